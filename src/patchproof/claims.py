@@ -1,0 +1,86 @@
+"""Intervals and promises: what a count of recognized images allows one to claim.
+
+In: counts. Out: intervals in [0, 1], or counts for prediction intervals; all at 95 % unless told otherwise.
+A rate from n images gets a Wilson interval. What n *new* photographs may show is wider, since they have noise of
+their own: a beta-binomial prediction interval with the Jeffreys prior Beta(1/2, 1/2). Differences on the same
+conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10, applies.
+Left out on purpose: corrections for looking more than once. The promise set is looked at once.
+
+Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650 (paired).
+"""
+
+from __future__ import annotations
+
+import math
+
+CONFIDENCE = 0.95
+
+
+def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Wilson's interval of a rate; (0, 1) when nothing was seen."""
+    if n == 0:
+        return 0.0, 1.0
+    z = _z(confidence)
+    rate = successes / n
+    center = (rate + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    # at 0 and n the formula gives exactly 0 and 1 but for rounding
+    return (0.0 if successes == 0 else center - half), (1.0 if successes == n else center + half)
+
+
+def prediction_interval(successes: int, n: int, photos: int, confidence: float = CONFIDENCE) -> tuple[int, int]:
+    """Counts [lo, hi] that `photos` new images will show with the given confidence, after `successes` of `n`."""
+    from scipy.stats import betabinom
+
+    predictive = betabinom(photos, successes + 0.5, n - successes + 0.5)
+    tail = (1 - confidence) / 2
+    return int(predictive.ppf(tail)), int(predictive.ppf(1 - tail))
+
+
+def paired_difference(
+    a: list[bool], b: list[bool], confidence: float = CONFIDENCE
+) -> tuple[float, tuple[float, float]]:
+    """Rate of `a` minus rate of `b` on the same n ≥ 1 conditions, with Newcombe's paired interval (method 10)."""
+    n = len(a)
+    if n == 0 or n != len(b):
+        raise ValueError(f"expected two equally long lists, got {n} and {len(b)} results")
+    both = sum(x and y for x, y in zip(a, b, strict=True))
+    only_a, only_b = sum(a) - both, sum(b) - both
+    neither = n - both - only_a - only_b
+    (low_a, high_a), (low_b, high_b) = wilson(sum(a), n, confidence), wilson(sum(b), n, confidence)
+    rate_a, rate_b = sum(a) / n, sum(b) / n
+    margins = (both + only_a) * (only_b + neither) * (both + only_b) * (only_a + neither)
+    # φ corrected for continuity, only where it is positive (Newcombe's rule)
+    covariance = both * neither - only_a * only_b
+    phi = 0.0 if margins == 0 else (max(covariance - n / 2, 0) if covariance > 0 else covariance) / math.sqrt(margins)
+    down_a, up_a, down_b, up_b = rate_a - low_a, high_a - rate_a, rate_b - low_b, high_b - rate_b
+    difference = rate_a - rate_b
+    low = difference - math.sqrt(max(0.0, down_a**2 - 2 * phi * down_a * up_b + up_b**2))
+    high = difference + math.sqrt(max(0.0, up_a**2 - 2 * phi * up_a * down_b + down_b**2))
+    return difference, (low, high)
+
+
+def independent_difference(
+    successes_a: int, n_a: int, successes_b: int, n_b: int, confidence: float = CONFIDENCE
+) -> tuple[float, tuple[float, float]]:
+    """Rate of a minus rate of b on different images, with Newcombe's interval of two Wilson scores."""
+    (low_a, high_a), (low_b, high_b) = wilson(successes_a, n_a, confidence), wilson(successes_b, n_b, confidence)
+    rate_a, rate_b = successes_a / max(n_a, 1), successes_b / max(n_b, 1)
+    difference = rate_a - rate_b
+    low = difference - math.hypot(rate_a - low_a, high_b - rate_b)
+    return difference, (low, difference + math.hypot(high_a - rate_a, rate_b - low_b))
+
+
+def mcnemar_p(a: list[bool], b: list[bool]) -> float:
+    """Exact two-sided McNemar p-value that the pairs `a`, `b` have the same rate (1 when no pair differs)."""
+    from scipy.stats import binomtest
+
+    only_a = sum(x and not y for x, y in zip(a, b, strict=True))
+    only_b = sum(y and not x for x, y in zip(a, b, strict=True))
+    return 1.0 if only_a + only_b == 0 else float(binomtest(only_a, only_a + only_b).pvalue)
+
+
+def _z(confidence: float) -> float:
+    from statistics import NormalDist
+
+    return NormalDist().inv_cdf(0.5 + confidence / 2)

@@ -1,0 +1,146 @@
+"""Poses, pinhole cameras and homographies, in float64 numpy.
+
+Frames. World: millimetres, right-handed, y up, origin at the centre of the object's bounding box. Camera: x right, y down,
+z forward. Page and piece: millimetres, x right, y down. Image: pixels, pixel centres at .5. `camera_from_world` is 4×4
+and `camera_from_world @ [X, 1]` is the point as the camera sees it; names say frame to frame, right to left.
+Left out on purpose: lens distortion. It is applied only where a camera file has it.
+
+Source of the homography's meaning and the normalised DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1 and 8.1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray:
+    """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to its right when positive.
+
+    Seen from outside, facing the side, positive azimuth moves the camera to the right. Arrays give N×3.
+    """
+    forward, up = _unit(forward), _unit(up)
+    right = np.cross(up, forward)  # the viewer who faces the side has this on the right hand
+    azimuth, elevation = np.radians(azimuth_deg)[..., None], np.radians(elevation_deg)[..., None]
+    level = np.cos(azimuth) * forward + np.sin(azimuth) * right
+    return np.cos(elevation) * level + np.sin(elevation) * up
+
+
+def look_at(eye_mm, target_mm, roll_deg=0.0, up=(0.0, 1.0, 0.0)) -> np.ndarray:
+    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, its picture turned clockwise by roll."""
+    eye, target = np.asarray(eye_mm, float), np.asarray(target_mm, float)
+    z = _unit(target - eye)
+    side = np.cross(z, _unit(up))
+    if np.linalg.norm(side) < 1e-9:  # straight up or down: any right hand will do, take world x
+        side = np.cross(z, [0.0, 0.0, 1.0])
+    x = _unit(side)
+    y = np.cross(z, x)  # down
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    rotation = np.stack([c * x - s * y, s * x + c * y, z])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose
+
+
+def intrinsics(fov_deg: float, size_px: tuple[int, int]) -> np.ndarray:
+    """Pinhole matrix 3×3 for a picture of (width, height) pixels whose *shorter* side spans `fov_deg`."""
+    width, height = size_px
+    focal_px = min(width, height) / 2 / np.tan(np.radians(fov_deg) / 2)
+    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
+
+
+def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
+    """Pixels N×2 of world points N×3; points behind the camera give NaN."""
+    points = np.asarray(points_mm, float)
+    camera = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    camera = np.where(camera[:, 2:] > 0, camera, np.nan)
+    image = camera @ np.asarray(matrix_px).T
+    return image[:, :2] / image[:, 2:]
+
+
+def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
+    """3×3 from plane millimetres (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin."""
+    pose = camera_from_world @ world_from_plane
+    return normalized(matrix_px @ pose[:3, [0, 1, 3]])
+
+
+def normalized(homography) -> np.ndarray:
+    """The same homography with its last entry 1, or with unit norm where that entry vanishes."""
+    homography = np.asarray(homography, float)
+    last = homography[2, 2]
+    scale = last if abs(last) > 1e-12 * np.abs(homography).max() else np.linalg.norm(homography)
+    return homography / scale
+
+
+def apply_homography(homography, points) -> np.ndarray:
+    """Points N×2 carried by the homography."""
+    points = np.asarray(points, float)
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def fit_homography(source, target) -> np.ndarray:
+    """Least-squares homography source → target from N ≥ 4 point pairs (normalised DLT); no outliers are expected."""
+    source, target = np.asarray(source, float), np.asarray(target, float)
+    to_a, to_b = _conditioner(source), _conditioner(target)
+    a, b = apply_homography(to_a, source), apply_homography(to_b, target)
+    ones, zeros = np.ones((len(a), 1)), np.zeros((len(a), 3))
+    a1 = np.hstack([a, ones])
+    rows = np.vstack([np.hstack([a1, zeros, -b[:, :1] * a1]), np.hstack([zeros, a1, -b[:, 1:] * a1])])
+    homography = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    return normalized(np.linalg.inv(to_b) @ homography @ to_a)
+
+
+def local_scale(homography, point) -> tuple[float, float]:
+    """(px_per_mm, tilt_deg) of a page→image homography at a page point, from the singular values of its derivative.
+
+    px_per_mm is their geometric mean; tilt is arccos of their ratio: exact for a far camera, approximate near by.
+    """
+    x, y = point
+    u, v, w = homography @ np.array([x, y, 1.0])
+    jacobian = (homography[:2, :2] - np.outer([u / w, v / w], homography[2, :2])) / w
+    large, small = np.linalg.svd(jacobian, compute_uv=False)
+    return float(np.sqrt(large * small)), float(np.degrees(np.arccos(np.clip(small / large, 0, 1))))
+
+
+def plane_pose(homography, matrix_px) -> np.ndarray:
+    """`camera_from_plane` 4×4 of a page→image homography and a pinhole matrix, with the page in front of the camera."""
+    columns = np.linalg.inv(matrix_px) @ homography
+    columns /= np.linalg.norm(columns[:, :2], axis=0).mean()
+    if columns[2, 2] < 0:
+        columns = -columns
+    u, _, vt = np.linalg.svd(columns[:, :2], full_matrices=False)
+    xy = u @ vt  # the nearest pair of orthonormal axes
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.column_stack([xy, np.cross(xy[:, 0], xy[:, 1])]), columns[:, 2]
+    return pose
+
+
+def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
+    """(azimuth_deg, elevation_deg, distance_mm) of the camera as a page point sees it.
+
+    Azimuth is positive when the camera stands to the right of the page's normal, elevation when it stands above.
+    """
+    rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
+    camera_in_plane = -rotation.T @ translation
+    x, y, z = camera_in_plane - np.array([point[0], point[1], 0.0])
+    toward = -z  # plane z points into the paper (x right, y down, right-handed)
+    distance = float(np.sqrt(x * x + y * y + z * z))
+    return float(np.degrees(np.arctan2(x, toward))), float(np.degrees(np.arcsin(-y / distance))), distance
+
+
+def rect_corners(rect) -> np.ndarray:
+    """The 4×2 corners of [x, y, width, height]: top-left, top-right, bottom-right, bottom-left."""
+    x, y, w, h = rect
+    return np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
+
+
+def _conditioner(points) -> np.ndarray:
+    """Similarity that centres points and brings them to mean distance √2 (Hartley's conditioning)."""
+    center = points.mean(0)
+    spread = np.sqrt(2) / max(np.linalg.norm(points - center, axis=1).mean(), 1e-300)
+    return np.array([[spread, 0, -spread * center[0]], [0, spread, -spread * center[1]], [0, 0, 1.0]])
+
+
+def _unit(vector) -> np.ndarray:
+    vector = np.asarray(vector, float)
+    return vector / np.linalg.norm(vector)

@@ -1,0 +1,87 @@
+"""Output that replaces what was there only when it is complete.
+
+In: where a command should write. Out: a place to write to that becomes the real one at the end. What exists is refused unless the
+user asked to overwrite it, and overwriting a folder removes only what the command itself writes: a mistyped folder loses nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from patchproof.settings import Refused
+
+
+@contextmanager
+def new_folder(out: str | Path, own: tuple[str, ...], overwrite: bool = False) -> Iterator[Path]:
+    """A folder to write into that becomes `out` when the block ends well; `own` are the names this command writes."""
+    out = Path(out)
+    check_folder(out, own, overwrite)
+    part = out.with_name(f".{out.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    make_folder(part)
+    try:
+        yield part
+        _replace(part, out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def check_folder(out: Path, own: tuple[str, ...], overwrite: bool = False) -> None:
+    """Refuse a folder with files in it unless they may be overwritten and are all this command's own."""
+    if out.exists() and not out.is_dir():
+        raise Refused("a folder to write to", f"the file {out}", "choose another --out")
+    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    if names and not overwrite:
+        raise Refused(
+            "an empty or new folder", f"{out} with {len(names)} files", "choose another --out or add --overwrite"
+        )
+    strange = [name for name in names if not any(fnmatch(name, pattern) for pattern in own)]
+    if strange:
+        raise Refused(
+            f"a folder with this command's own output only ({', '.join(own)})",
+            f"{out} with {strange[0]}",
+            "choose another --out",
+        )
+
+
+def check_file(path: Path, overwrite: bool = False) -> None:
+    """Refuse a file that exists unless it may be overwritten."""
+    if path.exists() and not overwrite:
+        raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it; refused where that cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Refused("a folder that can be made", f"{path} ({error.strerror})", "choose another --out") from error
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Let `write` fill a file beside `path`, then move it there: a reader sees the old file or the new one, whole."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        write(part)
+        os.replace(part, path)
+    except OSError as error:
+        raise Refused(
+            "a file that can be written", f"{path} ({error.strerror or error})", "make room or choose another --out"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _replace(part: Path, out: Path) -> None:
+    old = out.with_name(f".{out.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if out.is_dir():
+        out.rename(old)
+    part.rename(out)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,271 @@
+"""Scene files read strictly, the one way to refuse, and where shipped data lies.
+
+In: a TOML file (paths relative to it, `${VAR}` expanded). Out: frozen settings, every value checked: an unknown key names
+the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three things in one sentence: what was
+expected, what was there, and what to do. The command line prints that sentence and exits with 1.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+
+class Refused(ValueError):
+    """What the tool will not do, in one sentence that says expected, got, do."""
+
+    def __init__(self, expected: str, got: str, do: str):
+        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
+
+
+def shipped(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:
+    """A file of the data that travels with the program: inside the installed package, else in the checkout."""
+    package = Path(__file__).resolve().parent
+    # an editable install keeps these folders at the top of the checkout, two levels up
+    roots = [root for root in (package / folder, package.parents[1] / folder) if root.is_dir()]
+    if not roots:
+        raise Refused(f"the folder {folder} beside the program", "none", "install patchproof again")
+    return roots[0].joinpath(*parts)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError(f"must be [low, high] with low <= high, not [{pair[0]:g}, {pair[1]:g}]")
+    return pair
+
+
+Finite = Annotated[float, AfterValidator(_finite)]
+Positive = Annotated[Finite, Field(gt=0)]
+NotNegative = Annotated[Finite, Field(ge=0)]
+Share = Annotated[Finite, Field(ge=0, le=1)]
+Range = Annotated[tuple[Finite, Finite], AfterValidator(_ordered)]
+ShareRange = Annotated[tuple[Share, Share], AfterValidator(_ordered)]
+NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class Strict(BaseModel):
+    """Frozen settings that know all their keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ObjectSettings(Strict):
+    """The thing that the patch hangs on; `mesh` is a file or `primitive:NAME`."""
+
+    mesh: str
+    length_mm: Positive  # longest extent
+    up: Literal["y", "z"] = "z"
+
+
+class PatchSettings(Strict):
+    """The design's size and where it sits; `offset_mm` is [right, up] as one faces the side."""
+
+    width_mm: Positive
+    height_mm: Positive
+    kind: Literal["patch"] = "patch"
+    side: Side = "+x"
+    offset_mm: tuple[Finite, Finite] = (0.0, 0.0)
+    at_mm: tuple[Finite, Finite, Finite] | None = None  # a point in the scene instead of a side's middle
+    spin_deg: Finite = 0.0
+    bend: Literal[False] = False  # flat cards only
+
+
+class SheetSettings(Strict):
+    """The page that the piece is printed on."""
+
+    template: str = "a4"
+
+
+class TargetSettings(Strict):
+    """What the classifiers should see, and which classifiers."""
+
+    label: str | int
+    models: Annotated[tuple[str, ...], Field(min_length=1)]
+    accept: tuple[str | int, ...] = ()
+    goal: Literal["assist", "deceive"] = "assist"
+
+
+class ViewSettings(Strict):
+    """Ranges of the camera's place; azimuth 0 faces the patch's side; distance from the camera's centre to `look_at`."""
+
+    look_at: Literal["object", "patch"] = "object"
+    look_at_jitter: Share = 0.05  # share of the object's length
+    azimuth_deg: Range = (-60.0, 60.0)
+    elevation_deg: Annotated[Range, AfterValidator(lambda r: _within(r, -89, 89))] = (2.0, 27.0)
+    distance_mm: PositiveRange = (440.0, 800.0)
+    roll_deg: Range = (-5.0, 5.0)
+    fov_deg: Annotated[Positive, Field(lt=170)] = 50.0
+
+
+class LightSettings(Strict):
+    """Ambient and directional light; 1 is the light in which white paper is sRGB white at exposure 0."""
+
+    ambient: NotNegativeRange = (0.3, 0.7)
+    directional: NotNegativeRange = (0.2, 0.8)
+
+
+class BackgroundSettings(Strict):
+    """Photographs behind the object, or one plain sRGB colour."""
+
+    images: str | None = None
+    color: tuple[Share, Share, Share] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_them(self):
+        if self.images is not None and self.color is not None:
+            raise ValueError("takes images or color, not both")
+        return self
+
+
+class PrinterSettings(Strict):
+    """The printer's appearance model: a name in calibration/printers, or a file."""
+
+    profile: str = "coated"
+
+
+class CameraSettings(Strict):
+    """What the camera does; blur and noise are meant at `photo_px`."""
+
+    photo_px: tuple[Annotated[int, Field(ge=64, le=20000)], Annotated[int, Field(ge=64, le=20000)]] = (1600, 1200)
+    exposure_ev: Range = (-0.5, 0.5)
+    white_balance: Annotated[Share, Field(le=0.5)] = 0.05
+    blur_px: NotNegativeRange = (0.0, 1.0)
+    noise: ShareRange = (0.0, 0.01)
+    jpeg: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(_ordered)
+    ] = (60, 95)
+
+
+class OptimizeSettings(Strict):
+    """The loop: `views` conditions in each of `steps` steps."""
+
+    steps: Annotated[int, Field(ge=1)] = 120
+    views: Annotated[int, Field(ge=1)] = 12
+    seed: Annotated[int, Field(ge=0)] = 0
+    optimizer: Literal["adam", "sign"] = "adam"
+    step_size: Positive = 0.1
+    tv: NotNegative = 0.0
+    gamut: NotNegative = 0.1
+
+
+class SceneSettings(Strict):
+    """A whole scene file."""
+
+    object: ObjectSettings
+    patch: PatchSettings
+    target: TargetSettings
+    sheet: SheetSettings = SheetSettings()
+    view: ViewSettings = ViewSettings()
+    light: LightSettings = LightSettings()
+    background: BackgroundSettings = BackgroundSettings()
+    printer: PrinterSettings = PrinterSettings()
+    camera: CameraSettings = CameraSettings()
+    optimize: OptimizeSettings = OptimizeSettings()
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:
+        import tomli as tomllib
+    path = Path(path)
+    if not path.is_file():
+        raise Refused("a TOML file", f"no file at {path}", "check the path")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
+
+
+def load_scene_settings(path: str | Path) -> SceneSettings:
+    """The settings of a scene file as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
+    return validated(SceneSettings, read_toml(path), str(path))
+
+
+def validated(model: type[BaseModel], data: Any, where: str):
+    """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        # a misspelt key is also a missing one: the spelling says more
+        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        raise _explain(model, first, where) from error
+
+
+def expand(text: str, base: Path) -> str:
+    """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
+
+    def variable(match: re.Match) -> str:
+        if match[1] not in os.environ:
+            raise Refused(f"the environment variable {match[1]}", "none", f"set {match[1]} or write the path out")
+        return os.environ[match[1]]
+
+    text = re.sub(r"\$\{(\w+)\}", variable, text)
+    prefix, colon, rest = text.partition(":")
+    if colon and prefix == "file":
+        return f"file:{_absolute(rest, base)}"
+    if colon and (prefix in {"primitive", "torchvision", "timm", "module"}) or text == "builtin":
+        return text
+    return str(_absolute(text, base))
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`(did you mean "x"?)` where a known word is near, else the known words."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, 1, 0.5)
+    return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
+
+
+def _absolute(path: str, base: Path) -> Path:
+    return path_ if (path_ := Path(path)).is_absolute() else base / path_
+
+
+def _within(pair: tuple[float, float], low: float, high: float) -> tuple[float, float]:
+    if pair[0] < low or pair[1] > high:
+        raise ValueError(f"must lie within [{low:g}, {high:g}]")
+    return pair
+
+
+def _explain(model: type[BaseModel], error: dict, where: str) -> Refused:
+    key = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
+        return Refused(f"only known keys in {where}", f'"{key}"', hint)
+    if error["type"] == "missing":
+        return Refused(f'the key "{key}" in {where}', "none", f"add {key}")
+    value = str(error.get("input"))
+    value = value if len(value) < 80 else value[:77] + "..."
+    reason = error["msg"].removeprefix("Value error, ").rstrip(".")
+    reason = reason[0].lower() + reason[1:]
+    return Refused(
+        f'a usable "{key}" in {where}', value, f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
+    )
+
+
+def _keys_at(model: Any, location: tuple) -> Iterable[str]:
+    """The known keys of the table at a location, through lists, dictionaries and optional tables."""
+    for part in location:
+        if part in model.model_fields:  # else an index or a dictionary's own key
+            inner, todo = None, [model.model_fields[part].annotation]
+            while todo and inner is None:
+                one = todo.pop()
+                inner = one if isinstance(one, type) and issubclass(one, BaseModel) else None
+                todo.extend(get_args(one))
+            model = inner or model
+    return model.model_fields

@@ -1,0 +1,175 @@
+"""SHEET.json: the exact geometry of a printed sheet and the promise that was made before printing.
+
+Millimetres from the page's top-left corner, x right, y down; pages count from 1; rates in [0, 1]; unknown figures null.
+The manifest is all that the judge gets to see of the design's making, so it carries the design's own pixels (PNG, base64)
+beside their SHA-256, which is taken over the raw RGB bytes, row by row.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from patchproof.settings import Finite, Positive, Refused, Share, Strict, validated
+
+Point = tuple[Finite, Finite]
+Rect = tuple[Finite, Finite, Positive, Positive]
+Interval = tuple[Share, Share]
+SignedInterval = tuple[Finite, Finite]
+Page = Annotated[int, Field(ge=1)]
+
+
+class Design(Strict):
+    """The printed pixels and where they lie."""
+
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    rect_mm: Rect
+    size_px: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    page: Page
+    png: str
+
+    def pixels(self) -> np.ndarray:
+        """The design as uint8 H×W×3 sRGB; refused where it is not the one that the hash names."""
+        from PIL import Image
+
+        try:
+            image = Image.open(io.BytesIO(base64.b64decode(self.png, validate=True)), formats=["PNG"])
+            if image.size != self.size_px:
+                raise ValueError("size")
+            pixels = np.asarray(image.convert("RGB"))
+        except Exception as error:
+            raise Refused(
+                "the design's pixels in the manifest", "none that can be read", "make the sheet again"
+            ) from error
+        if design_sha256(pixels) != self.sha256:
+            raise Refused("the design that the manifest names", "other pixels", "make the sheet again")
+        return pixels
+
+
+class Marker(Strict):
+    """One ArUco marker: outer corners of its black square, clockwise from the top-left of the code."""
+
+    dictionary: str
+    id: Annotated[int, Field(ge=0)]
+    corners_mm: tuple[Point, Point, Point, Point]
+    page: Page
+
+
+class Swatch(Strict):
+    """One patch of known sRGB colour."""
+
+    rect_mm: Rect
+    srgb: tuple[Share, Share, Share]
+    page: Page
+
+
+class Tile(Strict):
+    """One page of a piece larger than the page."""
+
+    page: Page
+    page_from_design_mm: tuple[tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite]]
+
+
+class Target(Strict):
+    """What should be recognized; `indices` are the labels that count, the target's first."""
+
+    label: str
+    indices: tuple[Annotated[int, Field(ge=0)], ...]
+    goal: str
+
+
+class ModelClaim(Strict):
+    """One network's promised rate. Its name is as written; SHA-256 of its file where there is one."""
+
+    name: str
+    sha256: str | None
+    rate: Share
+    interval: Interval
+    confidence: Share
+
+
+class ControlClaim(Strict):
+    """A control on the same conditions; `difference` is the design's rate minus the control's."""
+
+    rate: Share
+    interval: Interval
+    confidence: Share
+    difference: Finite
+    difference_interval: SignedInterval
+
+
+class ConditionClaim(Strict):
+    """What a photograph can show of one promised condition, and whether it was recognized."""
+
+    px_per_mm: Finite | None
+    tilt_deg: Finite | None
+    azimuth_deg: Finite | None
+    contrast: Finite | None
+    blur_px: Finite | None
+    recognized: bool
+
+
+class Promise(Strict):
+    """The predicted rate of the primary (first) model, made before printing."""
+
+    target: Target
+    models: Annotated[tuple[ModelClaim, ...], Field(min_length=1)]
+    rate: Share
+    interval: Interval
+    n: Annotated[int, Field(ge=1)]
+    controls: dict[str, ControlClaim]
+    conditions: tuple[ConditionClaim, ...]
+
+
+class Manifest(Strict):
+    """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
+
+    sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
+    kind: str  # "design", or the control that this sheet is: "mean", "grey", "noise", "shuffled", "blank"
+    page_mm: tuple[Positive, Positive]
+    design: Design | None
+    markers: Annotated[tuple[Marker, ...], Field(min_length=1)]
+    chart: tuple[Swatch, ...]
+    cut_mm: Rect
+    ruler_mm: tuple[Positive, Positive]
+    tiles: tuple[Tile, ...] = ()
+    promise: Promise | None
+    settings: dict[str, Any]
+
+
+def design_sha256(pixels: np.ndarray) -> str:
+    """SHA-256 of uint8 H×W×3 pixels, row by row."""
+    return hashlib.sha256(np.ascontiguousarray(pixels, np.uint8).tobytes()).hexdigest()
+
+
+def png_base64(pixels: np.ndarray) -> str:
+    """uint8 H×W×3 pixels as a PNG in base64."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def dump_manifest(manifest: Manifest) -> str:
+    """Its JSON text: the same manifest gives the same bytes."""
+    return json.dumps(manifest.model_dump(), indent=1, allow_nan=False) + "\n"
+
+
+def load_manifest(path: str | Path) -> Manifest:
+    """A SHEET.json; refused in one sentence where it is missing, broken, or not one."""
+    path = Path(path)
+    if not path.is_file():
+        raise Refused("a manifest (SHEET.json)", f"no file at {path}", "name the JSON that was written beside the PDF")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError, OSError) as error:
+        raise Refused("a manifest (SHEET.json)", f"{path} that is not JSON", "make the sheet again") from error
+    return validated(Manifest, data, str(path))

@@ -1,0 +1,166 @@
+"""SHEET.pdf and SHEET.json: both complete, or neither.
+
+In: a piece, a template, the design's pixels, and the promise. Out: two files with the same stem, and the manifest, of
+which the PDF carries the same bytes as an attachment. They are written beside their places first and moved there
+last, so that a full disk or a crash leaves what was there before. `check_sheet` says in plain sentences what a print
+shop needs to know.
+Left out on purpose: asking before overwriting, which is the command line's business.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from patchproof.settings import Refused
+from patchproof.sheet.manifest import (
+    Design,
+    Manifest,
+    Marker,
+    Promise,
+    Swatch,
+    design_sha256,
+    dump_manifest,
+    png_base64,
+)
+from patchproof.sheet.page import PageLayout, lay_out_page
+from patchproof.sheet.pdf import page_pdf
+from patchproof.sheet.piece import DICTIONARY, Piece
+from patchproof.sheet.swatches import FRAME_COLORS
+from patchproof.sheet.template import Template
+
+
+def write_sheet(
+    pdf_path: str | Path,
+    *,
+    template: Template,
+    piece: Piece,
+    sheet_id: str,
+    kind: str,
+    design_srgb8: np.ndarray | None,
+    promise: Promise | None,
+    settings: dict[str, Any],
+) -> Manifest:
+    """Write SHEET.pdf and SHEET.json beside it; `design_srgb8` is uint8 H×W×3, or None for white paper."""
+    pdf_path = Path(pdf_path)
+    if pdf_path.suffix.lower() != ".pdf":
+        raise Refused("a file name that ends in .pdf", f'"{pdf_path}"', "name the sheet SHEET.pdf")
+    if design_srgb8 is not None:
+        _check_pixels(design_srgb8)
+    page = lay_out_page(template, piece, sheet_id, kind, qr_text(sheet_id, kind, design_srgb8))
+    manifest = _manifest(page, template, sheet_id, kind, design_srgb8, promise, settings)
+    text = dump_manifest(manifest)
+    pdf = page_pdf(page, design_srgb8, f"patchproof sheet {sheet_id} {kind}", text)
+    _replace_both({pdf_path: pdf, pdf_path.with_suffix(".json"): text.encode()})
+    return manifest
+
+
+def qr_text(sheet_id: str, kind: str, design_srgb8: np.ndarray | None) -> str:
+    """What the QR code says: the sheet's id and 16 digits of the design's SHA-256 (the kind where there is none)."""
+    return f"patchproof:{sheet_id}:{kind if design_srgb8 is None else design_sha256(design_srgb8)[:16]}"
+
+
+def check_sheet(manifest: Manifest) -> list[str]:
+    """What whoever prints this sheet should know, in sentences."""
+    width, height = manifest.page_mm
+    lines = [
+        f"The page is {width:g} × {height:g} mm, one side; print it at 100 %, as the file asks viewers to.",
+        f"No bleed is needed: markers, swatches and cut line stay {_nearest_ink_mm(manifest):.1f} mm from the edge.",
+        "Trim box and bleed box are the whole page.",
+        f"Cut the piece of {manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm along the dashed line.",
+        _design_line(manifest),
+        "All fonts are embedded; words, markers and swatches are vector, in sRGB; black is RGB 0 0 0.",
+        "Use matte white paper of 160 g/m² or more, color, best quality, and switch off all color enhancement.",
+        f"After printing both rulers must measure {manifest.ruler_mm[0]:g} and {manifest.ruler_mm[1]:g} mm.",
+    ]
+    inside = sum(_within(swatch.rect_mm, manifest.cut_mm) for swatch in manifest.chart)
+    if inside < len(FRAME_COLORS):
+        lines.append(
+            f"The frame has room for {inside} of {len(FRAME_COLORS)} swatches, so color on it is measured less well."
+        )
+    return lines
+
+
+def _design_line(manifest: Manifest) -> str:
+    if manifest.design is None:
+        return "The piece carries no design: its middle stays white paper."
+    (columns, rows), (_, _, w, h) = manifest.design.size_px, manifest.design.rect_mm
+    return (
+        f"The design is an RGB image tagged sRGB, {columns} × {rows} pixels on {w:g} × {h:g} mm "
+        f"({columns / w * 25.4:.0f} ppi), lossless; its pixels are meant as they are, so do not resample or sharpen."
+    )
+
+
+def _manifest(
+    page: PageLayout,
+    template: Template,
+    sheet_id: str,
+    kind: str,
+    design: np.ndarray | None,
+    promise: Promise | None,
+    settings: dict[str, Any],
+) -> Manifest:
+    printed = None
+    if design is not None:
+        printed = Design(
+            sha256=design_sha256(design),
+            rect_mm=page.design_mm,
+            size_px=(design.shape[1], design.shape[0]),
+            page=1,
+            png=png_base64(design),
+        )
+    return Manifest(
+        sheet_id=sheet_id,
+        kind=kind,
+        page_mm=page.page_mm,
+        design=printed,
+        markers=tuple(Marker(dictionary=DICTIONARY, id=m.id, corners_mm=m.corners_mm, page=1) for m in page.markers),
+        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
+        cut_mm=page.cut_mm,
+        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
+        promise=promise,
+        settings=settings,
+    )
+
+
+def _check_pixels(design: np.ndarray) -> None:
+    if design.dtype != np.uint8 or design.ndim != 3 or design.shape[2] != 3 or design.size == 0:
+        raise Refused("a design of uint8 H×W×3 pixels", f"{design.dtype} {design.shape}", "convert it to 8-bit RGB")
+
+
+def _replace_both(contents: dict[Path, bytes]) -> None:
+    """Write all files under other names in the same folder, then move each to its place."""
+    waiting = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
+    try:
+        for path, data in contents.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_dir():
+                raise IsADirectoryError(f"{path} is a folder")
+            waiting[path].write_bytes(data)
+        for path, part in waiting.items():
+            os.replace(part, path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise Refused(
+            "a folder that can be written to", f"{path} ({reason})", "choose another place for the sheet"
+        ) from error
+    finally:
+        for part in waiting.values():
+            if part.exists():
+                part.unlink()
+
+
+def _nearest_ink_mm(manifest: Manifest) -> float:
+    """From the page's edge to the nearest marker, swatch or cut line."""
+    width, height = manifest.page_mm
+    rects = [manifest.cut_mm, *(swatch.rect_mm for swatch in manifest.chart)]
+    points = [point for marker in manifest.markers for point in marker.corners_mm]
+    points += [(x + dx, y + dy) for x, y, w, h in rects for dx, dy in ((0, 0), (w, h))]
+    return min(min(x, y, width - x, height - y) for x, y in points)
+
+
+def _within(rect: tuple[float, ...], outer: tuple[float, ...]) -> bool:
+    return all(outer[i] <= rect[i] and rect[i] + rect[i + 2] <= outer[i] + outer[i + 2] for i in (0, 1))

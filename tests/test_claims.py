@@ -1,0 +1,114 @@
+"""Claims: published figures, and intervals that cover as often as they say."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom, multinomial
+
+from patchproof.claims import independent_difference, mcnemar_p, paired_difference, prediction_interval, wilson
+
+
+def pairs(both: int, only_a: int, only_b: int, neither: int) -> tuple[list[bool], list[bool]]:
+    a = [True] * (both + only_a) + [False] * (only_b + neither)
+    b = [True] * both + [False] * only_a + [True] * only_b + [False] * neither
+    return a, b
+
+
+def test_wilson_by_hand():
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=5e-5)
+    assert wilson(0, 10) == pytest.approx((0, 0.2775), abs=5e-5)  # z²/(n + z²)
+    assert wilson(0, 0) == (0, 1) and wilson(0, 5)[0] == 0 and wilson(5, 5)[1] == 1
+
+
+def test_wilson_is_symmetric_and_narrows():
+    for k in range(11):
+        low, high = wilson(k, 10)
+        assert wilson(10 - k, 10) == pytest.approx((1 - high, 1 - low))
+        assert low <= k / 10 <= high
+    widths = [np.ptp(wilson(n // 2, n)) for n in (10, 100, 1000)]
+    assert widths == sorted(widths, reverse=True)
+
+
+def test_wilson_covers_95_percent_on_average():
+    n = 60
+    rates = np.linspace(0.02, 0.98, 97)
+    intervals = np.array([wilson(k, n) for k in range(n + 1)])
+    inside = (intervals[:, :1] <= rates) & (rates <= intervals[:, 1:])
+    coverage = (binom.pmf(np.arange(n + 1)[:, None], n, rates) * inside).sum(0)
+    assert coverage.mean() == pytest.approx(0.95, abs=0.01) and coverage.min() > 0.88
+
+
+def test_independent_differences_as_published():
+    """Newcombe 1998 (873-890), Table II, method 10."""
+    for counts, expected in [
+        ((56, 70, 48, 80), (0.0524, 0.3339)),
+        ((9, 10, 3, 10), (0.1705, 0.8090)),
+        ((5, 56, 0, 29), (-0.0381, 0.1926)),
+        ((10, 10, 0, 20), (0.6791, 1.0000)),
+    ]:
+        difference, interval = independent_difference(*counts)
+        assert interval == pytest.approx(expected, abs=1e-4)
+        assert difference == pytest.approx(counts[0] / counts[1] - counts[2] / counts[3])
+
+
+def test_paired_difference_covers_by_exact_enumeration():
+    """Every table of 20 pairs, weighted by its chance; the interval is to hold the true difference 95 times in 100."""
+    n = 20
+    tables = [(a, b, c, n - a - b - c) for a in range(n + 1) for b in range(n + 1 - a) for c in range(n + 1 - a - b)]
+    found = np.array([paired_difference(*pairs(*table))[1] for table in tables])
+    for chances in ([0.4, 0.3, 0.1, 0.2], [0.6, 0.2, 0.05, 0.15], [0.25, 0.25, 0.25, 0.25], [0.1, 0.05, 0.05, 0.8]):
+        weight = multinomial.pmf(tables, n, chances)
+        truth = chances[1] - chances[2]
+        coverage = weight[(found[:, 0] <= truth) & (truth <= found[:, 1])].sum()
+        assert 0.93 < coverage < 0.999, chances
+
+
+def test_paired_difference_as_published():
+    """Newcombe 1998 (2635-2650), method 10: 36, 12, 2, 0 of 50 pairs."""
+    difference, interval = paired_difference(*pairs(36, 12, 2, 0))
+    assert difference == pytest.approx(0.2) and interval == pytest.approx((0.0569, 0.3404), abs=1e-4)
+
+
+def test_paired_difference_swaps_sign_and_stays_in_bounds():
+    for table in [(5, 9, 1, 5), (0, 20, 0, 0), (10, 0, 0, 10), (0, 0, 0, 20), (0, 10, 10, 0)]:
+        a, b = pairs(*table)
+        difference, (low, high) = paired_difference(a, b)
+        swapped, (swapped_low, swapped_high) = paired_difference(b, a)
+        assert (swapped, swapped_low, swapped_high) == pytest.approx((-difference, -high, -low))
+        assert -1 <= low <= difference <= high <= 1
+
+
+def test_pairing_narrows_where_results_agree():
+    a, b = pairs(40, 8, 2, 50)
+    paired = np.ptp(paired_difference(a, b)[1])
+    assert paired < 0.8 * np.ptp(independent_difference(sum(a), 100, sum(b), 100)[1])
+
+
+def test_paired_difference_wants_pairs():
+    for a, b in (([], []), ([True], [True, False])):
+        with pytest.raises(ValueError, match="equally long"):
+            paired_difference(a, b)
+
+
+def test_mcnemar_by_hand():
+    assert mcnemar_p(*pairs(5, 0, 0, 5)) == 1
+    assert mcnemar_p(*pairs(5, 6, 0, 5)) == pytest.approx(2 / 2**6)
+    assert mcnemar_p(*pairs(3, 9, 1, 7)) == pytest.approx(2 * (1 + 10) / 2**10)
+
+
+def test_prediction_interval_covers_new_photographs():
+    """Rates from the prior, 400 promise images, 20 photographs: the count falls inside at least 95 times in 100."""
+    rng = np.random.default_rng(0)
+    rates = rng.beta(0.5, 0.5, 4000)
+    seen, photos = rng.binomial(400, rates), rng.binomial(20, rates)
+    bounds = {k: prediction_interval(int(k), 400, 20) for k in np.unique(seen)}
+    inside = np.mean([bounds[k][0] <= photo <= bounds[k][1] for k, photo in zip(seen, photos, strict=True)])
+    assert 0.95 <= inside < 0.995  # whole counts cannot meet 95 % exactly from above
+
+
+def test_prediction_interval_is_wider_than_wilson_and_knows_the_ends():
+    low, high = prediction_interval(320, 400, 20)
+    assert low / 20 < wilson(320, 400)[0] and high / 20 > wilson(320, 400)[1]
+    assert prediction_interval(0, 400, 20)[0] == 0 and prediction_interval(400, 400, 20)[1] == 20
+    assert prediction_interval(0, 0, 5) == (0, 5)
+    assert prediction_interval(80, 400, 20) == tuple(20 - k for k in reversed(prediction_interval(320, 400, 20)))
+    assert all(isinstance(k, int) for k in prediction_interval(320, 400, 20))

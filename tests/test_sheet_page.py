@@ -1,0 +1,131 @@
+"""The page: what it holds, the proof that its parts lie apart, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from patchproof.settings import Refused, shipped
+from patchproof.sheet.page import Box, largest_piece_mm, lay_out_page, prove_apart, qr_rects_mm
+from patchproof.sheet.piece import KINDS, lay_out_piece, marker_size_mm
+from patchproof.sheet.template import TextLine, load_template
+
+ID = "WWWWWWWWWW"  # the widest id there can be
+PAGE, MARGIN = (210.0, 297.0), 7.0
+
+
+def page_of(template, design_mm, needed_mm=20.0, kind="design"):
+    marker = marker_size_mm(needed_mm, design_mm, largest_piece_mm(template))
+    return lay_out_page(template, lay_out_piece(design_mm, marker, ID, kind), ID, kind, f"patchproof:{ID}:{16 * '0'}")
+
+
+@pytest.mark.parametrize("design_mm", [(110, 110), (40, 40), (60, 140), (140, 50), (142, 155), (10, 10)])
+@pytest.mark.parametrize("kind", ["design", "shuffled"])
+def test_a4_holds_small_large_and_oblong_designs(design_mm, kind):
+    page = page_of(load_template("a4"), design_mm, kind=kind)
+    assert page.design_mm[2:] == design_mm
+    # the design is in the middle of the piece
+    assert page.design_mm[0] - page.cut_mm[0] == pytest.approx((page.cut_mm[2] - design_mm[0]) / 2, abs=2e-6)
+    assert len({m.id for m in page.markers}) == len(page.markers) == len(page.piece.markers) + 4
+
+
+def test_a4_holds_110_mm_with_20_mm_markers():
+    assert marker_size_mm(20, (110, 110), largest_piece_mm(load_template("a4"))) == 20
+
+
+def test_kinds_share_no_marker_even_with_the_page_s_own():
+    template = load_template("a4")
+    ids = [m.id for kind in KINDS for m in page_of(template, (60, 60), kind=kind).markers]
+    assert len(ids) == len(set(ids)) == 6 * 12
+
+
+def test_no_two_boxes_share_a_point_of_a_fine_grid():
+    """Slow twin of the proof: paint every box that holds no other onto a 0.1 mm grid and look for double paint."""
+    page = page_of(load_template("a4"), (110, 110))
+    holders = {box.inside for box in page.boxes}
+    paint = np.zeros((2970, 2100), np.uint8)
+    for box in page.boxes:
+        if box.name not in holders:
+            x, y, w, h = box.rect_mm
+            paint[int(y * 10 + 0.6) : int((y + h) * 10 + 0.4), int(x * 10 + 0.6) : int((x + w) * 10 + 0.4)] += 1
+    assert paint.max() == 1
+    assert not paint[:70].any() and not paint[-70:].any() and not paint[:, :70].any() and not paint[:, -70:].any()
+
+
+def test_overlap_is_caught():
+    boxes = (Box("one", (20, 20, 30, 30)), Box("two", (49.9, 49.9, 10, 10)))
+    with pytest.raises(Refused, match="one over two"):
+        prove_apart(boxes, PAGE, MARGIN)
+    prove_apart((boxes[0], Box("two", (50, 20, 10, 10))), PAGE, MARGIN)  # touching is apart
+    prove_apart((boxes[0], Box("two", (30, 30, 10, 10), "one")), PAGE, MARGIN)  # one may hold the other
+
+
+def test_two_parts_in_one_holder_must_lie_apart_and_stay_in():
+    holder = Box("card", (20, 20, 80, 50))
+    with pytest.raises(Refused, match="a over b"):
+        prove_apart((holder, Box("a", (30, 30, 9, 9), "card"), Box("b", (35, 35, 9, 9), "card")), PAGE, MARGIN)
+    with pytest.raises(Refused, match="a within card"):
+        prove_apart((holder, Box("a", (95, 30, 9, 9), "card")), PAGE, MARGIN)
+
+
+@pytest.mark.parametrize("rect", [(6.9, 50, 5, 5), (50, 6.9, 5, 5), (198.1, 50, 5, 5), (50, 285.1, 5, 5)])
+def test_ink_in_the_margin_is_caught(rect):
+    with pytest.raises(Refused, match="one within the margins of 7 mm"):
+        prove_apart((Box("one", rect),), PAGE, MARGIN)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("corner_mm = [7.0, 218.0]", "corner_mm = [12.0, 218.0]", "chart swatch 1 over card outline"),
+        ("corner_mm = [179.0, 20.0]", "corner_mm = [175.0, 20.0]", "piece over QR code"),
+        ("y_start_mm = [179.1, 72.0]", "y_start_mm = [179.1, 60.0]", "y ruler over text"),
+        ("[[7.0, 200.0]", "[[24.0, 200.0]", "page marker 1 over x ruler"),
+        ("[[7.0, 200.0]", "[[2.0, 200.0]", "page marker 1 within the margins"),
+        ("length_mm = 100.0", "length_mm = 107.0", "x ruler over text"),
+    ],
+)
+def test_a_template_whose_parts_collide_is_refused(tmp_path, old, new, what):
+    text = shipped("print_templates", "a4.toml").read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(Refused) as refusal:
+        page_of(load_template(path), (110, 110))
+    assert refusal.match("move")
+    told = str(refusal.value)
+    assert what in told or " over ".join(reversed(what.split(" over "))) in told
+
+
+def test_a_design_too_large_is_refused_with_the_largest_that_fits():
+    template = load_template("a4")
+    piece = lay_out_piece((120, 110), 20, ID, "design")
+    with pytest.raises(Refused) as refusal:
+        lay_out_page(template, piece, ID, "design", "x")
+    # 166.6 - 2 (20 × 9/7 + 2) = 111.17; 179.6 - 55.43 = 124.17; with 8 mm: 166.6 - 24.571 = 142.03, 155.03
+    assert "at most 111 × 124 mm with 20 mm markers or 142 × 155 mm with 8 mm markers" in str(refusal.value)
+    assert "got 175.4 × 165.4 mm" in str(refusal.value)
+
+
+def test_unknown_word_in_a_text_is_refused():
+    template = load_template("a4")
+    line = TextLine(at_mm=(50, 14), size_mm=2, text="{sheet}")
+    with pytest.raises(Refused, match=r"\{sheet\}: use one of: sheet_id"):
+        page_of(template.model_copy(update={"text": (line,)}), (110, 110))
+
+
+def test_qr_code_fills_its_square():
+    rects = np.array(qr_rects_mm("patchproof:A1B2C3D4E5:0123456789abcdef", (10, 20), 29))
+    assert rects[:, 0].min() == 10 and (rects[:, 0] + rects[:, 2]).max() == pytest.approx(39)
+    assert rects[:, 1].min() == 20 and rects[:, 3] == pytest.approx(1)  # version 3: 29 modules
+
+
+def test_rulers_have_a_tick_at_each_millimetre():
+    page = page_of(load_template("a4"), (110, 110))
+    vertical = sorted(t.ends_mm[0] for t in page.ticks if t.ends_mm[0] == t.ends_mm[2] and t.width_mm < 0.2)
+    assert np.diff(vertical) == pytest.approx(np.ones(100)) and len(vertical) == 101
+
+
+def test_layout_is_frozen():
+    page = page_of(load_template("a4"), (110, 110))
+    assert replace(page) == page
