@@ -1,0 +1,1 @@
+"""Models of printer and camera from profiles and photographs."""

@@ -1,0 +1,146 @@
+"""A printer from an ICC output profile.
+
+In: an RGB or CMYK profile of class `prtr`. Out: a `Printer` whose table follows the chain sRGB → printer → sRGB, both
+legs relative colorimetric: bare paper is 1, and an eye's or camera's adaptation to the paper is not applied twice.
+LittleCMS (through Pillow) works in 8 bits here; without NOOPTIMIZE it replaces the chain by a coarse one (ΔE00 up to 5
+on coated, 14 on uncoated paper). A bake measures its table against the exact chain and keeps the figures.
+Left out on purpose: black point compensation and perceptual intents; printer drivers differ in both.
+
+    python -m patchproof.calibrate.icc FOGRA39L_coated.icc --name coated --licence CC0 --source "colord project" --out .
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import io
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table, save_printer
+from patchproof.color import ciede2000, lab_from_srgb
+from patchproof.settings import Refused
+
+MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
+_D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1
+_CHECKED_COLORS = 10_000
+
+
+def bake(profile_path: Path, name: str, licence: str, source: str) -> Printer:
+    """The printer of a profile; `licence` and `source` are what the caller knows of it and go into provenance."""
+    data = _profile_bytes(Path(profile_path))
+    show, profile = _chain(data, Path(profile_path).name)
+    nodes = np.round(node_colors() * 255).astype(np.uint8)
+    lut = show(nodes)
+    white = lut[-1, -1, -1]
+    if white.min() < 250:  # relative to its medium, paper is white by definition, up to a profile's own rounding
+        got = f"sRGB white printed as {white.tolist()}"
+        raise Refused("a profile that leaves white paper bare", got, "use another one")
+    gamut = ciede2000(lab_from_srgb(nodes / 255), lab_from_srgb(lut / 255))
+    printer = printer_from_table(name, "icc", lut / 255, gamut, _paper_white(profile), {})
+    printer.provenance.update(
+        {
+            "source": source,
+            "licence": licence,
+            "profile": (profile.profile_description or "").strip(),
+            "profile_sha256": hashlib.sha256(data).hexdigest(),
+            "profile_colors": profile.xcolor_space.strip(),
+            "intents": "relative colorimetric both ways, no black point compensation",
+            "relative_to": f"paper: sRGB white is seen as {white.tolist()} of 255",
+            "table": f"{len(NODES_8BIT)} nodes per channel at 0, 8, ..., 248, 255; trilinear",
+            "delta_e00_to_exact_chain": _table_error(printer, show),
+            "uncertainty": "one print to the next and one paper to the next differ by more, see the printer model",
+        }
+    )
+    return printer
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Bake a profile and write it; the way the shipped printers were made."""
+    parser = argparse.ArgumentParser(prog="python -m patchproof.calibrate.icc", description=bake.__doc__)
+    parser.add_argument("profile", type=Path)
+    for option in ("--name", "--licence", "--source"):
+        parser.add_argument(option, required=True)
+    parser.add_argument("--out", type=Path, required=True, help="folder for NAME.npz and NAME.json")
+    given = parser.parse_args(arguments)
+    try:
+        printer = bake(given.profile, given.name, given.licence, given.source)
+        given.out.mkdir(parents=True, exist_ok=True)
+        path = save_printer(printer, given.out)
+    except Refused as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(f"{path}: ΔE00 to the exact chain {printer.provenance['delta_e00_to_exact_chain']}")
+    return 0
+
+
+def _profile_bytes(path: Path) -> bytes:
+    """The file, refused where it is missing, too large, or shorter than its own header says."""
+    if not path.is_file():
+        raise Refused("an ICC profile", f"no file at {path}", "check the path")
+    if path.stat().st_size > MAX_BYTES:
+        got = f"{path.stat().st_size / 2**20:.0f} MB in {path.name}"
+        raise Refused(f"an ICC profile of at most {MAX_BYTES // 2**20} MB", got, "check that it is a profile")
+    data = path.read_bytes()
+    if len(data) < 128 or data[36:40] != b"acsp":  # ICC.1, 7.2: the header and its signature
+        raise Refused("an ICC profile", f"{path.name}, which is none", "check the file")
+    if int.from_bytes(data[:4], "big") > len(data):
+        got = f"{len(data)} of {int.from_bytes(data[:4], 'big')} bytes of {path.name}"
+        raise Refused("a whole ICC profile", got, "copy the file again")
+    return data
+
+
+def _chain(data: bytes, file_name: str):
+    """(uint8 ... × 3 sRGB sent → uint8 sRGB seen, the profile's description) by LittleCMS."""
+    from PIL import Image, ImageCms
+
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
+    except (OSError, ImageCms.PyCMSError) as error:
+        raise Refused("an ICC profile that can be read", f"{file_name} ({error})", "use another one") from error
+    kind, colors = profile.profile.device_class.strip(), profile.profile.xcolor_space.strip()
+    if kind != "prtr" or colors not in {"RGB", "CMYK"}:
+        got = f"class {kind} with {colors} in {file_name}"
+        raise Refused("a printer's profile (class prtr, RGB or CMYK)", got, "use the profile of your printer and paper")
+    relative, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags
+    srgb = ImageCms.createProfile("sRGB")
+    exact = flags.SOFTPROOFING | flags.NOOPTIMIZE | flags.NOCACHE
+    try:
+        chain = ImageCms.buildProofTransform(srgb, srgb, profile, "RGB", "RGB", relative, relative, flags=exact)
+    except (ImageCms.PyCMSError, ValueError) as error:
+        got = f"{file_name} without them ({error})"
+        raise Refused("a profile with tables to and from the printer", got, "use another one") from error
+
+    def show(srgb_8bit: np.ndarray) -> np.ndarray:
+        image = Image.fromarray(np.ascontiguousarray(srgb_8bit.reshape(1, -1, 3)))
+        return np.asarray(ImageCms.applyTransform(image, chain)).reshape(srgb_8bit.shape)
+
+    return show, profile.profile
+
+
+def _paper_white(profile) -> tuple[float, float, float] | None:
+    """CIELAB (D50) of the bare paper from the profile's media white point."""
+    if not profile.media_white_point:
+        return None
+    t = np.array(profile.media_white_point[0]) / _D50
+    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    lab = 116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])
+    return tuple(round(float(value), 2) + 0.0 for value in lab)
+
+
+def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
+    """How far the interpolated table is from the chain itself on random colours."""
+    sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
+    exact = lab_from_srgb(show(sent) / 255)
+    seen = printer.apply(torch.tensor(sent / 255).T[None, :, :, None])[0, :, :, 0].T.numpy()
+    error = ciede2000(exact, lab_from_srgb(seen))
+    figures = {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()}
+    return {"colors": _CHECKED_COLORS, **{key: round(float(value), 3) for key, value in figures.items()}}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""The camera: linear light at the sensor becomes a display-encoded picture.
+
+In: N×3×H×W linear light and the drawn camera conditions. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics, focus),
+exposure and white balance, shot and read noise, clipping, tone curve (sRGB's).
+
+Blur, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the photograph gets
+what is left of them after averaging: blur and noise shrink with `scale`; what falls under the threshold of visibility is skipped,
+since it would cost time and show nothing. At full size the photograph is stored as a real JPEG by whoever writes it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from patchproof.color import srgb_from_linear
+
+# A blur below this sigma (pixels) adds 0.06 px² to the ~0.2 px² of a pixel's own averaging and resampling.
+SMALLEST_BLUR_PX = 0.25
+# Noise below half an 8-bit step is lost in rounding.
+SMALLEST_NOISE = 0.5 / 255
+# Below half size a JPEG block covers less than 4 pixels and averages out.
+SMALLEST_JPEG_SCALE = 0.5
+# Read noise is this share of the noise at white; shot noise makes up the rest (variance = noise² (x + READ_SHARE²)).
+READ_SHARE = 0.25
+
+
+def develop(linear: Tensor, conditions, scale: float, jpeg: bool = True) -> Tensor:
+    """The picture that a camera makes; `conditions` as in `scene.conditions.Conditions`, one row per picture.
+
+    `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
+    """
+    linear = blurred(linear, _tensor(conditions.blur_px, linear) * scale)
+    gain = 2 ** _tensor(conditions.exposure_ev, linear)[:, None] * _tensor(conditions.white_balance, linear)
+    linear = linear * gain[:, :, None, None]
+    linear = noisy(linear, _tensor(conditions.noise, linear) * scale, conditions.noise_seed)
+    picture = srgb_from_linear(linear.clamp(0, 1))
+    if jpeg and scale >= SMALLEST_JPEG_SCALE:
+        picture = compressed(picture, _tensor(conditions.jpeg, linear))
+    return picture
+
+
+def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:
+    """Gaussian blur with one sigma per picture; nothing where all are too small to be seen."""
+    from kornia.filters import gaussian_blur2d
+
+    largest = float(sigma_px.max())
+    if largest < SMALLEST_BLUR_PX:
+        return linear
+    taps = 2 * int(3 * largest + 0.5) + 1
+    sigma = sigma_px.clamp_min(0.05)[:, None].expand(-1, 2)  # 0.05 px leaves a picture as it was
+    return gaussian_blur2d(linear, (taps, taps), sigma, border_type="replicate")
+
+
+def noisy(linear: Tensor, noise: Tensor, seeds) -> Tensor:
+    """Shot and read noise in linear light (EMVA 1288: variance linear in the signal); each picture has its own seed."""
+    if float(noise.max()) < SMALLEST_NOISE:
+        return linear
+    grain = torch.stack([_grain(int(seed), linear.shape[1:]) for seed in seeds]).to(linear)
+    deviation = noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt()
+    return linear + deviation * grain
+
+
+def compressed(picture: Tensor, quality: Tensor) -> Tensor:
+    """Differentiable JPEG of sRGB pictures; sizes need not be multiples of 16."""
+    from kornia.enhance import jpeg_codec_differentiable
+
+    height, width = picture.shape[-2:]
+    padded = torch.nn.functional.pad(picture, (0, -width % 16, 0, -height % 16), mode="replicate")
+    return jpeg_codec_differentiable(padded, quality)[..., :height, :width].clamp(0, 1)
+
+
+def _grain(seed: int, shape) -> Tensor:
+    # made on the CPU whatever the device, so that a GPU sees the same noise
+    return torch.randn(tuple(shape), generator=torch.Generator().manual_seed(seed))
+
+
+def _tensor(values, like: Tensor) -> Tensor:
+    return torch.as_tensor(values, dtype=like.dtype, device=like.device)

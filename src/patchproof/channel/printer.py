@@ -1,0 +1,196 @@
+"""What a printer makes of sRGB: a table from the colours sent to the colours seen on paper, differentiable.
+
+In: sRGB as sent, N×3×H×W in [0, 1]. Out: sRGB as seen by an eye adapted to the paper (media-relative: bare paper is 1),
+so that light and camera are applied once, elsewhere. A second table holds how far each colour is out of gamut (ΔE00 of
+the round trip). A printer is a name, two tables and where they come from; on disk NAME.npz and NAME.json.
+Out-of-gamut inks (offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that
+deliver sRGB clip them too. Print-to-print variation is a small function on top, `vary`.
+Left out on purpose: halftone dots (below what a camera resolves beyond 0.2 mm per pixel) and ink spread.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from patchproof.color import lab_from_srgb
+from patchproof.settings import Finite, Refused, Strict, nearest, shipped, validated
+
+# 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
+NODES_8BIT = (*range(0, 249, 8), 255)
+SIZE = len(NODES_8BIT)
+GAMUT_STEPS = 8  # the gamut table is stored in eighths of a ΔE00, up to 31.9
+
+# Extremes of print-to-print variation, drawn evenly. Assumed, from the size of the tolerances of ISO 12647-2; about
+# ΔE00 1 to 3 together, which is what repeated prints of one machine are said to differ by.
+DOT_GAIN = 0.04  # tone value at 50 %, ± (tolerance 3 to 5 %)
+DENSITY = 0.05  # share of the ink's optical density, ±
+BLACK_LIFT = 0.004  # light from the sheet's surface, ±, paper = 1
+
+
+class Paper(Strict):
+    """The sheet under the media-relative table; null where unknown."""
+
+    white_lab: tuple[Finite, Finite, Finite] | None = None  # D50, absolute
+    black_L: Finite | None = None  # L* of printed sRGB black, paper white at 100
+
+
+class _Head(Strict):
+    name: str
+    method: Literal["measured", "icc", "assumed"]
+    paper: Paper = Paper()
+    provenance: dict[str, Any] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Printer:
+    """Tables on the nodes `NODES_8BIT` of red, green, blue (in this order); `provenance` says where they come from."""
+
+    name: str
+    method: Literal["measured", "icc", "assumed"]
+    lut: Tensor  # float32 33×33×33×3, seen sRGB in [0, 1]
+    gamut: Tensor  # float32 33×33×33, ΔE00 between sent and seen
+    paper: Paper = field(default_factory=Paper)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def apply(self, srgb: Tensor) -> Tensor:
+        """Seen sRGB N×3×H×W of sent sRGB; values outside [0, 1] are clamped. Trilinear."""
+        return _look_up(self._colors, srgb)
+
+    def gamut_distance(self, srgb: Tensor) -> Tensor:
+        """N×1×H×W: ΔE00 by which the printer misses each colour; differentiable, and so a penalty."""
+        return _look_up(self._distances, srgb)
+
+    @cached_property
+    def _colors(self) -> Tensor:
+        return _bordered(self.lut)
+
+    @cached_property
+    def _distances(self) -> Tensor:
+        return _bordered(self.gamut[..., None])
+
+
+def node_colors() -> np.ndarray:
+    """float64 33×33×33×3: the sRGB colours at which the tables are known, red slowest."""
+    nodes = np.array(NODES_8BIT) / 255
+    return np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1)
+
+
+def identity_printer() -> Printer:
+    """A printer that shows what it is sent."""
+    lut = torch.tensor(node_colors(), dtype=torch.float32)
+    note = {"source": "none: an ideal printer, for comparison"}
+    return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
+
+
+def printer_from_table(
+    name: str, method: Literal["measured", "icc", "assumed"], lut: np.ndarray, gamut: np.ndarray, white_lab, provenance
+) -> Printer:
+    """A printer from arrays 33×33×33×3 (clipped to [0, 1], see the module's head) and 33×33×33; black is read off."""
+    lut = np.clip(np.asarray(lut, np.float64), 0, 1)
+    paper = Paper(white_lab=white_lab, black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
+    tables = (torch.tensor(array, dtype=torch.float32) for array in (lut, np.asarray(gamut, np.float64)))
+    return Printer(name, method, *tables, paper, provenance)
+
+
+def vary(seen_linear: Tensor, print_draw: Tensor) -> Tensor:
+    """Light `... × 3` of colours as seen, as of another print of the same file; channels last, unlike an image.
+
+    `print_draw` `... × 3` in [0, 1] broadcasts against it: dot gain, ink density, black lift; 0.5 changes nothing. Bare
+    paper stays 1. With reflectance R: coverage 1 - R (Murray-Davies) grows by 4·g·R·(1 - R); density d makes R^(1+d);
+    the surface's own light b makes b + (1 - b)·R.
+    """
+    gain, density, lift = (2 * print_draw.to(seen_linear) - 1).split(1, -1)
+    light = seen_linear * (1 - 4 * DOT_GAIN * gain * (1 - seen_linear))
+    light = light * light.clamp_min(1e-3) ** (DENSITY * density)  # the floor keeps the slope finite at black
+    return (light + BLACK_LIFT * lift * (1 - light)).clamp(0, 1)
+
+
+def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
+    """A shipped printer by name, `identity`, or a NAME.npz or NAME.json file, relative to `base`."""
+    if name_or_file == "identity":
+        return identity_printer()
+    suffix = Path(name_or_file).suffix.lower()
+    if suffix in {".icc", ".icm"}:
+        do = "bake the profile into one with patchproof calibrate printer"
+        raise Refused("a printer model (.npz)", f"the ICC profile {name_or_file}", do)
+    if suffix in {".npz", ".json"} or len(Path(name_or_file).parts) > 1:
+        return _read((base or Path()) / name_or_file)
+    known = sorted(path.stem for path in shipped("calibration", "printers").glob("*.npz"))
+    if name_or_file not in known:
+        raise Refused("a printer's name or file", f'"{name_or_file}"', nearest(name_or_file, [*known, "identity"]))
+    return _read(shipped("calibration", "printers", f"{name_or_file}.npz"))
+
+
+def save_printer(printer: Printer, folder: Path) -> Path:
+    """Write NAME.npz and NAME.json into `folder`; the same printer gives the same bytes. Returns the .npz path."""
+    lut = printer.lut.double().numpy()
+    in_8_bits = np.abs(lut * 255 - np.round(lut * 255)).max() < 1e-4  # tables from an 8-bit engine lose nothing
+    levels, kind = (255, np.uint8) if in_8_bits else (65535, np.uint16)
+    gamut = np.round(printer.gamut.double().numpy() * GAMUT_STEPS).clip(0, 255).astype(np.uint8)
+    path = folder / f"{printer.name}.npz"
+    np.savez_compressed(path, lut=np.round(lut * levels).astype(kind), gamut=gamut)
+    head = _Head(name=printer.name, method=printer.method, paper=printer.paper, provenance=printer.provenance)
+    path.with_suffix(".json").write_text(json.dumps(head.model_dump(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+    return path
+
+
+def _read(path: Path) -> Printer:
+    tables, text = path.with_suffix(".npz"), path.with_suffix(".json")
+    for file in (tables, text):
+        if not file.is_file():
+            raise Refused("a printer as NAME.npz with NAME.json beside it", f"no file at {file}", "check the path")
+    try:
+        head = validated(_Head, json.loads(text.read_text("utf-8")), str(text))
+        with zipfile.ZipFile(tables) as archive:
+            if sum(item.file_size for item in archive.infolist()) > 2**22:  # the tables take 0.3 MB
+                raise ValueError("larger than a printer can be")
+        with np.load(tables, allow_pickle=False) as arrays:
+            lut, gamut = arrays["lut"], arrays["gamut"]
+        shapes = lut.shape == (SIZE, SIZE, SIZE, 3) and gamut.shape == (SIZE, SIZE, SIZE)
+        if not shapes or lut.dtype not in (np.uint8, np.uint16) or gamut.dtype != np.uint8:
+            raise ValueError(f"tables {lut.shape} {lut.dtype} and {gamut.shape} {gamut.dtype}")
+    except Refused:
+        raise
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        reason = str(error).strip().rstrip(".")[:100]
+        raise Refused("a printer's tables", f"{path} that cannot be read ({reason})", "calibrate again") from error
+    lut_srgb = torch.tensor(lut / np.iinfo(lut.dtype).max, dtype=torch.float32)
+    distances = torch.tensor(gamut / GAMUT_STEPS, dtype=torch.float32)
+    return Printer(head.name, head.method, lut_srgb, distances, head.paper, head.provenance)
+
+
+def _bordered(table: Tensor) -> Tensor:
+    """1×C×35×35×35 with a layer of linear continuation all round.
+
+    grid_sample's gradient is zero on the outermost nodes, where pure black and white lie: a saturated pixel would never
+    move again. One layer further out, the border is out of reach.
+    """
+    table = table.permute(3, 0, 1, 2)[None]
+    for dim in (2, 3, 4):
+        first, last = table.narrow(dim, 0, 2), table.narrow(dim, SIZE - 2, 2)
+        before = 2 * first.narrow(dim, 0, 1) - first.narrow(dim, 1, 1)
+        after = 2 * last.narrow(dim, 1, 1) - last.narrow(dim, 0, 1)
+        table = torch.cat([before, table, after], dim)
+    return table.contiguous()
+
+
+def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
+    colors = srgb if srgb.dtype == torch.float64 else srgb.float()  # half precision cannot address 33 nodes finely
+    levels = 255 * colors.clamp(0, 1)
+    position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
+    grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
+    seen = torch.nn.functional.grid_sample(
+        table.to(colors), grid[None], mode="bilinear", padding_mode="border", align_corners=True
+    )
+    return seen[0].movedim(0, 1).to(srgb.dtype)

@@ -1,0 +1,100 @@
+"""Conditions: draws from a scene's ranges of pose, light, background, print and camera (expectation over transformation).
+
+In: the scene's settings and a stream. Out: `Conditions`, arrays of one value per view in physical units. Five streams share
+nothing: what trains, what selects, what is promised, what is reprinted and what is evaluated. Training and selection use
+scrambled Sobol points, which cover the ranges with fewer views; the others draw independently, so that their intervals hold.
+All follow from one seed, and a view's draw depends on its index alone: step 70 sees the same views after a resume.
+
+Source of EoT: Athalye et al., Synthesizing Robust Adversarial Examples, ICML 2018.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+
+from patchproof.settings import SceneSettings
+
+Stream = Literal["train", "select", "promise", "reprint", "evaluate"]
+_STREAMS = ("train", "select", "promise", "reprint", "evaluate")
+_SOBOL = {"train", "select"}
+
+# The sun and lamps stand within these angles of the patch's side: from behind, nothing on the patch could be seen.
+LIGHT_AZIMUTH_DEG = (-90.0, 90.0)
+LIGHT_ELEVATION_DEG = (10.0, 80.0)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """N draws; every array has N rows. Angles are relative to the patch's side, offsets are shares of the object's length."""
+
+    azimuth_deg: np.ndarray
+    elevation_deg: np.ndarray
+    distance_mm: np.ndarray
+    roll_deg: np.ndarray
+    look_at_offset: np.ndarray  # N×3
+    ambient: np.ndarray
+    directional: np.ndarray
+    light_azimuth_deg: np.ndarray
+    light_elevation_deg: np.ndarray
+    background: np.ndarray  # N×5 in [0, 1): which picture, crop size, crop x, crop y, mirrored
+    exposure_ev: np.ndarray
+    white_balance: np.ndarray  # N×3 gains of red, green, blue
+    blur_px: np.ndarray  # Gaussian sigma at the photograph's full size
+    noise: np.ndarray  # standard deviation at white, in linear light, at full size
+    jpeg: np.ndarray  # quality
+    print_draw: np.ndarray  # N×3 in [0, 1): print-to-print variation
+    noise_seed: np.ndarray  # int64
+
+    def __len__(self) -> int:
+        return len(self.azimuth_deg)
+
+    def __getitem__(self, rows) -> Conditions:
+        """The draws at a slice or index array."""
+        return replace(self, **{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+
+_DIMENSIONS = 26
+
+
+def draw(settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0) -> Conditions:
+    """Draws `start` to `start + n` of a stream."""
+    number = _STREAMS.index(stream)
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, number])))
+    return _from_unit(settings, _unit(stream, rng, start + n)[start:], seed * len(_STREAMS) + number, start)
+
+
+def _unit(stream: Stream, rng: np.random.Generator, n: int) -> np.ndarray:
+    """n×D points of the unit cube; the first k do not depend on n."""
+    if stream not in _SOBOL:
+        return rng.random((n, _DIMENSIONS))
+    from scipy.stats import qmc
+
+    return qmc.Sobol(_DIMENSIONS, rng=rng).random_base2(max(n - 1, 1).bit_length())[:n]
+
+
+def _from_unit(settings: SceneSettings, u: np.ndarray, salt: int, start: int) -> Conditions:
+    view, light, camera = settings.view, settings.light, settings.camera
+    column = iter(u.T)
+
+    def within(low_high) -> np.ndarray:
+        low, high = low_high
+        return low + (high - low) * next(column)
+
+    jitter = (-view.look_at_jitter, view.look_at_jitter)
+    spread = np.log1p(camera.white_balance)
+    pose = [within(r) for r in (view.azimuth_deg, view.elevation_deg, view.distance_mm, view.roll_deg)]
+    offset = np.stack([within(jitter) for _ in range(3)], 1)
+    lights = [within(r) for r in (light.ambient, light.directional, LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG)]
+    background = np.stack([next(column) for _ in range(5)], 1)
+    exposure = within(camera.exposure_ev)
+    red, blue = within((-spread, spread)), within((-spread, spread))
+    gains = np.exp(np.stack([red, np.zeros_like(red), blue], 1))
+    blur, noise = within(camera.blur_px), within(camera.noise)
+    jpeg = np.round(within(camera.jpeg)).astype(np.int64)
+    printed = np.stack([next(column) for _ in range(3)], 1)
+    # each view's noise is its own, whatever batch it is rendered in
+    noise_seed = (salt * 1_000_003 + start + np.arange(len(u))).astype(np.int64)
+    return Conditions(*pose, offset, *lights, background, exposure, gains, blur, noise, jpeg, printed, noise_seed)

@@ -1,0 +1,52 @@
+"""What tests share: where outside data lies, and a small scene."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+torch.set_num_threads(max(1, min(2, os.cpu_count() or 1)))
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of real networks, meshes and photographs."""
+    folder = os.environ.get("PATCHPROOF_DATA")
+    if not folder:
+        pytest.skip("needs real networks, meshes and photographs: set PATCHPROOF_DATA to their folder")
+    return Path(folder)
+
+
+SCENE = """
+[object]
+mesh = "primitive:carton"
+length_mm = 300
+up = "y"
+[patch]
+side = "+z"
+width_mm = 90
+height_mm = 90
+[target]
+label = "carton"
+models = ["builtin"]
+[view]
+azimuth_deg = [-40, 40]
+elevation_deg = [0, 25]
+distance_mm = [500, 900]
+[camera]
+photo_px = [800, 600]
+[optimize]
+steps = 3
+views = 4
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path) -> Path:
+    """A scene file of a carton with a patch, small enough for tests."""
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE, encoding="utf-8")
+    return path
