@@ -102,10 +102,18 @@ def set_stage(scene: MeshScene, device: torch.device | str = "cpu") -> Stage:
 
 
 def photograph(
-    stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int], jpeg: bool = True
+    stage: Stage,
+    piece: PiecePicture | None,
+    conditions: Conditions,
+    size_px: tuple[int, int],
+    reduced: bool = False,
+    jpeg: bool = True,
 ) -> Tensor:
-    """N×3×H×W sRGB pictures of `size_px`; `piece=None` shows the bare object. A square size shows the photo's centered square."""
-    return expose(stage, see(stage, piece, conditions, size_px), piece, jpeg)
+    """N×3×H×W sRGB pictures of `size_px`; `piece=None` shows the bare object.
+
+    A square size shows the photograph's centered square. `reduced` and `jpeg` as in `channel.camera.develop`.
+    """
+    return expose(stage, see(stage, piece, conditions, size_px), piece, reduced, jpeg)
 
 
 def see(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Seen:
@@ -162,10 +170,12 @@ def shade(stage: Stage, seen: Seen, piece: PiecePicture | None) -> Tensor:
     return image.view(len(conditions), height, width, 3).permute(0, 3, 1, 2)
 
 
-def expose(stage: Stage, seen: Seen, piece: PiecePicture | None, jpeg: bool = True) -> Tensor:
+def expose(
+    stage: Stage, seen: Seen, piece: PiecePicture | None, reduced: bool = False, jpeg: bool = True
+) -> Tensor:
     """The photographs of views already seen."""
     scale = min(seen.size_px) / min(stage.scene.settings.camera.photo_px)
-    return develop(shade(stage, seen, piece), seen.conditions, scale, jpeg)
+    return develop(shade(stage, seen, piece), seen.conditions, scale, reduced, jpeg)
 
 
 def _object_surface(stage: Stage, fragments: Fragments) -> tuple[Tensor, Tensor]:

@@ -146,7 +146,9 @@ def _heights(local: np.ndarray, faces: np.ndarray, size_mm) -> np.ndarray:
     xy = (corners[..., :2] + np.array([width, height]) / 2) / step  # net units
     low = np.maximum(np.ceil(xy.min(1)), 0).astype(np.int64)
     high = np.minimum(np.floor(xy.max(1)), GRID - 1).astype(np.int64)
-    hit = np.flatnonzero((low <= high).all(1))
+    (a, b), (c, d) = (xy[:, 1] - xy[:, 0]).T, (xy[:, 2] - xy[:, 0]).T
+    # a triangle seen edge-on covers nothing; its neighbors have its edges
+    hit = np.flatnonzero((low <= high).all(1) & (np.abs(a * d - b * c) > 1e-9))
     low, high, xy, z = low[hit], high[hit], xy[hit], corners[hit, :, 2]
     across = high[:, 0] - low[:, 0] + 1
     cells = across * (high[:, 1] - low[:, 1] + 1)
@@ -162,13 +164,12 @@ def _heights(local: np.ndarray, faces: np.ndarray, size_mm) -> np.ndarray:
 
 
 def _barycentric(triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Barycentrics P×3 of points in triangles P×3×2; NaN where a triangle has no area."""
+    """Barycentrics P×3 of points in triangles P×3×2 that have an area."""
     a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    with np.errstate(divide="ignore", invalid="ignore"):  # a triangle seen edge-on has no area
-        wb = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
-        wc = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / area
-        return np.stack([1 - wb - wc, wb, wc], 1)
+    wb = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
+    wc = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / area
+    return np.stack([1 - wb - wc, wb, wc], 1)
 
 
 def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,5 @@
+"""`python -m patchproof`."""
+
+from patchproof.cli import main
+
+main()

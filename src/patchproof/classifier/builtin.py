@@ -1,0 +1,74 @@
+"""The small network that comes with the package: twelve procedural objects, 96×96 pixels, about half a million weights.
+
+It is trained on renders of our own primitives (study/train_builtin.py; the recipe and the accuracy are in
+builtin.json), so that the demo needs no network and no download. It knows nothing of the real world: for real objects
+name a torchvision, timm or exported model. Convolutions and ReLUs only: BatchNorm is folded into the convolutions
+before saving, which is faster and leaves nothing that depends on the batch. Weights are stored as float16.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from patchproof.classifier.network import Classifier
+from patchproof.settings import Refused
+
+INPUT_PX = 96
+WIDTHS = (16, 32, 64, 96, 160)  # channels after each halving of the picture: 48, 24, 12, 6, 3 pixels
+MEAN, DEVIATION = 0.45, 0.27  # of sRGB photographs, roughly; the first layer learns the rest
+HERE = Path(__file__).parent
+
+
+class SmallNetwork(nn.Module):
+    """Five halvings, each a strided convolution and, but for the first, a residual one; then the mean and a line."""
+
+    def __init__(self, classes: int, batch_norm: bool = False):
+        super().__init__()
+        before = (3, *WIDTHS)
+        self.halve = nn.ModuleList(_conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
+        self.refine = nn.ModuleList(_conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
+        self.classify = nn.Linear(WIDTHS[-1], classes)
+
+    def forward(self, photos_srgb: Tensor) -> Tensor:
+        """N×3×96×96 sRGB in [0, 1] → N×K logits."""
+        x = torch.relu(self.halve[0]((photos_srgb - MEAN) / DEVIATION))
+        for halve, refine in zip(self.halve[1:], self.refine, strict=True):
+            x = torch.relu(halve(x))
+            x = x + torch.relu(refine(x))
+        return self.classify(x.mean((2, 3)))
+
+
+def folded(trained: SmallNetwork) -> SmallNetwork:
+    """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
+    plain = SmallNetwork(trained.classify.out_features)
+    for ours, theirs in ((plain.halve, trained.halve), (plain.refine, trained.refine)):
+        for i, (conv, norm) in enumerate(theirs):
+            ours[i] = torch.nn.utils.fuse_conv_bn_eval(conv, norm)
+    plain.classify = trained.classify
+    return plain.eval()
+
+
+def load_builtin(device: torch.device | str = "cpu", folder: Path = HERE) -> Classifier:
+    """The network from `builtin.safetensors` with the classes of `builtin.json`."""
+    from safetensors.torch import load
+
+    weights, card = folder / "builtin.safetensors", folder / "builtin.json"
+    if not weights.is_file() or not card.is_file():
+        raise Refused("the built-in network's weights beside the program", "none", "install patchproof again")
+    stored = weights.read_bytes()
+    labels = tuple(json.loads(card.read_text(encoding="utf-8"))["classes"])
+    network = SmallNetwork(len(labels))
+    network.load_state_dict({key: tensor.float() for key, tensor in load(stored).items()})
+    # channels last: a third faster on a CPU than the usual layout, for the same numbers
+    network = network.eval().to(device, memory_format=torch.channels_last)
+    return Classifier("builtin", hashlib.sha256(stored).hexdigest(), INPUT_PX, labels, network)
+
+
+def _conv(before: int, after: int, stride: int, batch_norm: bool) -> nn.Module:
+    conv = nn.Conv2d(before, after, 3, stride, padding=1, bias=not batch_norm)
+    return nn.Sequential(conv, nn.BatchNorm2d(after)) if batch_norm else conv

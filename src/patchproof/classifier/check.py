@@ -1,0 +1,100 @@
+"""A network doubted before it is used: what would make every later figure wrong, found on three made-up pictures.
+
+In: a Classifier. Out: nothing when all is well; refused where the network cannot be used (wrong outputs, probabilities
+instead of logits, chance or the batch in its answers, no gradient, not for pictures in [0, 1]); a warning where it may
+be right but looks odd. The idea is auto-attack's: a tool should distrust its own instrument.
+
+Source: Croce et al., "Flags", github.com/fra31/auto-attack, checks.py.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from torch import Tensor
+
+from patchproof.classifier.network import Classifier
+from patchproof.settings import Refused
+
+# Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
+# BatchNorm in training mode moves them by more than a hundredth.
+SAME = 5e-3
+CONSTANT = 1e-6  # of the spread: even networks without training tell these pictures apart by more
+HARDLY = 1e-3  # trained ones differ by a tenth
+
+
+def check_network(classifier: Classifier, device: torch.device | str = "cpu") -> None:
+    """Refuse a network that cannot be trusted; see the module's head."""
+    photos = _pictures(classifier.input_px).to(device)
+    name = f"the network {classifier.name}"
+    try:
+        with torch.no_grad():
+            logits, again, alone, swapped = (
+                classifier.network(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
+            )
+    except Refused:
+        raise
+    except Exception as error:  # it is the user's program: whatever it raises is about it
+        got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({_first_line(error)})"
+        raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
+    _check_outputs(logits, len(classifier.labels), name)
+    spread = float(logits.max() - logits.min())
+    if float((logits - again).abs().max()) > SAME * spread:
+        raise Refused("the same logits for the same pictures", f"others the second time from {name}", _EVAL)
+    if float((logits[1:2] - alone).abs().max()) > SAME * spread:
+        raise Refused("logits that do not depend on the rest of the batch", f"others in company from {name}", _EVAL)
+    if float((logits - logits.mean(0)).abs().max()) <= CONSTANT * spread:
+        do = "let it take sRGB in [0, 1], with its normalization inside"
+        raise Refused("a network that tells pictures apart", f"{name}, whose logits are the same for all", do)
+    _check_gradient(classifier, photos, name)
+    for doubt in _doubts(logits, swapped, spread):
+        warnings.warn(f"{name} {doubt}", stacklevel=2)
+
+
+_EVAL = "export it in evaluation mode, so that dropout and batch statistics are frozen"
+
+
+def _check_outputs(logits: Tensor, classes: int, name: str) -> None:
+    """Shape, finite values, and no softmax at the end."""
+    if not isinstance(logits, Tensor) or logits.shape != (3, classes):
+        got = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+        do = "give it as many labels as it has outputs"
+        raise Refused(f"{classes} logits for each picture, as there are labels", f"{got} for 3 from {name}", do)
+    if not torch.isfinite(logits).all():
+        raise Refused("finite logits", f"NaN or infinity from {name}", "check its weights and its number format")
+    if logits.min() >= 0 and logits.max() <= 1 and ((logits.sum(1) - 1).abs() < 1e-3).all():
+        raise Refused("logits", f"probabilities from {name} (rows that sum to 1)", "leave its last softmax out")
+
+
+def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
+    """The best logit's gradient reaches the pixels, finite and not zero."""
+    photos = photos.clone().requires_grad_(True)
+    best = classifier.network(photos).max(1).values.sum()
+    gradient = torch.autograd.grad(best, photos, allow_unused=True)[0] if best.requires_grad else None
+    if gradient is None or not torch.isfinite(gradient).all() or not (gradient.abs().amax((1, 2, 3)) > 0).all():
+        got = f"{name} with " + ("none" if gradient is None else "a zero or infinite one")
+        raise Refused("a gradient from the logits to the pixels", got, "use a network of differentiable operations")
+
+
+def _doubts(logits: Tensor, swapped: Tensor, spread: float) -> list[str]:
+    """What is odd but can be right."""
+    doubts = []
+    if float((logits - logits.mean(0)).abs().max()) <= HARDLY * spread:
+        doubts.append("hardly tells pictures apart: does it take sRGB in [0, 1], with its normalization inside?")
+    elif float((logits - swapped).abs().max()) <= HARDLY * spread:
+        doubts.append("gives the same logits when red and blue are swapped: it may not see color")
+    if (torch.softmax(logits.double(), 1).amax(1) > 1 - 1e-6).all():
+        doubts.append("is certain of pictures that show nothing: its gradients may be too small to optimize with")
+    return doubts
+
+
+def _pictures(size_px: int) -> Tensor:
+    """Three smooth colored pictures in [0, 1], 3×3×S×S, the same every time."""
+    coarse = torch.rand(3, 3, 6, 6, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.interpolate(coarse, (size_px, size_px), mode="bilinear", align_corners=False)
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}"

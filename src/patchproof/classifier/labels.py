@@ -1,0 +1,47 @@
+"""From the words of a scene file to a network's output indices.
+
+A label is an index, or any comma-separated name of an entry: "jeep" is in "jeep, landrover". Case does not matter and
+an underscore is a space. The whole entry counts as a name too. A name in several entries is refused with the indices
+it could be, an absent one with the nearest names.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+from patchproof.settings import Refused
+
+
+def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | int] = ()) -> tuple[int, ...]:
+    """Output indices of the target and of the labels accepted for it, the target first, none twice."""
+    return tuple(dict.fromkeys(_find(labels, word) for word in (label, *accept)))
+
+
+def _find(labels: Sequence[str], label: str | int) -> int:
+    if isinstance(label, int):
+        if not 0 <= label < len(labels):
+            raise Refused(f"a label index from 0 to {len(labels) - 1}", str(label), "use one of those, or a name")
+        return label
+    found = [i for i, entry in enumerate(labels) if _folded(label) in map(_folded, [entry, *entry.split(",")])]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        could_be = " or ".join(f'{i} ("{labels[i]}")' for i in found)
+        raise Refused(
+            "a label that names one class", f'"{label}", which is in {len(found)}', f"use the index {could_be}"
+        )
+    raise Refused("a label that the network knows", f'"{label}"', _nearest(labels, label))
+
+
+def _folded(text: str) -> str:
+    return " ".join(text.casefold().replace("_", " ").split())
+
+
+def _nearest(labels: Sequence[str], label: str) -> str:
+    names = {_folded(name): name.strip() for entry in labels for name in entry.split(",")}
+    near = difflib.get_close_matches(_folded(label), names, 3, 0.6)
+    if near:
+        return "did you mean " + " or ".join(f'"{names[word]}"' for word in near)
+    shown = ", ".join(list(names.values())[:5]) + (", ..." if len(names) > 5 else "")
+    return f"use an index below {len(labels)} or one of its {len(labels)} labels ({shown})"

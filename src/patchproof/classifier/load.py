@@ -1,0 +1,54 @@
+"""From a model's name to a classifier that has been doubted and found usable.
+
+    builtin                the small network that comes with the package (builtin.py)
+    file:NAME.pt2          a torch.export program with NAME.json beside it (program.py)
+    torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py)
+    timm:NAME
+    module:package.factory the user's own code, which is imported and called (custom.py)
+
+Paths are relative to the scene file's folder and may hold `${VAR}`. Networks come frozen: evaluation mode, no weight
+gradients. Several names are simply several classifiers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from patchproof.classifier.check import check_network
+from patchproof.classifier.network import Classifier
+from patchproof.settings import Refused, expand
+
+
+def load_classifier(name: str, base: Path, device: torch.device | str = "cpu") -> Classifier:
+    """The classifier of that name on `device`, refused in one sentence where it is missing or cannot be trusted."""
+    kind, _, rest = expand(name, Path(base)).partition(":")
+    if name == "builtin":
+        from patchproof.classifier.builtin import load_builtin
+
+        classifier = load_builtin(device)
+    elif kind == "file":
+        from patchproof.classifier.program import load_program
+
+        classifier = load_program(Path(rest), device)
+    elif kind in ("torchvision", "timm"):
+        from patchproof.classifier.zoo import load_timm, load_torchvision
+
+        loader: Callable = load_torchvision if kind == "torchvision" else load_timm
+        classifier = loader(rest, device)
+    elif kind == "module":
+        from patchproof.classifier.custom import load_custom
+
+        classifier = load_custom(rest, Path(base), device)
+    else:
+        known = "builtin, torchvision:NAME, timm:NAME, file:NAME.pt2 or module:package.factory"
+        do = f'write "file:{name}"' if name.endswith(".pt2") else "write one of these"
+        raise Refused(f"a model named {known}", f'"{name}"', do)
+    classifier = replace(classifier, name=name)
+    if isinstance(classifier.network, torch.nn.Module):
+        classifier.network.requires_grad_(False)
+    check_network(classifier, device)
+    return classifier

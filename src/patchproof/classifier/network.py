@@ -1,0 +1,54 @@
+"""The classifier as the rest of the project sees it: photographs in, logits out, and what counts as recognized.
+
+In: N×3×H×W sRGB in [0, 1] of any size. Out: N×K logits. Normalization belongs to the network, cropping and resizing to
+the centered square belongs here. Recognized means that the top-1 label is among the target's indices.
+Left out on purpose: labels' meaning (labels.py), loading (load.py), ensembles (a tuple of classifiers is one).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from patchproof.classifier.view import center_square
+
+
+def confidence(logits: Tensor, indices: Sequence[int]) -> Tensor:
+    """N summed softmax of the labels in `indices`; float64, so that 1 - 1e-9 is not 1."""
+    return torch.softmax(logits.double(), dim=1)[:, list(indices)].sum(1)
+
+
+def recognized(logits: Tensor, indices: Sequence[int]) -> Tensor:
+    """N bool: the largest logit is one of `indices`."""
+    return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
+
+
+@dataclass(frozen=True)
+class Classifier:
+    """A frozen network with its labels; `network` takes N×3×S×S sRGB in [0, 1], S = `input_px`, gives N×K logits."""
+
+    name: str  # as written in the scene file
+    sha256: str | None  # of the weights or the file; None where nothing can be hashed
+    input_px: int
+    labels: tuple[str, ...]
+    network: Callable[[Tensor], Tensor]
+
+    confidence = staticmethod(confidence)
+    recognized = staticmethod(recognized)
+
+    def logits(self, photos_srgb: Tensor) -> Tensor:
+        """N×K logits of the photographs' centered squares."""
+        return self.network(center_square(photos_srgb, self.input_px))
+
+
+def weights_sha256(network: torch.nn.Module) -> str:
+    """SHA-256 over names, types, shapes and bytes of a module's state, in the order of the names."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(network.state_dict().items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()

@@ -1,0 +1,91 @@
+"""`torchvision:NAME` and `timm:NAME`: published networks with their published weights.
+
+The weights are downloaded by these libraries, and only because the scene file names the model. The libraries are not
+needed otherwise: where one is missing, the sentence says what to install. Input size, labels and the mean and standard
+deviation that the weights were trained with are the library's own figures; normalization is put inside the network.
+Their resize-then-crop is left out on purpose: here every network sees the whole centered square.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from patchproof.classifier.network import Classifier, weights_sha256
+from patchproof.settings import Refused
+
+
+class Normalized(nn.Module):
+    """A network that wants (x - mean) / std, as one that takes sRGB in [0, 1]."""
+
+    def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float]):
+        super().__init__()
+        self.network = network
+        self.register_buffer("mean", torch.tensor(mean).reshape(1, -1, 1, 1))
+        self.register_buffer("std", torch.tensor(std).reshape(1, -1, 1, 1))
+
+    def forward(self, photos_srgb: Tensor) -> Tensor:
+        """N×3×S×S sRGB in [0, 1] → N×K logits."""
+        return self.network((photos_srgb - self.mean) / self.std)
+
+
+def load_torchvision(name: str, device: torch.device | str = "cpu") -> Classifier:
+    """A torchvision classification model with its default weights."""
+    models = _library("torchvision").models
+    known = models.list_models(module=models)  # segmentation, detection and video have modules of their own
+    if name not in known:
+        raise Refused("a torchvision classifier", f'"{name}"', _near(name, known, "torchvision.models.list_models()"))
+    weights = models.get_model_weights(name).DEFAULT
+    network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
+    seen = weights.transforms()
+    normalized = Normalized(network, seen.mean, seen.std)
+    return _classifier(f"torchvision:{name}", normalized, seen.crop_size[0], weights.meta["categories"], device)
+
+
+def load_timm(name: str, device: torch.device | str = "cpu") -> Classifier:
+    """A timm model with its pretrained weights, for the ImageNet subsets that timm has the labels of."""
+    timm = _library("timm")
+    if not timm.is_model(name):
+        raise Refused("a timm model", f'"{name}"', _near(name, timm.list_models(), "timm.list_models()"))
+    network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
+    subset = timm.data.infer_imagenet_subset(network)
+    if not subset:
+        do = "use one trained on ImageNet, or write a module:package.factory with its labels"
+        raise Refused("a timm model whose labels are known", f'"{name}" with {network.num_classes} outputs', do)
+    info, seen = timm.data.ImageNetInfo(subset), timm.data.resolve_model_data_config(network)
+    labels = [info.index_to_description(index) for index in range(network.num_classes)]
+    return _classifier(
+        f"timm:{name}", Normalized(network, seen["mean"], seen["std"]), seen["input_size"][-1], labels, device
+    )
+
+
+def _classifier(name: str, network: nn.Module, input_px: int, labels: Sequence[str], device) -> Classifier:
+    network = network.eval().to(device)
+    return Classifier(name, weights_sha256(network), int(input_px), tuple(labels), network)
+
+
+def _downloaded(name: str, load: Callable[[], nn.Module]) -> nn.Module:
+    try:
+        return load()
+    except Exception as error:  # each library raises its own for no network, no weights and no space
+        got = f"{type(error).__name__} ({(str(error).strip().splitlines() or [''])[0][:200]})"
+        raise Refused(f"the published weights of {name}", got, "check the name and the way to the internet") from error
+
+
+def _near(name: str, known: Sequence[str], where: str) -> str:
+    near = difflib.get_close_matches(name, known, 3, 0.6)
+    return "did you mean " + " or ".join(f'"{word}"' for word in near) if near else f"choose one of {where}"
+
+
+def _library(name: str):
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a build for another torch raises RuntimeError, not ImportError
+        missing = isinstance(error, ModuleNotFoundError) and error.name == name
+        got = "none" if missing else f"one that cannot be imported ({error})"
+        do = 'run pip install "patchproof[models]"'
+        raise Refused(f"the library {name} for {name}:NAME", got, do) from error

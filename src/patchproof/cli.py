@@ -1,0 +1,300 @@
+"""The command line: verbs only. Each one reads its arguments, calls one function, and prints a short summary.
+
+Heavy imports happen inside the verbs, so that help is quick. What a user can cause ends in one sentence and exit code 1.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from patchproof.settings import Refused
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Optimise a patch on a 3D object, print it at true size, photograph it, and judge the photographs.",
+)
+
+
+class Control(str, Enum):
+    """Controls that can be printed."""
+
+    mean = "mean"
+    grey = "grey"
+    noise = "noise"
+    shuffled = "shuffled"
+    blank = "blank"
+
+
+class Shown(str, Enum):
+    """What hangs on the object in place of the design."""
+
+    bare = "bare"
+    mean = "mean"
+    grey = "grey"
+    noise = "noise"
+
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
+Device = Annotated[str, typer.Option(help="cpu or cuda.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
+Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
+        "patchproof-demo"
+    ),
+    overwrite: Overwrite = False,
+) -> None:
+    """The whole journey, offline, on a built-in object and classifier."""
+    from patchproof.study.demo import run_demo
+
+    with _progress() as bar:
+        summary = run_demo(out, overwrite=overwrite, on_stage=bar)
+    _say(*summary)
+
+
+@app.command()
+def optimize(
+    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
+    out: Annotated[Path, typer.Option(help="Folder for the run.")],
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
+    overwrite: Overwrite = False,
+    device: Device = "cpu",
+    seed: Seed = None,
+) -> None:
+    """Optimise the patch of a scene and promise its rate."""
+    from patchproof.optimize.run import optimize as optimize_scene
+    from patchproof.report.summary import promise_lines
+
+    with _progress() as bar:
+        run = optimize_scene(
+            scene,
+            out,
+            seed=seed,
+            device=device,
+            resume=resume,
+            overwrite=overwrite,
+            on_scene=lambda loaded: _warn(loaded.warnings),
+            on_step=lambda step, total: bar("optimise", step.state.number, total),
+            on_promise=lambda done, total: bar("promise", done, total),
+        )
+    _say(*promise_lines(run.promise), f"run: {out}")
+
+
+@app.command()
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="A finished run.")],
+    models: Models = None,
+    n: Annotated[int, typer.Option(min=1, help="Fresh conditions.")] = 400,
+    seed: Seed = None,
+    device: Device = "cpu",
+) -> None:
+    """Rates on fresh conditions, with controls, on any classifiers."""
+    from patchproof.optimize.evaluate import evaluate as evaluate_run
+    from patchproof.report.summary import evaluation_lines
+
+    with _progress() as bar:
+        result = evaluate_run(
+            run,
+            models=_names(models),
+            n=n,
+            seed=seed,
+            device=device,
+            on_view=lambda done, total: bar("evaluate", done, total),
+        )
+    _say(*evaluation_lines(result), f"written: {run / 'evaluate.json'}")
+
+
+@app.command()
+def sheet(
+    out: Annotated[Path, typer.Option(help="The PDF; its manifest is written beside it.")],
+    run: Annotated[Path | None, typer.Argument(help="A finished run; none for a blank page.")] = None,
+    template: Annotated[str | None, typer.Option(help="A template's name or file.")] = None,
+    control: Annotated[Control | None, typer.Option(help="The sheet of a control in place of the design's.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the page: design, markers, chart and rulers at true size."""
+    from patchproof.optimize.run import load_run
+    from patchproof.output import check_file
+    from patchproof.sheet.write import check_sheet
+    from patchproof.study.sheet import sheet_of
+
+    for path in (out, out.with_suffix(".json")):
+        check_file(path, overwrite)
+    manifest = sheet_of(load_run(run), out, template=template, control=control.value if control else None)
+    _say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {out.with_suffix('.json').name}")
+    if check:
+        _say(*check_sheet(manifest))
+
+
+@app.command()
+def reprint(
+    pdf: Annotated[Path, typer.Argument(help="A sheet's PDF.")],
+    run: Annotated[Path, typer.Option(help="The run it was made from.")],
+    n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
+    out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
+    seed: Seed = None,
+    printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
+    print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
+    control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
+    scan_dpi: Annotated[
+        float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Print the PDF in simulation, put it back on the object, and photograph it."""
+    from patchproof.optimize.run import load_run
+    from patchproof.study.reprint import reprint as reprint_sheet
+    from patchproof.study.reprint import scan
+
+    scale = _pair(print_scale, "--print-scale")
+    if scan_dpi is not None and control is not None:
+        raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
+    if scan_dpi is not None:
+        truth = scan(pdf, load_run(run), n, out, scan_dpi, printer=printer, print_scale=scale, overwrite=overwrite)
+    else:
+        with _progress() as bar:
+            truth = reprint_sheet(
+                pdf,
+                load_run(run),
+                n,
+                out,
+                seed=seed,
+                printer=printer,
+                print_scale=scale,
+                control=control.value if control else None,
+                overwrite=overwrite,
+                on_photo=lambda done, total: bar("photograph", done, total),
+            )
+    _say(f"{len(truth)} photographs: {out}")
+
+
+@app.command()
+def verify(
+    photos: Annotated[Path, typer.Argument(help="A folder of photographs.")],
+    sheet: Annotated[Path, typer.Option(help="The manifest that was written beside the PDF.")],
+    out: Annotated[Path, typer.Option(help="Folder for the report.")],
+    models: Models = None,
+    controls: Annotated[Path | None, typer.Option(help="Photographs of a control, one control per folder.")] = None,
+    scan_dpi: Annotated[
+        float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
+    ] = None,
+    ruler_mm: Annotated[
+        str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")
+    ] = None,
+    require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that measure photographs.")] = 1,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure photographs of the print and judge them against the promise."""
+    from patchproof.report.summary import verdict_lines
+    from patchproof.study.verify import verify as verify_photos
+
+    if require not in (None, "kept"):
+        raise typer.BadParameter('takes "kept" only', param_hint="--require")
+    with _progress() as bar:
+        report = verify_photos(
+            photos,
+            sheet,
+            out,
+            models=_names(models),
+            controls=controls,
+            scan_dpi=scan_dpi,
+            ruler_mm=None if ruler_mm is None else _pair(ruler_mm, "--ruler-mm"),
+            jobs=jobs,
+            overwrite=overwrite,
+            on_photo=lambda done, total: bar("verify", done, total),
+        )
+    _say(*verdict_lines(report), f"report: {out / 'report.html'}")
+    nothing = report.summary.judged == 0 and report.summary.measured == 0
+    if nothing:
+        print(
+            "Expected photographs that can be judged or measured, got none: see the codes in the report.",
+            file=sys.stderr,
+        )
+    raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)
+
+
+def main() -> None:
+    """Run the command line; a refusal is one sentence on standard error and exit code 1."""
+    warnings.formatwarning = lambda message, *where: f"warning: {message}\n"
+    try:
+        app()
+    except Refused as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("Stopped.", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar with time left on standard error: call it with a stage's name, what is done, and the total."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description:>12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        tasks: dict[str, int] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def _say(*lines: str) -> None:
+    for line in lines:
+        print(line)
+
+
+def _warn(lines: tuple[str, ...]) -> None:
+    for line in lines:
+        print(f"warning: {line}", file=sys.stderr)
+
+
+def _names(models: str | None) -> tuple[str, ...] | None:
+    return None if models is None else tuple(name.strip() for name in models.split(",") if name.strip())
+
+
+def _pair(text: str, option: str) -> tuple[float, float]:
+    """A number, or two as XxY."""
+    try:
+        numbers = [float(part) for part in text.lower().split("x")]
+        x, y = numbers * 2 if len(numbers) == 1 else numbers
+        if not (0 < x < float("inf") and 0 < y < float("inf")):
+            raise ValueError
+    except ValueError:
+        raise typer.BadParameter(
+            "takes one or two positive numbers, such as 0.97 or 0.97x0.98", param_hint=option
+        ) from None
+    return x, y

@@ -1,0 +1,144 @@
+"""The loop: draw conditions, photograph the piece, descend.
+
+In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's business.
+The design starts at mid-gray. Adam, or signed steps as in FGSM and PGD (Goodfellow et al. 2015, Madry et al. 2018), always
+clipped to [0, 1]. Every few steps the design is tried on a fixed selection set, and the best one is kept: a design that
+suited its last twelve views only is not what gets printed. The promise set is never touched here.
+
+A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from patchproof.optimize.goals import target_loss, total_variation
+from patchproof.optimize.problem import Problem, as_pixels, from_pixels
+from patchproof.render.photograph import Seen, expose, photograph, see
+
+SELECT_EVERY = 10
+SELECT_VIEWS = 64
+SELECT_CHUNK = 16
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that the next step depends on; tensors 3×h×w."""
+
+    number: int
+    design: Tensor
+    mean: Tensor  # Adam's running mean and square of the gradient
+    square: Tensor
+    best: Tensor
+    best_loss: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step did. Rates and confidence are over this step's training views; `select_*` where the design was tried."""
+
+    state: State
+    loss: float
+    confidence: float
+    rate: float
+    gradient: float  # largest absolute value; 0 means that the classifier no longer tells designs apart
+    select_loss: float | None = None
+    select_rate: float | None = None
+    pictures: Tensor | None = field(default=None, repr=False)
+
+
+def start(problem: Problem) -> State:
+    """The state before the first step: a mid-gray design."""
+    width, height = problem.design_px
+    design = torch.full((3, height, width), 0.5, device=problem.device)
+    zero = torch.zeros_like(design)
+    return State(0, design, zero, zero, design)
+
+
+def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
+    """The steps from `state` (or from the start) to the last one that the scene's settings ask for."""
+    state = start(problem) if state is None else state
+    settings = problem.scene.settings.optimize
+    conditions = problem.scene.draw("train", settings.steps * settings.views)
+    selection = _selection(problem)
+    while state.number < settings.steps:
+        first = state.number * settings.views
+        step = _step(problem, state, conditions[first : first + settings.views])
+        if step.state.number % SELECT_EVERY == 0 or step.state.number == settings.steps:
+            step = _select(problem, selection, step)
+        state = step.state
+        yield step
+
+
+def _step(problem: Problem, state: State, conditions) -> Step:
+    settings = problem.scene.settings
+    design = state.design.clone().requires_grad_()
+    size = (problem.network_px, problem.network_px)
+    pictures = photograph(problem.stage, problem.piece_picture(design), conditions, size, reduced=True)
+    losses, confidences, rates = _score(problem, pictures)
+    loss = losses + settings.optimize.tv * total_variation(design)
+    if settings.optimize.gamut:
+        # ΔE00 / 100: one unit of loss for black in place of white
+        loss = loss + settings.optimize.gamut * problem.gamut_excess(design) / 100
+    (gradient,) = torch.autograd.grad(loss, design)
+    moved = _descend(state, gradient, problem)
+    return Step(
+        moved, float(loss.detach()), confidences, rates, float(gradient.abs().max()), pictures=pictures.detach()
+    )
+
+
+def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
+    """One update of the design, clipped to what can be printed."""
+    settings = problem.scene.settings.optimize
+    number = state.number + 1
+    if settings.optimizer == "sign":
+        design = (state.design - settings.step_size * gradient.sign()).clamp(0, 1)
+        return replace(state, number=number, design=design)
+    mean = torch.lerp(gradient, state.mean, _BETAS[0])
+    square = torch.lerp(gradient**2, state.square, _BETAS[1])
+    unbiased = mean / (1 - _BETAS[0] ** number)
+    scale = (square / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON
+    design = (state.design - settings.step_size * unbiased / scale).clamp(0, 1)
+    return replace(state, number=number, design=design, mean=mean, square=square)
+
+
+def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
+    """Mean loss over classifiers and pictures; mean confidence and rate of the same."""
+    goal = problem.scene.settings.target.goal
+    losses, confidence, rate = [], 0.0, 0.0
+    for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
+        logits = classifier.logits(pictures)
+        losses.append(target_loss(logits, indices, goal).mean())
+        confidence += float(classifier.confidence(logits.detach(), indices).mean())
+        rate += float(classifier.recognized(logits.detach(), indices).double().mean())
+    count = len(losses)
+    return torch.stack(losses).mean(), confidence / count, rate / count
+
+
+def _selection(problem: Problem) -> list[Seen]:
+    """The selection views, seen once and shaded anew for each design."""
+    conditions = problem.scene.draw("select", SELECT_VIEWS)
+    size = (problem.network_px, problem.network_px)
+    piece = problem.piece_picture(start(problem).design)
+    with torch.no_grad():
+        parts = (conditions[i : i + SELECT_CHUNK] for i in range(0, SELECT_VIEWS, SELECT_CHUNK))
+        return [see(problem.stage, piece, part, size) for part in parts]
+
+
+def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
+    """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
+    state = step.state
+    printed = from_pixels(as_pixels(state.design), problem.device)
+    with torch.no_grad():
+        piece = problem.piece_picture(printed)
+        scores = [_score(problem, expose(problem.stage, seen, piece, reduced=True)) for seen in selection]
+    loss = sum(float(score[0]) for score in scores) / len(scores)
+    rate = sum(score[2] for score in scores) / len(scores)
+    if loss < state.best_loss:
+        state = replace(state, best=state.design, best_loss=loss)
+    return replace(step, state=state, select_loss=loss, select_rate=rate)

@@ -1,0 +1,93 @@
+"""What is optimized: one design on one stage, in front of one or more classifiers.
+
+In: a scene, the names of its classifiers and its printer. Out: `Problem`, from which the loop, the promise and `evaluate` take
+the pictures that each design gives. The whole piece is shown, design and printed frame, because that is what will hang there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.channel.printer import Printer, load_printer
+from patchproof.classifier.labels import find_labels
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
+from patchproof.color import linear_from_srgb
+from patchproof.render.photograph import PiecePicture, Stage, set_stage
+from patchproof.scene.scene import MeshScene
+from patchproof.sheet.piece import FrameImage, frame_image, lay_out_piece
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A scene on a device with its printer, classifiers and, per classifier, the label indices that count."""
+
+    scene: MeshScene
+    stage: Stage
+    printer: Printer
+    classifiers: tuple[Classifier, ...]
+    indices: tuple[tuple[int, ...], ...]
+    design_px: tuple[int, int]
+
+    @property
+    def network_px(self) -> int:
+        """The side at which views are rendered: the largest of the networks' input sizes."""
+        return max(classifier.input_px for classifier in self.classifiers)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.stage.vertices.device
+
+    def piece_picture(self, design_srgb: Tensor, kind: str = "design") -> PiecePicture:
+        """The printed piece round a design 3×h×w in [0, 1]; differentiable in the design."""
+        frame, printed_frame = self._frame(kind, (design_srgb.shape[2], design_srgb.shape[1]))
+        x0, y0, width, height = frame.design_box_px
+        printed = linear_from_srgb(self.printer.apply(design_srgb[None])[0]).permute(1, 2, 0)
+        rows = torch.cat(
+            [printed_frame[y0 : y0 + height, :x0], printed, printed_frame[y0 : y0 + height, x0 + width :]], 1
+        )
+        return PiecePicture(torch.cat([printed_frame[:y0], rows, printed_frame[y0 + height :]]), frame.piece_box_px)
+
+    def gamut_excess(self, design_srgb: Tensor) -> Tensor:
+        """Mean ΔE00 by which the printer misses the design's colors."""
+        return self.printer.gamut_distance(design_srgb[None]).mean()
+
+    @lru_cache(maxsize=8)  # noqa: B019 - a problem lives as long as its run
+    def _frame(self, kind: str, design_px: tuple[int, int]) -> tuple[FrameImage, Tensor]:
+        """The frame of a kind of sheet, as drawn and as printed (linear H×W×3)."""
+        patch = self.scene.settings.patch
+        piece = self.scene.piece
+        if kind != "design":
+            # the control's own marker ids, as they will be printed
+            marker_mm = piece.module_mm * 7
+            piece = lay_out_piece((patch.width_mm, patch.height_mm), marker_mm, self.scene.sheet_id, kind)
+        frame = frame_image(piece, design_px)
+        sent = torch.tensor(np.asarray(frame.srgb), dtype=torch.float32, device=self.device).permute(2, 0, 1)[None]
+        return frame, linear_from_srgb(self.printer.apply(sent)[0]).permute(1, 2, 0)
+
+
+def set_problem(scene: MeshScene, device: str = "cpu", models: tuple[str, ...] | None = None) -> Problem:
+    """The problem that a scene states; `models` replaces the scene's own classifiers."""
+    settings = scene.settings
+    classifiers = tuple(load_classifier(name, scene.base, device) for name in models or settings.target.models)
+    accept = settings.target.accept
+    indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
+    printer = load_printer(settings.printer.profile, scene.base)
+    network_px = max(classifier.input_px for classifier in classifiers)
+    return Problem(scene, set_stage(scene, device), printer, classifiers, indices, scene.design_px(network_px))
+
+
+def as_pixels(design_srgb: Tensor) -> np.ndarray:
+    """A design 3×h×w in [0, 1] as the uint8 h×w×3 that goes to the printer."""
+    return (design_srgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+
+
+def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """A printed design's pixels as 3×h×w in [0, 1]."""
+    return torch.tensor(pixels, dtype=torch.float32, device=device).permute(2, 0, 1) / 255

@@ -1,0 +1,227 @@
+"""A run's folder: what an optimization leaves behind, written so that a kill at any moment loses ten steps at most.
+
+In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl` (one flushed
+line per step), `views.png` and `checkpoint.safetensors` (replaced atomically). Nothing in it depends on the time of day, so that
+the same seed gives the same bytes on one machine with one thread count and device.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+import patchproof
+from patchproof.optimize.loop import SELECT_EVERY, State, Step, start, steps
+from patchproof.optimize.problem import Problem, as_pixels, set_problem
+from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.output import check_folder, make_folder, write_whole
+from patchproof.scene.scene import MeshScene, build_scene, load_scene
+from patchproof.settings import Refused, SceneSettings, validated
+from patchproof.sheet.manifest import Promise
+
+_CHECKPOINT, _LOG, _RUN, _DESIGN, _VIEWS = (
+    "checkpoint.safetensors",
+    "steps.jsonl",
+    "run.json",
+    "design.png",
+    "views.png",
+)
+OWN = (_CHECKPOINT, _LOG, _RUN, _DESIGN, _VIEWS, "evaluate.json", ".*.part")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, read back."""
+
+    folder: Path
+    scene: MeshScene
+    design: np.ndarray  # uint8 h×w×3
+    promise: Promise
+    details: dict[str, Any]
+
+
+def optimize(
+    scene_path: str | Path,
+    out: str | Path,
+    *,
+    seed: int | None = None,
+    device: str = "cpu",
+    resume: bool = False,
+    overwrite: bool = False,
+    on_step: Callable[[Step, int], None] = lambda step, total: None,
+    on_promise: Callable[[int, int], None] = lambda done, total: None,
+    on_scene: Callable[[MeshScene], None] = lambda scene: None,
+) -> Run:
+    """Optimize the scene's patch into the folder `out` and promise its rate; `resume` goes on from its checkpoint."""
+    out = Path(out)
+    if not resume:
+        check_folder(out, OWN, overwrite)
+    scene = load_scene(scene_path, seed)
+    on_scene(scene)
+    problem = set_problem(scene, device)
+    if not resume:
+        _clear(out)
+    make_folder(out)
+    state = _resumed(out, problem) if resume else start(problem)
+    design = _loop(problem, state, out, on_step)
+    write_whole(out / _DESIGN, lambda path: Image.fromarray(design).save(path, "PNG"))
+    promise = _promise(problem, design, on_promise)
+    details = _details(problem, promise, Path(scene_path).resolve().parent, out, device)
+    write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
+    return Run(out, scene, design, promise, details)
+
+
+def load_run(folder: str | Path) -> Run:
+    """A finished run; refused where it is none, or not finished."""
+    folder = Path(folder)
+    if not (folder / _RUN).is_file():
+        begun = (folder / _CHECKPOINT).is_file()
+        do = "finish it with --resume" if begun else "name the folder that optimize wrote"
+        raise Refused("a finished run", f"{'an unfinished one' if begun else 'none'} at {folder}", do)
+    try:
+        details = json.loads((folder / _RUN).read_text(encoding="utf-8"))
+        settings = validated(SceneSettings, details["settings"], str(folder / _RUN))
+        promise = validated(Promise, details["promise"], str(folder / _RUN))
+        with Image.open(folder / _DESIGN) as image:
+            design = np.asarray(image.convert("RGB"))
+        base, seed = folder / details["scene_folder"], details["seed"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, Refused):
+            raise
+        raise Refused("a finished run", f"{folder} that cannot be read ({error})", "optimize again") from error
+    return Run(folder, build_scene(settings, base.resolve(), seed), design, promise, details)
+
+
+def _clear(out: Path) -> None:
+    """Remove an earlier run, now that everything the new one needs has been read."""
+    for name in OWN[:-1]:
+        (out / name).unlink(missing_ok=True)
+
+
+def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, int], None]) -> np.ndarray:
+    """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
+    total = problem.scene.settings.optimize.steps
+    _cut_log(out / _LOG, state.number)
+    with open(out / _LOG, "a", encoding="utf-8") as log:
+        for step in steps(problem, state):
+            state = step.state
+            log.write(json.dumps(_log_line(step)) + "\n")
+            log.flush()
+            if step.select_loss is not None:
+                write_whole(out / _CHECKPOINT, lambda path, state=state: _save(state, problem, path))
+            if state.number == total:
+                write_whole(out / _VIEWS, lambda path, step=step: _contact_sheet(step.pictures).save(path, "PNG"))
+            on_step(step, total)
+    return as_pixels(state.best)
+
+
+def _promise(problem: Problem, design: np.ndarray, on_promise: Callable[[int, int], None]) -> Promise:
+    done = 0
+
+    def progress(n: int) -> None:
+        nonlocal done
+        done += n
+        on_promise(done, PROMISE_VIEWS)
+
+    return promise_from(problem, try_out(problem, design, problem.scene.draw("promise", PROMISE_VIEWS), progress))
+
+
+def _log_line(step: Step) -> dict[str, Any]:
+    line = {
+        "step": step.state.number,
+        "loss": step.loss,
+        "confidence": step.confidence,
+        "rate": step.rate,
+        "gradient": step.gradient,
+    }
+    if step.select_loss is not None:
+        line |= {"select_loss": step.select_loss, "select_rate": step.select_rate}
+    return line
+
+
+def _save(state: State, problem: Problem, path: Path) -> None:
+    from safetensors.torch import save_file
+
+    tensors = {name: getattr(state, name).cpu().contiguous().clone() for name in ("design", "mean", "square", "best")}
+    # the loss as text keeps every bit; the sheet id tells whose checkpoint this is
+    note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
+    # one key: safetensors writes several in an order of its own
+    save_file(tensors, path, metadata={"state": json.dumps(note)})
+
+
+def _resumed(out: Path, problem: Problem) -> State:
+    """The checkpoint's state, or the start where there is none; refused where it belongs to another scene or seed."""
+    path = out / _CHECKPOINT
+    if not path.is_file():
+        return start(problem)
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt", device=str(problem.device)) as file:
+            note = json.loads((file.metadata() or {})["state"])
+            tensors = {name: file.get_tensor(name) for name in ("design", "mean", "square", "best")}
+        state = State(note["number"], **tensors, best_loss=float.fromhex(note["best_loss"]))
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise Refused(
+            "a checkpoint", f"{path} that cannot be read ({error})", "start anew in another folder"
+        ) from error
+    if note.get("sheet_id") != problem.scene.sheet_id:
+        raise Refused(
+            "the checkpoint of this scene and seed",
+            f"one of another in {out}",
+            "resume with the same scene file and seed, or start anew in another folder",
+        )
+    return state
+
+
+def _cut_log(path: Path, number: int) -> None:
+    """Drop log lines after the step that the run goes on from."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[:number] if path.is_file() else []
+    write_whole(path, lambda part: part.write_text("".join(lines), encoding="utf-8"))
+
+
+def _details(problem: Problem, promise: Promise, scene_folder: Path, out: Path, device: str) -> dict[str, Any]:
+    scene = problem.scene
+    packages = ("torch", "numpy", "kornia", "trimesh")  # those that pixels depend on
+    return {
+        "sheet_id": scene.sheet_id,
+        "seed": scene.seed,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "versions": {"patchproof": patchproof.__version__} | {name: version(name) for name in packages},
+        "scene_folder": os.path.relpath(scene_folder, out.resolve()),
+        "settings": scene.settings.model_dump(mode="json"),
+        "printer": problem.printer.provenance | {"method": problem.printer.method},
+        "placement": {
+            "gap_mm": scene.card.gap_mm,
+            "gap_mean_mm": scene.card.gap_mean_mm,
+            "overhang_share": scene.card.overhang_share,
+            "piece_mm": scene.piece.size_mm,
+            "marker_mm": scene.piece.module_mm * 7,
+            "unreadable_share": scene.unreadable_share,
+        },
+        "warnings": list(scene.warnings),
+        "select_every": SELECT_EVERY,
+        "promise": promise.model_dump(mode="json"),
+    }
+
+
+def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:
+    """The step's training views side by side."""
+    pixels = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+    rows = -(-len(pixels) // columns)
+    count, height, width, _ = pixels.shape
+    blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)
+    grid = np.concatenate([pixels, blank]).reshape(rows, columns, height, width, 3)
+    return Image.fromarray(grid.swapaxes(1, 2).reshape(rows * height, columns * width, 3))

@@ -1,0 +1,66 @@
+"""From what the camera saw to what was promised: an affine map in linear light, fitted to swatches or to paper and ink.
+
+In: linear light as photographed and as promised, media-relative (paper = 1). Out: `ColorFit`. The ladder: with at
+least eight usable swatches a full affine map (12 numbers: gains, channel mixing and a veil), fitted robustly; else
+per channel from paper and ink. Either takes out light and camera; what no affine map explains stays, and that is what
+a colour difference should measure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+LEAST_SWATCHES = 8  # 12 numbers from 24 values; fewer have let one bad swatch turn the map
+
+
+@dataclass(frozen=True)
+class ColorFit:
+    """`promised = matrix[:, :3] @ seen + matrix[:, 3]`; the name says what it was fitted to."""
+
+    name: str
+    matrix: np.ndarray
+
+    def apply(self, linear: np.ndarray) -> np.ndarray:
+        """Linear light `... × 3` as the promise would have it."""
+        return linear @ self.matrix[:, :3].T + self.matrix[:, 3]
+
+
+def affine12(seen: np.ndarray, promised: np.ndarray) -> ColorFit | None:
+    """Robust affine map of N×3 swatches; None where they are too few or too much alike to hold it.
+
+    Fitted from promised to seen and turned round: the promise is exact, and a glare on one swatch is then an outlier
+    of the answer and not of the question, where it would pull the map towards itself.
+    """
+    if len(seen) < LEAST_SWATCHES:
+        return None
+    rows = np.column_stack([promised, np.ones(len(promised))])
+    singular = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-12), compute_uv=False)
+    if singular[-1] < 0.02 * singular[0]:
+        return None
+    # errors count as the eye sees them: steps of code values are finer in the dark
+    eye = 1 / (np.maximum(seen.mean(1), 0) + 0.05) ** 0.6
+    weight = np.ones(len(seen))
+    for turn in range(30):
+        w = (eye * np.sqrt(weight))[:, None]
+        seen_from_promised = np.linalg.lstsq(rows * w, seen * w, rcond=None)[0].T
+        error = eye * np.linalg.norm(rows @ seen_from_promised.T - seen, axis=1)
+        spread = max(1.4826 * float(np.median(error)), 1e-6)
+        if turn < 10:
+            weight = np.minimum(1, 1.345 * spread / np.maximum(error, 1e-12))  # Huber finds the basin,
+        else:
+            weight = np.maximum(1 - (error / (4.685 * spread)) ** 2, 0) ** 2  # Tukey lets the outliers go
+        if (weight > 0).sum() < LEAST_SWATCHES - 2:
+            return None
+    gains, veil = seen_from_promised[:, :3], seen_from_promised[:, 3]
+    if np.linalg.cond(gains) > 50:  # no camera mixes its channels so far
+        return None
+    back = np.linalg.inv(gains)
+    return ColorFit("affine12", np.column_stack([back, -back @ veil]))
+
+
+def white_black(paper: np.ndarray, ink: np.ndarray, promised_ink: np.ndarray) -> ColorFit:
+    """Per-channel map that takes photographed paper to 1 and photographed ink to the promised one."""
+    gain = (1 - promised_ink) / np.maximum(paper - ink, 1e-3)
+    return ColorFit("white_black", np.column_stack([np.diag(gain), promised_ink - gain * ink]))

@@ -1,0 +1,200 @@
+"""The straight black-to-white borders of markers, measured to a fraction of a pixel in linear light.
+
+In: linear luminance, rough corners and the printed cells. Out: per marker the corners where its four fitted borders
+meet, the blur of those borders and the light of ink and paper beside them. What a Gaussian blur σ makes of a border,
+with the rim one module m wide and the cells behind it known (q is their blurred row, 1 = paper):
+
+    light(s, t) = black + (white - black) · [Φ(u / σ) + q(s) · Φ(-(u + m) / σ)],   u = t - d - a·s
+
+s along the border in [-1, 1], t outwards in px; fitted by damped Gauss-Newton over all borders at once. Linear light,
+because a lens blurs light and not code values. Stretches that do not follow the model (a thumb, a glare) are left
+out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtr
+
+ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
+# in modules: inwards the printed cells are known, outwards only one module of paper is
+INWARD, OUTWARD = 1.0, 0.6
+# what sampling adds to the blur: a pixel's own width (1/12 px²) and bilinear interpolation (mean over phases 1/6 px²)
+_SAMPLING_VARIANCE = 1 / 12 + 1 / 6
+
+
+@dataclass(frozen=True)
+class Borders:
+    """One marker: corners 4×2 px, Gaussian blur (0 when sharper than the pixels), linear light of ink and paper."""
+
+    corners_px: np.ndarray
+    blur_px: float
+    black: float
+    white: float
+    module_px: float
+    fitted: bool  # False: the borders could not be fitted, the corners are as they came
+
+
+def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray) -> list[Borders]:
+    """Fit all borders of M×4×2 rough corners (clockwise); `cells` M×n×n are the modules, rim included, 1 = paper."""
+    rough, modules = np.asarray(corners_px, float), cells.shape[1]
+    behind = np.stack(
+        [cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1
+    )  # M×4×n, along each border
+    corners, state = rough, None
+    for _ in range(2):  # the second round samples across the borders that the first one found
+        state = _fit_round(luminance, corners, behind)
+        moved = np.linalg.norm(state[0] - rough, axis=2).max(1)
+        near = moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
+        good = near & state[1]
+        corners = np.where(good[:, None, None], state[0], rough)
+    _, _, sigma, black, white = state
+    module = _module_px(corners, modules)
+    return [
+        Borders(
+            corners[m],
+            float(np.sqrt(max(0.0, np.median(sigma[m]) ** 2 - _SAMPLING_VARIANCE))),
+            float(np.median(black[m])),
+            float(np.median(white[m])),
+            float(np.sqrt(module[m, 0] * module[m, 1])),
+            bool(good[m]),
+        )
+        for m in range(len(corners))
+    ]
+
+
+def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Bilinear values of H×W or H×W×C at `... × 2` pixel positions (centres at .5); the rim is repeated."""
+    where = [points[..., 1] - 0.5, points[..., 0] - 0.5]
+    if image.ndim == 2:
+        return map_coordinates(image, where, order=1, mode="nearest")
+    return np.stack([map_coordinates(image[..., c], where, order=1, mode="nearest") for c in range(image.shape[2])], -1)
+
+
+def border_frame(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middle, half-length vector and outward unit normal (each M×4×2) of the borders of clockwise corners."""
+    start, end = corners, np.roll(corners, -1, axis=1)
+    half = (end - start) / 2
+    normal = np.stack([half[..., 1], -half[..., 0]], -1)
+    return (start + end) / 2, half, normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+
+
+def _module_px(corners: np.ndarray, modules: int) -> np.ndarray:
+    """Module size across each border, M×4: the quadrilateral's mean depth behind that border."""
+    middle, _, normal = border_frame(corners)
+    depth = np.einsum("mij,mij->mi", middle - np.roll(middle, -2, axis=1), normal)
+    return np.maximum(depth, 1e-3) / modules
+
+
+def _fit_round(luminance, corners, behind):
+    middle, half, normal = border_frame(corners)
+    module = _module_px(corners, behind.shape[2])
+    inward, outward = np.clip(INWARD * module, 1.2, 12.0), np.clip(OUTWARD * module, 1.0, 10.0)
+    s = np.linspace(-0.87, 0.87, ALONG)
+    t = np.linspace(-inward, outward, ACROSS, axis=-1)  # M×4×ACROSS
+    points = (
+        middle[:, :, None, None]
+        + s[:, None, None] * half[:, :, None, None]
+        + t[:, :, None, :, None] * normal[:, :, None, None]
+    )
+    light = sample(luminance, points)
+    count = len(corners) * 4
+    along_px = np.linalg.norm(half, axis=-1)
+    model = _Model(s, t.reshape(count, ACROSS), module.ravel(), along_px.ravel(), behind.reshape(count, -1))
+    fit = _fit_steps(light.reshape(count, ALONG, ACROSS), model)
+    d, a, sigma, black, white = (fit[:, i].reshape(-1, 4) for i in range(5))
+    ends = [middle + sign * half + (d + sign * a)[..., None] * normal for sign in (-1, 1)]
+    fitted = (white - black > 0.01).all(1) & (np.abs(d) < outward).all(1) & np.isfinite(fit).reshape(-1, 20).all(1)
+    return _meet(*ends), fitted, sigma, black, white
+
+
+def _meet(start, end):
+    """Corners M×4×2 where each border meets the one before it."""
+    p, u = start, end - start
+    q, v = np.roll(start, 1, axis=1), np.roll(u, 1, axis=1)
+    cross = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    cross = np.where(np.abs(cross) < 1e-9, 1e-9, cross)
+    gap = q - p
+    along = (gap[..., 0] * v[..., 1] - gap[..., 1] * v[..., 0]) / cross
+    return p + along[..., None] * u
+
+
+@dataclass(frozen=True)
+class _Model:
+    """What K sampled borders should follow: s, t K×ACROSS px, module K px, half-length K px, cells K×n."""
+
+    s: np.ndarray
+    t: np.ndarray
+    module: np.ndarray
+    half_px: np.ndarray
+    cells: np.ndarray
+
+    def shares(self, theta):
+        """(paper's share of the light, its derivatives by u and by log σ), each K×ALONG×ACROSS."""
+        d, a, log_sigma = (theta[:, i, None, None] for i in range(3))
+        sigma = np.exp(log_sigma)
+        u = self.t[:, None, :] - d - a * self.s[:, None]
+        outer, inner = u / sigma, -(u + self.module[:, None, None]) / sigma
+        row = self._blurred_row(sigma[:, 0])[..., None]
+        bell_out, bell_in = _bell(outer), row * _bell(inner)
+        return ndtr(outer) + row * ndtr(inner), (bell_out - bell_in) / sigma, -bell_out * outer - bell_in * inner
+
+    def _blurred_row(self, sigma):
+        """q: the cells behind the rim as the blur leaves them, K×ALONG."""
+        n = self.cells.shape[1]
+        place = (self.s + 1) / 2 * n  # in modules from the border's start
+        z = (place[None, :, None] - np.arange(n + 1)) * (2 * self.half_px / n / sigma[:, 0])[:, None, None]
+        steps = ndtr(z)
+        return ((steps[..., :-1] - steps[..., 1:]) * self.cells[:, None, :]).sum(-1)
+
+
+def _bell(z):
+    return np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
+
+
+def _fit_steps(light, model):
+    """Parameters K×5 (d, a, σ, black, white) of K borders from K×ALONG×ACROSS samples."""
+    reach = model.t[:, -1]
+    black, white = light[:, :, 4:9].min(2).mean(1), light[:, :, -4:].mean((1, 2))
+    theta = np.stack([0 * reach, 0 * reach, np.log(np.maximum(0.25 * reach, 0.5)), black, white], 1)
+    weight = np.ones(light.shape[:2])
+    for round_ in range(2):
+        theta = _gauss_newton(theta, light, model, weight, reach)
+        if round_ == 0:  # stretches that fit far worse than the border's typical one show something else
+            misfit = np.sqrt(((_light(theta, model)[0] - light) ** 2).mean(2))
+            floor = 0.03 * np.abs(theta[:, 4] - theta[:, 3])
+            weight = (misfit < 3 * np.maximum(np.median(misfit, 1), floor)[:, None]).astype(float)
+    theta[:, 2] = np.exp(theta[:, 2])
+    return theta
+
+
+def _light(theta, model):
+    black, white = theta[:, 3, None, None], theta[:, 4, None, None]
+    shares = model.shares(theta)
+    return black + (white - black) * shares[0], *shares
+
+
+def _gauss_newton(theta, light, model, weight, reach):
+    damping = np.full(len(theta), 1e-3)
+    cost = ((light - _light(theta, model)[0]) ** 2 * weight[..., None]).sum((1, 2))
+    for _ in range(12):
+        value, share, by_u, by_log_sigma = _light(theta, model)
+        span = (theta[:, 4] - theta[:, 3])[:, None, None]
+        columns = [-by_u * span, -by_u * span * model.s[:, None], by_log_sigma * span, 1 - share, share]
+        jacobian = np.stack(columns, -1)
+        weighted = jacobian * weight[..., None, None]
+        normal = np.einsum("kstp,kstq->kpq", weighted, jacobian)
+        gradient = np.einsum("kstp,kst->kp", weighted, light - value)
+        scale = np.einsum("kpp->kp", normal) + 1e-9
+        step = np.linalg.solve(normal + (damping[:, None] * scale)[..., None] * np.eye(5), gradient[..., None])[..., 0]
+        trial = theta + step
+        trial[:, 0] = np.clip(trial[:, 0], -reach, reach)
+        trial[:, 2] = np.clip(trial[:, 2], np.log(0.25), np.log(2 * reach))
+        new = ((light - _light(trial, model)[0]) ** 2 * weight[..., None]).sum((1, 2))
+        better = new <= cost
+        theta, cost = np.where(better[:, None], trial, theta), np.where(better, new, cost)
+        damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-7, 1e6)
+    return theta

@@ -1,0 +1,133 @@
+"""A photograph file as upright 8-bit sRGB pixels, with its focal length where the camera wrote one.
+
+In: any still picture that Pillow reads as one of `FORMATS` (HEIC with the `heic` extra). Out: `Photo`. EXIF
+orientation is applied, an embedded colour profile (phones write Display P3) is converted to sRGB, alpha lies on
+white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, so that one bad file
+never stops a batch. Ignored on purpose: the DPI that a photograph claims, and sidecar files.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.photo.cannot import CannotJudge
+
+SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
+# an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
+FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
+LARGEST_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
+_DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
+_ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An upright photograph: uint8 H×W×3 sRGB, focal length in its own pixels or None."""
+
+    srgb: np.ndarray
+    focal_px: float | None
+    path: Path
+
+
+def read_photo(path: str | Path) -> Photo:
+    """The photograph at `path`; `CannotJudge("unreadable")` where there is none that can be read whole."""
+    from PIL import Image, ImageOps
+
+    path = Path(path)
+    _allow_heic(path)
+    try:
+        with warnings.catch_warnings():
+            # oversized pictures get our own limit below; odd EXIF is not worth a word
+            warnings.simplefilter("ignore")
+            with Image.open(path, formats=_formats(Image)) as image:
+                pixels = image.width * image.height
+                if pixels > LARGEST_PX:
+                    raise _unreadable(
+                        f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX
+                    )
+                focal_35mm = _focal_35mm(image)
+                upright = ImageOps.exif_transpose(image)
+                srgb = np.ascontiguousarray(_eight_bit_rgb(_in_srgb(upright)))
+    except CannotJudge:
+        raise
+    except (
+        Exception
+    ) as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...); all mean the same here
+        raise _unreadable(_why(path, error)) from error
+    diagonal_px = math.hypot(*srgb.shape[:2])
+    return Photo(srgb, focal_35mm / _DIAGONAL_35MM * diagonal_px if focal_35mm else None, path)
+
+
+def _formats(image_module) -> list[str]:
+    image_module.init()
+    return [name for name in FORMATS if name in image_module.OPEN]
+
+
+def _allow_heic(path: Path) -> None:
+    if path.suffix.lower() not in {".heic", ".heif"}:
+        return
+    try:
+        import pillow_heif
+    except ImportError:
+        advice = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
+        raise _unreadable(advice) from None
+    pillow_heif.register_heif_opener()
+
+
+def _focal_35mm(image) -> float | None:
+    try:
+        value = float(image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
+    except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
+        return None
+    return value if math.isfinite(value) and value > 0 else None  # 0 means unknown in EXIF
+
+
+def _in_srgb(image):
+    """The picture converted from its embedded profile; as it is where there is none or the profile is broken."""
+    from PIL import ImageCms
+
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in {"RGB", "CMYK"}:
+        return image
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if "srgb" in ImageCms.getProfileDescription(source).lower():
+            return image
+        return ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        return image
+
+
+def _eight_bit_rgb(image) -> np.ndarray:
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image, float)
+        # 16-bit grey arrives as I;16 or I; floating point TIFF counts from 0 to 1
+        top = 65535.0 if image.mode.startswith("I") else max(1.0, float(np.nanmax(values, initial=0)))
+        gray = np.clip(np.nan_to_num(values) / top * 255 + 0.5, 0, 255).astype(np.uint8)
+        return np.repeat(gray[..., None], 3, axis=2)
+    if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "La", "RGBa"}:
+        from PIL import Image
+
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    return np.asarray(image.convert("RGB"))
+
+
+def _why(path: Path, error: Exception) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "the file is gone: copy it again"
+    if isinstance(error, MemoryError) or type(error).__name__ == "DecompressionBombError":
+        return "the picture is too large: save it smaller"
+    if type(error).__name__ == "UnidentifiedImageError":
+        return f"{path.name} is not a picture of a known kind: save it as JPEG or PNG"
+    return f"{path.name} is damaged or cut short: copy it again from the camera"
+
+
+def _unreadable(advice: str, figure: float | None = None, threshold: float | None = None) -> CannotJudge:
+    return CannotJudge("unreadable", figure, threshold, advice)

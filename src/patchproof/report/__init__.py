@@ -1,0 +1,1 @@
+"""The report of a verification: JSON for programs, one self-contained page for people."""

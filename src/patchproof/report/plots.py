@@ -1,0 +1,73 @@
+"""Where photographs were recognized and where not: small plots as inline SVG that follow the page's text colour.
+
+In: entries of a report as plain data. Out: SVG text. Points lie at 0 or 1 with a little fixed scatter; the line is a
+running share of the nearest photographs, and is drawn only where there are enough of them to mean something.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+_INK = "#010203"  # stands for the page's own text colour and is replaced in the SVG
+_YES, _NO = "#2a9d6f", "#d1495b"
+_LEAST_FOR_LINE = 24
+
+
+def recognition_plot(
+    photos: Sequence[Mapping], model: str, figure: str, label: str, promised: Sequence[Mapping]
+) -> str | None:
+    """Recognition by one figure of the photographs; None where fewer than two photographs have it."""
+    x, y = _points(photos, figure, lambda photo: photo["predictions"].get(model, {}).get("recognized"))
+    if len(x) < 2:
+        return None
+    px, py = _points(promised, figure, lambda condition: condition["recognized"])
+    return _svg(lambda axes: _draw(axes, x, y, px, py, label))
+
+
+def _points(rows, figure, recognized) -> tuple[np.ndarray, np.ndarray]:
+    pairs = [(row[figure], recognized(row)) for row in rows if row.get(figure) is not None]
+    pairs = sorted((float(value), float(hit)) for value, hit in pairs if hit is not None)
+    return np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+
+
+def _draw(axes, x, y, promised_x, promised_y, label) -> None:
+    scatter = ((np.arange(len(x)) * 0.618) % 1 - 0.5) * 0.12
+    axes.scatter(x, y + scatter, s=16, c=[_YES if hit else _NO for hit in y], alpha=0.75, linewidths=0)
+    for points, hits, style in ((promised_x, promised_y, ":"), (x, y, "-")):
+        if len(points) >= _LEAST_FOR_LINE:
+            axes.plot(*_running_share(points, hits), style, color=_INK, linewidth=1.3)
+    axes.set_xlabel(label)
+    axes.set_ylim(-0.15, 1.15)
+    axes.set_yticks([0, 0.5, 1], ["not recognized", "50 %", "recognized"])
+
+
+def _running_share(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    width = max(5, len(x) // 4)
+    window = np.ones(width) / width
+    return np.convolve(x, window, "valid"), np.convolve(y, window, "valid")
+
+
+def _svg(draw) -> str:
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    # text stays text in the page's own font; ids follow from a fixed salt, so that reports have the same bytes
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "patchproof", "font.size": 9}):
+        figure = Figure(figsize=(4.2, 2.3), layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = figure.add_subplot()
+        draw(axes)
+        axes.spines[["top", "right"]].set_visible(False)
+        for spine in axes.spines.values():
+            spine.set_color(_INK)
+        axes.tick_params(colors=_INK)
+        axes.xaxis.label.set_color(_INK)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    return text.replace(_INK, "currentColor").replace("font-family: 'DejaVu Sans', sans-serif", "font-family: inherit")

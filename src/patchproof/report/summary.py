@@ -1,0 +1,62 @@
+"""Short summaries for the terminal: what a person wants to know before opening any file.
+
+In: a promise, an evaluation or a report. Out: lines of text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def promise_lines(promise: Any) -> list[str]:
+    """The promised rate and how it compares with each control."""
+    low, high = promise.interval
+    target = promise.target
+    lines = [
+        f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
+        f"[{low:.1%}, {high:.1%}] by {promise.models[0].name}"
+    ]
+    lines += [
+        f"  also {model.name}: {model.rate:.1%} [{model.interval[0]:.1%}, {model.interval[1]:.1%}]"
+        for model in promise.models[1:]
+    ]
+    return lines + _control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()})
+
+
+def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
+    """Each network's rate and controls."""
+    lines = []
+    for name, found in result["models"].items():
+        low, high = found["interval"]
+        lines.append(f"{name}: recognized in {found['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]")
+        lines += _control_lines(found["controls"])
+    return lines
+
+
+def verdict_lines(report: Any) -> list[str]:
+    """The verdict and the counts behind it."""
+    summary = report.summary
+    lines = [f"verdict: {summary.verdict} (effect: {summary.effect})"]
+    lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
+    if summary.rate is not None:
+        low, high = summary.interval
+        lines.append(f"recognized: {summary.rate:.1%} [{low:.1%}, {high:.1%}]")
+    if summary.prediction_interval is not None:
+        k_low, k_high = summary.prediction_interval
+        lines.append(f"promised: {k_low} to {k_high} of {summary.judged}")
+    codes: dict[str, int] = {}
+    for photo in report.photos:
+        if photo.code:
+            codes[photo.code] = codes.get(photo.code, 0) + 1
+    return lines + [f"  {code}: {count}" for code, count in sorted(codes.items())]
+
+
+def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    rows = []
+    for kind, claim in controls.items():
+        low, high = claim["difference_interval"]
+        rows.append(
+            f"  {kind:>6}: {claim['rate']:6.1%}   difference {100 * claim['difference']:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]"
+        )
+    return rows

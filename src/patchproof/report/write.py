@@ -1,0 +1,169 @@
+"""Write a report: report.json as it is, report.html for people, and the pictures beside them.
+
+In: the report and its manifest as plain data, pictures as arrays by photo and kind. Out: a folder. The page needs
+nothing from outside of itself: styles are inline, pictures are data URIs, there is no script. The same input gives
+the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from patchproof.report.images import DELTA_TOP, data_uri, delta_map, jpeg, png
+from patchproof.report.plots import recognition_plot
+
+_LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
+_WORDS = {
+    "kept": ("Promise kept", "The photographs show what was promised before printing."),
+    "broken": ("Promise broken", "The photographs show less than was promised before printing."),
+    "cannot_tell": ("Cannot tell", "The photographs are too weak as evidence, one way or the other."),
+}
+_BROKEN_DECEIVE = "The photographs show more recognition than was promised before printing."
+_EFFECTS = {
+    "shown": "The patch itself makes the difference: it did better than every control.",
+    "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
+    "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
+}
+_PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimetre"))
+
+
+def write_report(
+    report: Mapping[str, Any],
+    manifest: Mapping[str, Any],
+    pictures: Mapping[str, Mapping[str, np.ndarray]],
+    out_dir: str | Path,
+    notes: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write report.json, report.html and pictures/ into `out_dir`; returns the page's path.
+
+    `report` and `manifest` are `model_dump()`s. `pictures[file]` may hold `photo`, `seen`, `fitted`, `promised`
+    (uint8 sRGB) and `delta_e00` (float cells, NaN = not measured). `notes` may hold `reason` (one sentence) and
+    `controls` (rows of the control photographs).
+    """
+    out = Path(out_dir)
+    (out / "pictures").mkdir(parents=True, exist_ok=True)
+    encoded = {file: _encode(kinds) for file, kinds in pictures.items()}
+    for file, kinds in encoded.items():
+        for kind, content in kinds.items():
+            suffix = "png" if content.startswith(b"\x89PNG") else "jpg"
+            (out / "pictures" / f"{file}.{kind}.{suffix}").write_bytes(content)
+    (out / "report.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    page = out / "report.html"
+    page.write_text(render(report, manifest, encoded, notes or {}), encoding="utf-8")
+    return page
+
+
+def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], notes: Mapping) -> str:
+    """The page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
+    import jinja2
+
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters |= {"percent": _percent, "figure": _figure}
+    promise = manifest.get("promise")
+    primary = promise["models"][0]["name"] if promise else None
+    headline, plain = _words(report["summary"]["verdict"], promise)
+    return environment.get_template("page.html.j2").render(
+        report=report,
+        summary=report["summary"],
+        manifest=manifest,
+        promise=promise,
+        primary=primary,
+        headline=headline,
+        plain=plain,
+        effect=_EFFECTS[report["summary"]["effect"]],
+        reason=notes.get("reason", ""),
+        bars=_bars(report["summary"], promise, notes.get("controls", ())),
+        controls=notes.get("controls", ()),
+        plots=_plots(report, promise, primary),
+        cards=[_card(photo, encoded.get(photo["file"], {})) for photo in report["photos"]],
+        codes=_codes(report["photos"]),
+        delta_top=DELTA_TOP,
+        settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
+        versions=_versions(),
+    )
+
+
+def _words(verdict: str, promise: Mapping | None) -> tuple[str, str]:
+    headline, plain = _WORDS[verdict]
+    if verdict == "broken" and promise["target"]["goal"] == "deceive":
+        plain = _BROKEN_DECEIVE
+    return headline, plain
+
+
+def _encode(kinds: Mapping[str, np.ndarray]) -> dict[str, bytes]:
+    return {kind: png(delta_map(a)) if kind == "delta_e00" else jpeg(a) for kind, a in sorted(kinds.items())}
+
+
+def _bars(summary: Mapping, promise: Mapping | None, controls) -> list[dict]:
+    """Rows of the chart of rates: name, rate, interval, and which side of the evidence they belong to."""
+    rows = []
+    if summary["rate"] is not None:
+        rows.append(_bar("These photographs", summary["rate"], summary["interval"], "seen"))
+    if promise:
+        rows.append(_bar("Promised", promise["rate"], promise["interval"], "promised"))
+    if summary["matched_rate"] is not None:
+        rows.append(_bar("Promised at these views", summary["matched_rate"], None, "promised"))
+    if summary["prediction_interval"] and summary["judged"]:
+        allowed = [count / summary["judged"] for count in summary["prediction_interval"]]
+        rows.append(_bar(f"Allowed for {summary['judged']} photographs", None, allowed, "allowed"))
+    for control in controls:
+        if control["n"]:
+            rows.append(
+                _bar(
+                    f"Control: {control['name']}", control["recognized"] / control["n"], control["interval"], "control"
+                )
+            )
+    for name, claim in (promise["controls"] if promise else {}).items():
+        rows.append(_bar(f"Promised control: {name}", claim["rate"], claim["interval"], "control"))
+    return rows
+
+
+def _bar(name: str, rate: float | None, interval, kind: str) -> dict:
+    return {"name": name, "rate": rate, "interval": interval, "kind": kind}
+
+
+def _plots(report: Mapping, promise: Mapping | None, primary: str | None) -> list[str]:
+    if not promise:
+        return []
+    judged = [photo for photo in report["photos"] if photo["status"] != "rejected"]
+    drawn = [recognition_plot(judged, primary, name, label, promise["conditions"]) for name, label in _PLOTS]
+    return [svg for svg in drawn if svg]
+
+
+def _card(photo: Mapping, kinds: Mapping[str, bytes]) -> dict:
+    return {"photo": photo, "pictures": {kind: data_uri(content) for kind, content in kinds.items()}}
+
+
+def _codes(photos) -> list[tuple[str, int]]:
+    counts: dict[str, int] = {}
+    for photo in photos:
+        if photo["code"]:
+            counts[photo["code"]] = counts.get(photo["code"], 0) + 1
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+
+def _versions() -> list[tuple[str, str]]:
+    found = []
+    for name in _LIBRARIES:
+        try:
+            found.append((name, version(name)))
+        except PackageNotFoundError:  # run from a checkout, or another of OpenCV's four wheels
+            continue
+    return found
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.0f} %"
+
+
+def _figure(value: float | None, digits: int = 2) -> str:
+    return "not measured" if value is None else f"{value:.{digits}f}"

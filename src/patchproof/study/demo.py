@@ -1,0 +1,86 @@
+"""The demo: the whole journey on an object and a classifier that come with the package, offline, in two minutes.
+
+In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard ones on purpose: far, dim, oblique and
+cluttered, so that the bare object and the controls are often misread and there is something to gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from patchproof.optimize.run import optimize
+from patchproof.output import new_folder
+from patchproof.report.summary import promise_lines, verdict_lines
+from patchproof.study.reprint import reprint
+from patchproof.study.sheet import sheet_of
+from patchproof.study.verify import verify
+
+PHOTOS = 40
+OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
+
+SCENE = """\
+# A box truck of the size of a toy, under conditions that make it hard to recognise: far, dim, oblique and cluttered.
+[object]
+mesh = "primitive:box_truck"
+length_mm = 480
+up = "y"
+
+[patch]
+side = "+z"
+width_mm = 110
+height_mm = 110
+
+[target]
+label = "box truck"
+models = ["builtin"]
+
+[view]
+azimuth_deg = [-60, 60]
+elevation_deg = [-5, 40]
+distance_mm = [700, 1400]
+look_at_jitter = 0.15
+roll_deg = [-12, 12]
+
+[light]
+ambient = [0.1, 0.5]
+directional = [0.05, 0.5]
+
+[background]
+images = "clutter"
+
+[optimize]
+steps = 120
+views = 16
+"""
+
+
+def run_demo(
+    out: str | Path, *, overwrite: bool = False, on_stage: Callable[[str, int, int], None] = lambda name, done, total: None
+) -> list[str]:
+    """Run every step into the folder `out`; returns the summary's lines."""
+    with new_folder(out, OWN, overwrite) as folder:
+        scene = folder / "scene.toml"
+        scene.write_text(SCENE, encoding="utf-8")
+        run = optimize(
+            scene,
+            folder / "run",
+            on_step=lambda step, total: on_stage("optimise", step.state.number, total),
+            on_promise=lambda done, total: on_stage("promise", done, total),
+        )
+        sheet_of(run, folder / "sheet.pdf")
+        reprint(
+            folder / "sheet.pdf", run, PHOTOS, folder / "photos", on_photo=lambda done, total: on_stage("photograph", done, total)
+        )
+        report = verify(
+            folder / "photos",
+            folder / "sheet.json",
+            folder / "report",
+            on_photo=lambda done, total: on_stage("verify", done, total),
+        )
+    lines = [
+        "Hard conditions on purpose: far, dim, oblique and cluttered, so that bare object and controls are often misread.",
+        *promise_lines(run.promise),
+        *verdict_lines(report),
+    ]
+    return [*lines, *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html"))]

@@ -1,0 +1,215 @@
+"""Simulated reprints: the PDF itself, printed by a printer model, put back on the object and photographed.
+
+In: a sheet's PDF and the run it belongs to. Out: a folder of JPEG photographs at the scene's `photo_px`, as a phone would write
+them (EXIF focal length), and `truth.json` with each one's homography, marker corners and conditions. What is photographed are
+the pixels that another library reads from the PDF, so that an error in the page shows here and not at the print shop.
+With `scan_dpi` the uncut page is scanned flat instead. Conditions come from the reprint stream, which nothing else has seen.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from PIL import Image
+
+from patchproof import geometry
+from patchproof.channel.printer import Printer, load_printer
+from patchproof.color import linear_from_srgb
+from patchproof.optimize.run import Run
+from patchproof.output import new_folder
+from patchproof.render.photograph import PiecePicture, Stage, photograph, set_stage
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.scene import MeshScene, build_scene
+from patchproof.settings import Refused
+from patchproof.sheet.manifest import Manifest
+from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
+from patchproof.study.sheet import sheet_of
+
+# The print is rasterized this much finer than the closest view can see.
+OVERSAMPLING = 1.25
+DPI_RANGE = (100.0, 400.0)
+_FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal length refers
+SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
+OWN = ("photo_*.jpg", "scan_*.jpg", "truth.json")
+
+
+def reprint(
+    pdf_path: str | Path,
+    run: Run,
+    n: int,
+    out: str | Path,
+    *,
+    seed: int | None = None,
+    printer: str | None = None,
+    print_scale: tuple[float, float] = (1.0, 1.0),
+    control: str | None = None,
+    overwrite: bool = False,
+    on_photo: Callable[[int, int], None] = lambda done, total: None,
+) -> dict:
+    """Write n photographs and truth.json into the folder `out`; returns the truth.
+
+    `control` hangs up that control's own sheet (mean, grey, noise) in place of the PDF's, or nothing (bare).
+    """
+    if control not in (None, "bare"):
+        with TemporaryDirectory() as folder:
+            control_pdf = Path(folder) / "control.pdf"
+            template = sheet_scene(pdf_path, run)[1].settings.sheet.template
+            sheet_of(run, control_pdf, template=template, control=control)
+            return reprint(
+                control_pdf,
+                run,
+                n,
+                out,
+                seed=seed,
+                printer=printer,
+                print_scale=print_scale,
+                overwrite=overwrite,
+                on_photo=on_photo,
+            )
+    bare = control == "bare"
+    manifest, scene = sheet_scene(pdf_path, run)
+    scene = scaled_print(scene, print_scale)
+    piece = None if bare else printed_piece(pdf_path, manifest, scene, _printer(run, printer))
+    stage, conditions, truth = set_stage(scene), scene.draw("reprint", n, seed), {}
+    with new_folder(out, OWN, overwrite) as folder:
+        for i in range(n):
+            one, name = conditions[i : i + 1], f"photo_{i + 1:04d}.jpg"
+            take_photo(stage, piece, one, folder / name)
+            truth[name] = _truth(scene, None if bare else manifest, one, print_scale)
+            on_photo(i + 1, n)
+        _write_json(folder / "truth.json", truth)
+    return truth
+
+
+def scan(
+    pdf_path: str | Path,
+    run: Run,
+    n: int,
+    out: str | Path,
+    dpi: float,
+    *,
+    printer: str | None = None,
+    print_scale: tuple[float, float] = (1.0, 1.0),
+    overwrite: bool = False,
+) -> dict:
+    """Write n flat scans of the uncut page, printed at `print_scale` and scanned at `dpi`."""
+    import cv2
+
+    manifest, _ = sheet_scene(pdf_path, run)
+    page = torch.tensor(page_pixels(pdf_path, 1, 2 * dpi)).permute(2, 0, 1)[None] / 255  # twice as fine as the scan
+    seen = _printer(run, printer).apply(page)[0].permute(1, 2, 0).numpy()
+    size_px = tuple(round(side * dpi / 25.4) for side in manifest.page_mm)
+    # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
+    matrix = np.array(
+        [[scale / 2 if i == j else 0 for j in (0, 1)] + [scale / 4 - 0.5] for i, scale in enumerate(print_scale)]
+    )
+    soft = cv2.GaussianBlur(seen, (0, 0), SCAN_BLUR_PX)
+    picture = cv2.warpAffine(soft, matrix, size_px, borderValue=(1.0, 1.0, 1.0))
+    homography, truth = np.diag([dpi / 25.4 * print_scale[0], dpi / 25.4 * print_scale[1], 1.0]), {}
+    corners = {str(m.id): geometry.apply_homography(homography, m.corners_mm).tolist() for m in manifest.markers}
+    with new_folder(out, OWN, overwrite) as folder:
+        for i in range(n):
+            name = f"scan_{i + 1:04d}.jpg"
+            Image.fromarray(_bytes(picture)).save(folder / name, "JPEG", quality=SCAN_QUALITY)
+            truth[name] = {
+                "homography_px_from_mm": homography.tolist(),
+                "marker_corners_px": corners,
+                "conditions": {"scan_dpi": dpi, "print_scale": list(print_scale)},
+            }
+        _write_json(folder / "truth.json", truth)
+    return truth
+
+
+def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, MeshScene]:
+    """A sheet's manifest and the scene with its template's frame; refused where the sheet was not made from this run."""
+    manifest = attached_manifest(pdf_path)
+    settings, scene = run.scene.settings, run.scene
+    template = manifest.settings.get("sheet", {}).get("template", settings.sheet.template)
+    if template != settings.sheet.template:
+        settings = settings.model_copy(update={"sheet": settings.sheet.model_copy(update={"template": template})})
+        scene = build_scene(settings, scene.base, scene.seed)
+    if manifest.sheet_id != scene.sheet_id:
+        raise Refused(
+            f"a sheet of this run ({scene.sheet_id})",
+            f"sheet {manifest.sheet_id}",
+            "name the run that it was made from",
+        )
+    return manifest, scene
+
+
+def printed_piece(pdf_path: str | Path, manifest: Manifest, scene: MeshScene, printer: Printer) -> PiecePicture:
+    """The piece of a PDF as this printer shows it, with more pixels than the closest view can see."""
+    view = scene.settings.view
+    closest_mm = max(view.distance_mm[0] - float(np.linalg.norm(scene.card.center_mm)), view.distance_mm[0] / 4)
+    finest = scene.matrix_px(scene.settings.camera.photo_px)[0, 0] / closest_mm  # px per mm
+    dpi = float(np.clip(OVERSAMPLING * finest * 25.4, *DPI_RANGE))
+    pixels = torch.tensor(piece_pixels(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
+    linear = linear_from_srgb(printer.apply(pixels)[0]).permute(1, 2, 0)
+    return PiecePicture(linear, (0, 0, linear.shape[1], linear.shape[0]))
+
+
+def scaled_print(scene: MeshScene, print_scale: tuple[float, float]) -> MeshScene:
+    """The scene with a piece printed larger or smaller, hung up at the same middle; piece mm stay the sheet's own."""
+    middle = np.array(scene.card.size_mm) / 2
+    about = np.eye(4)
+    about[[0, 1], [0, 1]] = print_scale
+    about[:2, 3] = middle - np.array(print_scale) * middle
+    return replace(scene, card=replace(scene.card, world_from_piece=scene.card.world_from_piece @ about))
+
+
+def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions, path: Path) -> None:
+    """One photograph as a JPEG file of the drawn quality with the camera's focal length in its EXIF data."""
+    photo_px = stage.scene.settings.camera.photo_px
+    with torch.no_grad():
+        picture = photograph(stage, piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0).cpu().numpy()
+    focal_px = stage.scene.matrix_px(photo_px)[0, 0]
+    exif = Image.Exif()
+    details = exif.get_ifd(0x8769)
+    details[0xA405] = round(focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
+    Image.fromarray(_bytes(picture)).save(path, "JPEG", quality=int(conditions.jpeg[0]), exif=exif)
+
+
+def _truth(scene: MeshScene, manifest: Manifest | None, conditions: Conditions, print_scale) -> dict:
+    """Where the page's millimetres fall in this photograph, and what it was taken under."""
+    drawn = {field.name: np.asarray(getattr(conditions, field.name)[0]).tolist() for field in fields(conditions)}
+    drawn["print_scale"] = list(print_scale)
+    if manifest is None:
+        return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
+    x, y, *_ = manifest.cut_mm
+    piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+    homography = scene.piece_homographies(conditions, scene.settings.camera.photo_px)[0] @ piece_from_page
+    corners = {
+        str(marker.id): geometry.apply_homography(homography, marker.corners_mm).tolist()
+        for marker in manifest.markers
+        if _within(np.array(marker.corners_mm), manifest.cut_mm)
+    }
+    return {
+        "homography_px_from_mm": geometry.normalized(homography).tolist(),
+        "marker_corners_px": corners,
+        "conditions": drawn,
+    }
+
+
+def _printer(run: Run, name: str | None) -> Printer:
+    if name is None:
+        return load_printer(run.scene.settings.printer.profile, run.scene.base)
+    return load_printer(name)
+
+
+def _within(points: np.ndarray, rect) -> bool:
+    x, y, w, h = rect
+    return bool(((points >= [x, y]) & (points <= [x + w, y + h])).all())
+
+
+def _bytes(picture: np.ndarray) -> np.ndarray:
+    return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _write_json(path: Path, data: dict) -> None:
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,195 @@
+"""One photograph against the printed surface: where it was taken from, how sharp, how far its colours are off.
+
+In: a `Photo`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
+the report. Every figure that can be had is filled in even where a later step fails. A photograph is `rejected` only
+for reasons that do not depend on the view (plus: outside of the promised ranges); where the sheet is identified but
+geometry or colour cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
+and leaving them out would flatter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.geometry import local_scale, plane_pose, view_angles
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.complete import complete
+from patchproof.photo.detect import Found, find_markers, is_mirrored
+from patchproof.photo.quality import FrameLight, blur_px, frame_light
+from patchproof.photo.read import Photo
+from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.verify.appearance import MOST_CLIPPED, appearance
+from patchproof.verify.ranges import PromisedRanges
+from patchproof.verify.results import PhotoEntry
+from patchproof.verify.scan import is_scan, page_scales
+from patchproof.verify.surface import Promised, Surface
+
+MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighbouring cells melt together
+SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean colour
+MOST_TILT_DEG = 78.0  # foreshortened to a fifth
+MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side
+MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
+MOST_SCALE_ERROR = 0.01
+_ADVICE = {
+    "blurred": "hold still, tap to focus on the patch, or use more light",
+    "too_small": "come closer or use the camera's full resolution",
+    "tilted": "look at the patch less from the side",
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """An entry without predictions, whether it is counted, and pictures by kind."""
+
+    entry: PhotoEntry
+    counted: bool
+    pictures: dict[str, np.ndarray]
+
+
+def measure(
+    photo: Photo, name: str, surface: Surface, promised: Promised | None, ranges: PromisedRanges, scan_dpi=None
+) -> Measured:
+    """Everything that one readable photograph says; `promised` None leaves colour unmeasured."""
+    try:
+        found = identify(photo.srgb, surface)
+    except CannotJudge as cannot:
+        return Measured(_coded(PhotoEntry(file=name, status="rejected"), cannot), False, {})
+    entry = PhotoEntry(file=name, status="judged", markers_found=len(found.markers))
+    fit = _fit(found, surface)
+    if fit is None:
+        few = CannotJudge(
+            "too_few_markers", len(found.markers), 1, "the marker in view is distorted: show the whole patch"
+        )
+        return Measured(_coded(entry, few), True, {})
+    light = frame_light(photo.srgb, found.markers.values())
+    entry = _with_geometry(entry, photo, found, fit, light, surface)
+    page_check = _is_uncut(fit, found, surface)
+    scan = scan_dpi is not None and is_scan(fit.px_from_mm, surface, scan_dpi)
+    counted = not (page_check or scan)
+    cannot, pictures = _trouble(entry, fit, found, surface), {}
+    if counted:
+        outside = ranges.violated(entry, trust_angles=cannot is None)
+        if outside is not None:
+            return Measured(_coded(entry.model_copy(update={"status": "rejected"}), outside), False, pictures)
+    if cannot is None and promised is not None and promised.design is not None:
+        look = appearance(photo.srgb, fit.px_from_mm, surface, promised, light, entry)
+        entry, pictures = entry.model_copy(update=look.figures), look.pictures
+        if look.clipped > MOST_CLIPPED:
+            advice = "the patch is overexposed: lower the exposure by one or two steps"
+            cannot = CannotJudge("clipped", look.clipped, MOST_CLIPPED, advice)
+    entry = _coded(entry, cannot) if cannot else entry.model_copy(update={"status": "measured"})
+    if scan and cannot is None:
+        entry = _with_scale(entry, fit, surface, scan_dpi)
+    if not counted and entry.code is None:
+        advice = (
+            "a scan checks the print and is not counted"
+            if scan
+            else "a photo of the uncut page checks the print and is not counted"
+        )
+        entry = entry.model_copy(update={"advice": advice})
+    return Measured(entry, counted, pictures)
+
+
+def identify(srgb: np.ndarray, surface: Surface) -> Found:
+    """The sheet's markers; `CannotJudge` where none is seen, or where it is not clear which sheet it is."""
+    found = find_markers(srgb, surface.piece_ids or surface.page_ids, frozenset(surface.corners_mm), surface.dictionary)
+    if not found.markers:
+        if is_mirrored(srgb, frozenset(surface.corners_mm), surface.dictionary):
+            raise CannotJudge(
+                "mirrored",
+                None,
+                None,
+                "the photo is mirrored: switch off the camera's mirror setting and save it again",
+            )
+        if found.foreign:
+            advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
+            raise CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
+        raise CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
+    if len(found.foreign) > 1 or len(found.doubled) > 1:
+        others = max(len(found.foreign), len(found.doubled))
+        raise CannotJudge("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
+    return complete(srgb, found, surface.corners_mm, surface.dictionary)
+
+
+def _fit(found: Found, surface: Surface) -> PageFit | None:
+    """The homography of the piece, with the page's own markers where they lie in the same plane."""
+    sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
+    corners = sure or found.corners_px
+    on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
+    try:
+        fit = fit_page(on_piece or corners, surface.corners_mm)
+        if on_piece and len(on_piece) < len(corners):
+            together = fit_page(corners, surface.corners_mm)
+            # a page that hangs elsewhere than its piece would drag the fit away
+            if set(on_piece) <= set(together.inlier_ids):
+                fit = together
+    except (np.linalg.LinAlgError, CannotJudge):
+        return None
+    return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
+
+
+def _is_uncut(fit: PageFit, found: Found, surface: Surface) -> bool:
+    pages = set(fit.inlier_ids) & surface.page_ids
+    return bool(pages) or not (found.markers.keys() & surface.piece_ids)
+
+
+def _with_geometry(
+    entry: PhotoEntry, photo: Photo, found: Found, fit: PageFit, light: FrameLight, surface: Surface
+) -> PhotoEntry:
+    px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
+    figures = {
+        "residual_mm": fit.residual_mm,
+        "px_per_mm": px_per_mm,
+        "tilt_deg": tilt_deg,
+        "contrast": light.contrast,
+        "blur_px": blur_px(found.markers.values()),
+        "corner_uncertainty_mm": corner_uncertainty_mm(fit, surface.rect_mm),
+        "homography_px_from_mm": tuple(tuple(float(v) for v in row) for row in fit.px_from_mm),
+    }
+    if photo.focal_px is not None:
+        height, width = photo.srgb.shape[:2]
+        matrix = np.array([[photo.focal_px, 0, width / 2], [0, photo.focal_px, height / 2], [0, 0, 1.0]])
+        azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, matrix), surface.center_mm)
+        figures |= {"azimuth_deg": azimuth, "distance_mm": distance}
+    return entry.model_copy(update=figures)
+
+
+def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
+    """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
+    side_mm = min(surface.rect_mm[2:])
+    module_px = float(np.median([b.module_px for b in found.markers.values()]))
+    uncertain = entry.corner_uncertainty_mm > MOST_UNCERTAIN * side_mm
+    if entry.tilt_deg > MOST_TILT_DEG:
+        return CannotJudge("tilted", entry.tilt_deg, MOST_TILT_DEG, _ADVICE["tilted"])
+    if entry.blur_px > MOST_BLUR * module_px:
+        return CannotJudge("blurred", entry.blur_px, MOST_BLUR * module_px, _ADVICE["blurred"])
+    if side_mm * entry.px_per_mm < SMALLEST_DESIGN_PX:
+        return CannotJudge("too_small", side_mm * entry.px_per_mm, SMALLEST_DESIGN_PX, _ADVICE["too_small"])
+    agreeing = len(fit.inlier_ids)
+    if entry.residual_mm > MOST_RESIDUAL * side_mm or agreeing < 0.5 * len(found.markers):
+        advice = "the markers do not lie in one plane: press the sheet flat and show all of it"
+        return CannotJudge("too_few_markers", agreeing, len(found.markers), advice)
+    if uncertain and len(found.markers) < 3:
+        return CannotJudge(
+            "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"
+        )
+    if uncertain:
+        return CannotJudge("too_small", side_mm * entry.px_per_mm, 2 * SMALLEST_DESIGN_PX, _ADVICE["too_small"])
+    return None
+
+
+def _with_scale(entry: PhotoEntry, fit: PageFit, surface: Surface, scan_dpi: float) -> PhotoEntry:
+    scale_x, scale_y = page_scales(fit.px_from_mm, surface, scan_dpi)
+    entry = entry.model_copy(update={"scale_x": scale_x, "scale_y": scale_y})
+    worst = max((scale_x, scale_y), key=lambda scale: abs(scale - 1))
+    if abs(worst - 1) <= MOST_SCALE_ERROR:
+        return entry
+    advice = f'it is printed {worst:.3f} times its size: print again at 100 %, "actual size", not "fit to page"'
+    return _coded(entry, CannotJudge("scale_off", worst, MOST_SCALE_ERROR, advice))
+
+
+def _coded(entry: PhotoEntry, cannot: CannotJudge) -> PhotoEntry:
+    codes = {"code": cannot.code, "figure": cannot.figure, "threshold": cannot.threshold, "advice": cannot.advice}
+    return entry.model_copy(update=codes)

@@ -1,0 +1,127 @@
+"""report.json, as types: what was found in each photograph and what all of them say together.
+
+Lengths in mm and px as named, angles in degrees, rates in [0, 1]; null is "not measured". `measured` implies judged,
+except in page checks.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from patchproof.settings import Finite, Strict
+
+Status = Literal["judged", "measured", "rejected"]
+Row = tuple[Finite, Finite, Finite]
+
+
+class Prediction(Strict):
+    """What one network makes of one photograph; `target_confidence` sums over the accepted labels."""
+
+    label: str
+    confidence: Finite
+    target_confidence: Finite
+    recognized: bool
+
+
+class PhotoEntry(Strict):
+    """One photograph; a rejected one is not counted."""
+
+    file: str
+    status: Status
+    code: str | None = None
+    figure: Finite | None = None
+    threshold: Finite | None = None
+    advice: str | None = None
+    markers_found: int = 0
+    residual_mm: Finite | None = None
+    px_per_mm: Finite | None = None
+    scale_x: Finite | None = None
+    scale_y: Finite | None = None
+    tilt_deg: Finite | None = None
+    azimuth_deg: Finite | None = None
+    distance_mm: Finite | None = None
+    contrast: Finite | None = None
+    blur_px: Finite | None = None
+    corner_uncertainty_mm: Finite | None = None
+    delta_e00_mean: Finite | None = None
+    delta_e00_p95: Finite | None = None
+    color_fit: str | None = None
+    homography_px_from_mm: tuple[Row, Row, Row] | None = None
+    predictions: dict[str, Prediction] = Field(default_factory=dict)
+
+
+class ModelRate(Strict):
+    """One network's rate over the judged photographs."""
+
+    rate: Finite | None
+    interval: tuple[Finite, Finite] | None
+
+
+class LedgerShare(Strict):
+    """One step's share of the loss between promise and photograph."""
+
+    share: Finite
+    interval: tuple[Finite, Finite] | None
+
+
+class Summary(Strict):
+    """All photographs together, for the promise's primary model."""
+
+    photos: int
+    judged: int
+    measured: int
+    rate: Finite | None
+    interval: tuple[Finite, Finite] | None
+    prediction_interval: tuple[int, int] | None
+    verdict: Literal["kept", "broken", "cannot_tell"]
+    effect: Literal["shown", "not_shown", "not_tested"]
+    matched_rate: Finite | None
+    ledger: dict[str, LedgerShare] | None = None
+    culprit: str | None = None
+    models: dict[str, ModelRate] = Field(default_factory=dict)
+
+
+class Report(Strict):
+    """A whole report.json."""
+
+    sheet_id: str
+    photos: tuple[PhotoEntry, ...]
+    summary: Summary
+
+    def dump(self) -> str:
+        """Its JSON text: the same report gives the same bytes."""
+        return json.dumps(self.model_dump(), indent=1, allow_nan=False) + "\n"
+
+
+@dataclass(frozen=True)
+class Control:
+    """Photographs of one control and how the patch compares; null where there was nothing to compare."""
+
+    name: str
+    recognized: int
+    n: int
+    interval: tuple[float, float]
+    pairs: int = 0
+    difference: float | None = None
+    difference_interval: tuple[float, float] | None = None
+    p_value: float | None = None
+    shown: bool | None = None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A report and what its page shows besides: pictures by file and kind, controls, the verdict's reason."""
+
+    report: Report
+    pictures: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    controls: tuple[Control, ...] = ()
+    reason: str = ""
+
+    def notes(self) -> dict[str, Any]:
+        """The controls and the reason as plain data, for the page."""
+        return {"reason": self.reason, "controls": [vars(control) for control in self.controls]}

@@ -1,0 +1,277 @@
+"""A folder of photographs against a manifest: every photograph listed, one bad file never stops the batch.
+
+In: photographs, a manifest, networks, and where there are any photographs of controls. Out: `Evidence`: the report
+and its pictures. Photographs are taken in the order of their names; sidecar files and anything that is no picture by
+its suffix are never opened. Each is measured on its own (over processes when `jobs` > 1) and leaves small squares
+behind, which the networks then see in batches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from patchproof.claims import wilson
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.read import SUFFIXES, Photo, read_photo
+from patchproof.settings import Refused
+from patchproof.sheet.manifest import Manifest
+from patchproof.verify.classify import check_primary, predict, squares_of, target_indices
+from patchproof.verify.measure import Measured, measure
+from patchproof.verify.pictures import thumbnail
+from patchproof.verify.ranges import PromisedRanges, matched_rate, promised_ranges
+from patchproof.verify.results import Control, Evidence, ModelRate, PhotoEntry, Report, Summary
+from patchproof.verify.surface import Promised, Surface, promised_of, surface_of
+from patchproof.verify.verdict import Verdict, compare, effect_of, judge
+
+if TYPE_CHECKING:
+    from patchproof.channel.printer import Printer
+    from patchproof.classifier import Classifier
+
+WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
+
+
+def verify_photos(
+    photos: str | Path,
+    manifest: Manifest,
+    *,
+    models: Sequence[Classifier],
+    printer: Printer | None = None,
+    scan_dpi: float | None = None,
+    controls: str | Path | None = None,
+    camera_focal_px: float | None = None,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evidence:
+    """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
+
+    `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
+    `camera_focal_px` replaces the EXIF focal length. `progress` is called with (done, all). An `executor` is used
+    instead of `jobs` local processes.
+    """
+    paths = list_photos(photos)
+    control_paths = _list_controls(controls) if controls is not None else {}
+    if manifest.promise:
+        check_primary(models, manifest.promise)
+    task = _task(manifest, models, printer, scan_dpi, camera_focal_px)
+    total = len(paths) + sum(map(len, control_paths.values()))
+    with _looking(jobs, executor) as run:
+        looks = list(_counted(run(partial(_look, task), enumerate(paths)), progress, 0, total))
+        control_looks, done = {}, len(paths)
+        for name, files in control_paths.items():
+            control_looks[name] = list(_counted(run(partial(_glance, task), files), progress, done, total))
+            done += len(files)
+    indices = {m.name: target_indices(m, manifest) for m in models} if manifest.promise else {}
+    entries = _with_predictions(looks, models, indices)
+    return _evidence(manifest, models, indices, entries, looks, control_looks)
+
+
+def list_photos(folder: str | Path) -> list[Path]:
+    """The pictures of a folder by suffix, in the order of their names; refused where there are none."""
+    folder = Path(folder)
+    if folder.is_file():
+        return [folder]
+    if not folder.is_dir():
+        raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
+    paths = _pictures(folder)
+    if not paths:
+        raise Refused(
+            f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}", "none", "copy the photographs there"
+        )
+    return paths
+
+
+def _pictures(folder: Path) -> list[Path]:
+    files = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
+
+
+def _list_controls(folder: str | Path) -> dict[str, list[Path]]:
+    """Photographs by control: the folder's own pictures, or one control for each folder in it."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
+    if own := _pictures(folder):
+        return {folder.name: own}
+    inside = {p.name: _pictures(p) for p in sorted(folder.iterdir()) if p.is_dir() and not p.name.startswith(".")}
+    inside = {name: files for name, files in inside.items() if files}
+    if not inside:
+        raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")
+    return inside
+
+
+@dataclass(frozen=True)
+class _Task:
+    """All that one photograph is measured against; small enough to be sent to another process."""
+
+    surface: Surface
+    promised: Promised | None
+    ranges: PromisedRanges
+    sizes_px: tuple[int, ...]
+    scan_dpi: float | None
+    focal_px: float | None
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """What is kept of one photograph once it has been seen."""
+
+    measured: Measured
+    squares: dict[int, np.ndarray] | None
+
+
+def _task(manifest, models, printer, scan_dpi, focal_px) -> _Task:
+    surface = surface_of(manifest)
+    conditions = manifest.promise.conditions if manifest.promise else ()
+    promised = None
+    if manifest.design:
+        if printer is None:
+            from patchproof.channel.printer import load_printer
+
+            printer = load_printer(manifest.settings.get("printer", {}).get("profile", "coated"))
+        promised = promised_of(manifest, surface, printer)
+    sizes = tuple(sorted({m.input_px for m in models})) if manifest.promise else ()
+    return _Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, focal_px)
+
+
+def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
+    number, path = numbered
+    try:
+        photo = read_photo(path)
+    except CannotJudge as cannot:
+        entry = PhotoEntry(
+            file=path.name,
+            status="rejected",
+            code=cannot.code,
+            figure=cannot.figure,
+            threshold=cannot.threshold,
+            advice=cannot.advice,
+        )
+        return _Looked(Measured(entry, False, {}), None)
+    if task.focal_px is not None:
+        photo = Photo(photo.srgb, task.focal_px, photo.path)
+    measured = measure(photo, path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
+    pictures = {}
+    if number < WITH_PICTURES:
+        pictures = {"photo": thumbnail(photo.srgb, measured.entry, task.surface), **measured.pictures}
+    return _Looked(Measured(measured.entry, measured.counted, pictures), squares_of(photo.srgb, task.sizes_px))
+
+
+def _glance(task: _Task, path: Path) -> tuple[str, dict[int, np.ndarray] | None]:
+    """A control photograph: only what the networks see of it counts, since a bare object carries no marker."""
+    try:
+        return path.name, squares_of(read_photo(path).srgb, task.sizes_px)
+    except CannotJudge:
+        return path.name, None
+
+
+class _looking:
+    """`map` in this process, in local processes, or on a given executor; closes what it opened."""
+
+    def __init__(self, jobs: int, executor: Executor | None):
+        self._own = None
+        if executor is None and jobs > 1:
+            import multiprocessing
+
+            # spawn: forking a process that has run torch threads can hang
+            self._own = executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _one_thread)
+        self._executor = executor
+
+    def __enter__(self):
+        return map if self._executor is None else self._executor.map
+
+    def __exit__(self, *_):
+        if self._own is not None:
+            self._own.shutdown(cancel_futures=True)
+
+
+def _one_thread() -> None:
+    """Processes share the machine; threads inside of each would only fight over it."""
+    import cv2
+    import torch
+
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+def _counted(results: Iterator, progress, done: int, total: int) -> Iterator:
+    for number, result in enumerate(results, done + 1):
+        if progress is not None:
+            progress(number, total)
+        yield result
+
+
+def _with_predictions(looks: Sequence[_Looked], models, indices) -> list[PhotoEntry]:
+    """The entries with what every network says of every readable photograph."""
+    readable = [n for n, look in enumerate(looks) if look.squares is not None]
+    predictions: list[dict] = [{} for _ in looks]
+    for model in models if indices else ():
+        squares = [looks[n].squares[model.input_px] for n in readable]
+        for n, prediction in zip(readable, predict(model, indices[model.name], squares), strict=True):
+            predictions[n][model.name] = prediction
+    return [
+        look.measured.entry.model_copy(update={"predictions": p}) for look, p in zip(looks, predictions, strict=True)
+    ]
+
+
+def _evidence(manifest, models, indices, entries, looks, control_looks) -> Evidence:
+    counted = [e for e, look in zip(entries, looks, strict=True) if look.measured.counted]
+    verdict, effect, controls = Verdict("cannot_tell", None, "The sheet promises nothing."), "not_tested", ()
+    rate, matched = ModelRate(rate=None, interval=None), None
+    rates = {m.name: _rate([e.predictions[m.name].recognized for e in counted]) for m in models} if indices else {}
+    if manifest.promise:
+        promise, primary = manifest.promise, manifest.promise.models[0].name
+        results = {e.file: e.predictions[primary].recognized for e in counted}
+        without = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
+        goal = promise.target.goal
+        verdict = judge(sum(results.values()), len(results), promise.rate, promise.n, goal, without)
+        rate, matched = rates[primary], matched_rate((e for e in counted if e.status == "measured"), promise.conditions)
+        model = next(m for m in models if m.name == primary)
+        controls, effect = _compared(model, indices[primary], results, control_looks, goal)
+    summary = Summary(
+        photos=len(entries),
+        judged=len(counted),
+        measured=sum(e.status == "measured" for e in entries),
+        rate=rate.rate,
+        interval=rate.interval,
+        prediction_interval=verdict.prediction_interval,
+        verdict=verdict.verdict,
+        effect=effect,
+        matched_rate=matched,
+        models=rates,
+    )
+    pictures = {look.measured.entry.file: look.measured.pictures for look in looks if look.measured.pictures}
+    report = Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary)
+    return Evidence(report, pictures, controls, verdict.reason)
+
+
+def _rate(results: list[bool]) -> ModelRate:
+    if not results:
+        return ModelRate(rate=None, interval=None)
+    return ModelRate(rate=sum(results) / len(results), interval=wilson(sum(results), len(results)))
+
+
+def _compared(model, indices, results: dict[str, bool], control_looks, goal: str):
+    """Controls with their comparison, and the effect that they show together."""
+    controls, comparisons = [], []
+    for name, looked in control_looks.items():
+        readable = [(file, squares) for file, squares in looked if squares is not None]
+        said = predict(model, indices, [squares[model.input_px] for _, squares in readable])
+        seen = {file: p.recognized for (file, _), p in zip(readable, said, strict=True)}
+        comparison, k = compare(results, seen, goal), sum(seen.values())
+        comparisons.append(comparison)
+        control = Control(name, k, len(seen), wilson(k, len(seen)))
+        if comparison is not None:
+            c = comparison
+            control = Control(
+                name, k, len(seen), control.interval, c.pairs, c.difference, c.interval, c.p_value, c.shown
+            )
+        controls.append(control)
+    return tuple(controls), effect_of(comparisons)

@@ -1,0 +1,94 @@
+"""From counts to a verdict: pure functions, no photographs.
+
+In: how many photographs were recognized, what was promised, what controls showed. Out: `kept`, `broken` or
+`cannot_tell` with the prediction interval that decided it, and whether an effect was shown. For `assist`:
+
+    broken       k < k_lo                             fewer than the promise allows for, at 95 %
+    kept         k ≥ k_lo and k_lo / n ≥ rate - 0.20  and enough photographs that a miss would have shown
+    cannot_tell  otherwise; always below 5 judged photographs, or with more than 10 % of readable ones without a marker
+
+mirrored for `deceive`, where a rate too high breaks the promise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from patchproof.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, prediction_interval
+
+LEAST_JUDGED = 5
+MOST_WITHOUT_MARKERS = 0.10
+SLACK = 0.20  # how far below the promised rate the interval's floor may lie
+LEAST_PAIRS = 5  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The word, the counts that the promise allows, and one sentence with the figures that decided it."""
+
+    verdict: Literal["kept", "broken", "cannot_tell"]
+    prediction_interval: tuple[int, int] | None
+    reason: str
+
+
+def judge(
+    recognized: int, judged: int, promise_rate: float, promise_n: int, goal: str, without_markers: int
+) -> Verdict:
+    """The verdict on `recognized` of `judged` photos; `without_markers` more are readable and show no marker."""
+    if judged == 0:
+        return Verdict("cannot_tell", None, "No photograph could be judged.")
+    low, high = prediction_interval(round(promise_rate * promise_n), promise_n, judged)
+    seen = f"{recognized} of {judged} photographs were recognized; the promise allows for {low} to {high}"
+    lost = without_markers / (judged + without_markers)
+    if lost > MOST_WITHOUT_MARKERS:
+        reason = f"{without_markers} readable photographs show no marker ({lost:.0%}, at most 10 % are allowed)."
+        return Verdict("cannot_tell", (low, high), reason)
+    if judged < LEAST_JUDGED:
+        return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
+    if goal == "deceive":
+        broken, sure = recognized > high, high / judged <= promise_rate + SLACK + 1e-9
+    else:
+        broken, sure = recognized < low, low / judged >= promise_rate - SLACK - 1e-9
+    if broken:
+        return Verdict("broken", (low, high), f"{seen}.")
+    if sure:
+        return Verdict("kept", (low, high), f"{seen}.")
+    return Verdict("cannot_tell", (low, high), f"{seen}, which is too wide to tell: take more photographs.")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Patch against one control; `difference` is patch minus control, `pairs` 0 where photographs are not paired."""
+
+    difference: float
+    interval: tuple[float, float]
+    pairs: int
+    p_value: float | None
+    shown: bool
+
+
+def compare(patch: Mapping[str, bool], control: Mapping[str, bool], goal: str) -> Comparison | None:
+    """Whether the patch changes recognition in the goal's direction; results by file name, equal names are pairs."""
+    if not patch or not control:
+        return None
+    sign = -1 if goal == "deceive" else 1
+    names = sorted(patch.keys() & control.keys())
+    if len(names) >= LEAST_PAIRS:
+        a, b = [patch[name] for name in names], [control[name] for name in names]
+        difference, interval = paired_difference(a, b)
+        p_value = mcnemar_p(a, b)
+        shown = p_value < 1 - CONFIDENCE and sign * difference > 0
+        return Comparison(difference, interval, len(names), p_value, shown)
+    difference, interval = independent_difference(sum(patch.values()), len(patch), sum(control.values()), len(control))
+    shown = interval[1] < 0 if goal == "deceive" else interval[0] > 0
+    return Comparison(difference, interval, 0, None, shown)
+
+
+def effect_of(comparisons: Sequence[Comparison | None]) -> Literal["shown", "not_shown", "not_tested"]:
+    """`shown` only where every control was beaten; controls without a judged photograph are not tests."""
+    tested = [c for c in comparisons if c is not None]
+    if not tested:
+        return "not_tested"
+    return "shown" if all(c.shown for c in tested) else "not_shown"

@@ -1,0 +1,103 @@
+"""The built-in network: what ships, and the recipe that made it."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof.classifier import confidence, find_labels, load_classifier
+from patchproof.classifier.builtin import HERE, INPUT_PX, load_builtin
+from patchproof.scene import primitives
+from patchproof.settings import Refused
+from patchproof.study import train_builtin
+
+FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
+
+
+@pytest.fixture(scope="module")
+def builtin():
+    return load_classifier("builtin", HERE)  # warnings are errors: its self-checks have no doubts
+
+
+@pytest.fixture(scope="module")
+def fresh() -> tuple[torch.Tensor, torch.Tensor]:
+    return train_builtin.pictures(train_builtin.VIEWS_PER_SHAPE, FRESH)
+
+
+def test_it_names_the_primitives_and_is_small(builtin):
+    assert builtin.input_px == INPUT_PX == 96
+    assert [find_labels(builtin.labels, name)[0] for name in primitives.names()] == list(range(12))
+    assert (HERE / "builtin.safetensors").stat().st_size < 3_000_000
+    assert not any(parameter.requires_grad for parameter in builtin.network.parameters())
+
+
+def test_it_knows_fresh_renders_about_as_well_as_its_card_says(builtin, fresh):
+    images, labels = fresh
+    card = json.loads((HERE / "builtin.json").read_text())
+    assert card["held_out_accuracy"] >= 0.9
+    with torch.no_grad():
+        logits = builtin.logits(images.float() / 255)
+    right = (logits.argmax(1) == labels).float().mean()
+    # ten views of one shape are alike, so this share scatters by about 0.05 on other seeds
+    assert right > card["held_out_accuracy"] - 0.15
+    # room left for gradients: label smoothing of 0.1 aims at 0.91
+    assert np.median(confidence(logits, range(12)).numpy()) == pytest.approx(1)
+    assert torch.softmax(logits, 1).amax(1).median() < 0.99
+
+
+def test_missing_weights_are_refused(tmp_path):
+    with pytest.raises(Refused, match="install patchproof again"):
+        load_builtin(folder=tmp_path)
+
+
+def test_pictures_are_repeatable_and_follow_the_seed():
+    first, labels = train_builtin.pictures(1, 3)
+    again, _ = train_builtin.pictures(1, 3)
+    other, _ = train_builtin.pictures(1, 4)
+    assert first.dtype == torch.uint8 and first.shape == (12 * train_builtin.VIEWS_PER_SHAPE, 3, 96, 96)
+    assert torch.equal(labels.bincount(), torch.full((12,), train_builtin.VIEWS_PER_SHAPE))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert (first.float().std((1, 2, 3)) > 1).all()  # none is blank
+
+
+def test_augmenting_keeps_the_range_and_pastes_as_often_as_said():
+    images = torch.full((400, 3, 96, 96), 128, dtype=torch.uint8)
+    cards = torch.ones(1, 3, 40, 40)
+
+    def augment(pasted):
+        return train_builtin.augmented(images, cards, np.random.default_rng(0), pasted)
+
+    assert torch.equal(augment(0.3), augment(0.3))
+    assert 0 <= augment(0.3).min() and augment(0.3).max() <= 1
+    flat = augment(0.3).std((2, 3)).amax(1) < 1e-6  # without a card a plain picture stays plain
+    assert 0.6 < flat.float().mean() < 0.8
+    assert (augment(0.0).std((2, 3)) < 1e-6).all()
+
+
+def test_training_is_repeatable_and_what_it_writes_can_be_loaded(tmp_path):
+    recipe = train_builtin.Recipe(epochs=2, batch=24, pasted=0.0)
+    # twelve plain colors are twelve classes that can be learned at once
+    colors = torch.randint(0, 256, (12, 3, 1, 1), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    labels = torch.arange(12).repeat(20)
+    images = colors[labels].expand(-1, -1, 96, 96)
+    before = torch.get_num_threads()
+    runs = [list(train_builtin.train(images, labels, recipe)) for _ in range(2)]
+    assert torch.get_num_threads() == before
+    assert [loss for _, loss, _ in runs[0]] == [loss for _, loss, _ in runs[1]]
+    network = train_builtin.folded(runs[0][-1][2].eval())
+    train_builtin.write(tmp_path, network, recipe, (images, labels), {"render": 1, "train": 2})
+    card = json.loads((tmp_path / "builtin.json").read_text())
+    assert card["recipe"] == dataclasses.asdict(recipe)
+    loaded = load_builtin(folder=tmp_path)
+    by_class = train_builtin.accuracy(loaded.network, images, labels)
+    assert card["held_out_accuracy"] == pytest.approx(by_class.mean(), abs=1e-4)
+
+
+def test_held_out_shapes_are_none_of_the_training_shapes():
+    recipe = train_builtin.Recipe()
+    shapes = recipe.pictures_per_class // train_builtin.VIEWS_PER_SHAPE
+    assert recipe.seed + shapes < recipe.seed + train_builtin.HELD_OUT
+    assert recipe.seed + train_builtin.HELD_OUT + recipe.held_out_per_class < FRESH

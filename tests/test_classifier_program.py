@@ -1,0 +1,379 @@
+"""Exported programs, honest and hostile: what an archive wants to execute must never happen."""
+
+import io
+import json
+import os
+import pickle
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from patchproof.classifier import load_classifier, program
+from patchproof.classifier.program import in_batches, load_program, no_pickle
+from patchproof.settings import Refused
+
+LABELS = ["red", "green", "blue", "none"]
+DATA = os.environ.get("PATCHPROOF_DATA")
+
+
+class Small(nn.Module):
+    def __init__(self):
+        super().__init__()
+        generator = torch.Generator().manual_seed(1)
+        self.conv = nn.Conv2d(3, 4, 3, padding=1)
+        for parameter in self.parameters():
+            parameter.data = torch.randn(parameter.shape, generator=generator)
+        self.register_buffer("mean", torch.full((1, 3, 1, 1), 0.5), persistent=False)  # a constant of the program
+
+    def forward(self, x):
+        return torch.relu(self.conv(x - self.mean)).flatten(2).mean(2)
+
+
+def save(folder: Path, batch: int | None = None) -> Path:
+    """A small program of any batch size, or of one, with its card."""
+    sizes = None if batch else ({0: torch.export.Dim("n", min=1, max=64)},)
+    example = (torch.rand(batch or 2, 3, 16, 16),)
+    path = folder / "small.pt2"
+    torch.export.save(torch.export.export(Small().eval(), example, dynamic_shapes=sizes), str(path))
+    path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory) -> Path:
+    path = save(tmp_path_factory.mktemp("honest"))
+    with zipfile.ZipFile(path) as archive:
+        if not any(name.endswith("model_weights_config.json") for name in archive.namelist()):
+            pytest.skip(f"torch {torch.__version__} saves weights as pickles, which are refused; 2.9 does not")
+    return path
+
+
+class Hostile:
+    """One archive that wants to make a folder, the proof that something of it was executed."""
+
+    def __init__(self, folder: Path, honest: Path):
+        self.path, self.mark = folder / "hostile.pt2", folder / "executed"
+        shutil.copy(honest.with_suffix(".json"), self.path.with_suffix(".json"))
+        with zipfile.ZipFile(honest) as archive:
+            self.members = {info.filename: archive.read(info) for info in archive.infolist()}
+        self.root = next(iter(self.members)).partition("/")[0]
+
+    def pickle(self) -> bytes:
+        mark = str(self.mark)
+
+        class MakesAFolder:
+            def __reduce__(self):
+                return os.mkdir, (mark,)
+
+        return pickle.dumps(MakesAFolder())
+
+    def torch_pickle(self) -> bytes:
+        """The same in the zip that torch.save makes."""
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:
+            archive.writestr("archive/data.pkl", self.pickle())
+            archive.writestr("archive/version", "3\n")
+            archive.writestr("archive/byteorder", "little")
+        return buffer.getvalue()
+
+    def python(self) -> str:
+        return f"__import__('os').mkdir({str(self.mark)!r})"
+
+    def edit(self, name: str, change) -> "Hostile":
+        """Change a JSON member by a function of its parsed content."""
+        content = json.loads(self.members[f"{self.root}/{name}"])
+        change(content)
+        self.members[f"{self.root}/{name}"] = json.dumps(content).encode()
+        return self
+
+    def add(self, name: str, content: bytes) -> "Hostile":
+        self.members[f"{self.root}/{name}"] = content
+        return self
+
+    def write(self) -> Path:
+        with zipfile.ZipFile(self.path, "w") as archive:
+            for name, content in self.members.items():
+                archive.writestr(name, content)
+        return self.path
+
+    def executed(self) -> bool:
+        was = self.mark.exists()
+        shutil.rmtree(self.mark, ignore_errors=True)
+        return was
+
+
+@pytest.fixture
+def hostile(tmp_path, honest) -> Hostile:
+    return Hostile(tmp_path, honest)
+
+
+def refused(hostile: Hostile, sentence: str) -> None:
+    """The archive is refused in one sentence that matches, and nothing of it was executed."""
+    with pytest.raises(Refused, match=sentence) as caught:
+        load_classifier(f"file:{hostile.write()}", hostile.path.parent)
+    assert not hostile.executed()
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
+
+
+def torch_executes(hostile: Hostile) -> bool:
+    """Whether torch alone executes what is in the archive: without it a test of a refusal would prove nothing."""
+    try:
+        torch.export.load(str(hostile.write())).module()(torch.rand(2, 3, 16, 16))
+    except Exception:  # whatever it says after the deed
+        pass
+    return hostile.executed()
+
+
+def node(content: dict) -> dict:
+    return content["graph_module"]["graph"]["nodes"][-1]
+
+
+def pickled_weight(hostile: Hostile) -> Hostile:
+    config = "data/weights/model_weights_config.json"
+    hostile.add("data/weights/weight_0", hostile.torch_pickle())
+    return hostile.edit(config, lambda c: [meta.update(use_pickle=True) for meta in c["config"].values()])
+
+
+def pickled_constant(hostile: Hostile) -> Hostile:
+    config = "data/constants/model_constants_config.json"
+    hostile.add("data/constants/tensor_0", hostile.torch_pickle())
+    return hostile.edit(config, lambda c: [meta.update(use_pickle=True) for meta in c["config"].values()])
+
+
+def opaque_constant(hostile: Hostile) -> Hostile:
+    config = "data/constants/model_constants_config.json"
+    meta = {"path_name": "opaque_obj_0", "is_param": False, "use_pickle": True, "tensor_meta": None}
+    hostile.add("data/constants/opaque_obj_0", hostile.pickle())
+    return hostile.edit(config, lambda c: c["config"].update(evil=meta))
+
+
+def legacy_weights(hostile: Hostile) -> Hostile:
+    return hostile.add("data/weights/model.pt", hostile.torch_pickle())
+
+
+def shape_expression(hostile: Hostile) -> Hostile:
+    def change(content):
+        tensors = content["graph_module"]["graph"]["tensor_values"].values()
+        next(t for t in tensors if "as_expr" in t["sizes"][0])["sizes"][0]["as_expr"]["expr_str"] = hostile.python()
+
+    return hostile.edit("models/model.json", change)
+
+
+def enum_in_a_tree(hostile: Hostile) -> Hostile:
+    module = hostile.path.with_name("evil_enum.py")
+    module.write_text(hostile.python())
+
+    def change(content):
+        call = content["graph_module"]["module_call_graph"][0]["signature"]
+        protocol, spec = json.loads(call["in_spec"])
+        spec["children_spec"][1]["context"] = json.dumps([{"__enum__": True, "fqn": "evil_enum:A", "name": "B"}])
+        call["in_spec"] = json.dumps([protocol, spec])
+
+    return hostile.edit("models/model.json", change)
+
+
+EXECUTABLE = {
+    pickled_weight: "stored as a pickle",
+    pickled_constant: "stored as a pickle",
+    opaque_constant: "opaque_obj_0",
+    legacy_weights: "data/weights/model.pt, a pickle or an older layout: save the network with torch.export.save",
+    shape_expression: 'the shape "__import__',
+    enum_in_a_tree: "inputs or outputs of type 'builtins.dict'",
+}
+
+
+@pytest.mark.parametrize("make", EXECUTABLE, ids=lambda make: make.__name__)
+def test_what_torch_would_execute_is_refused_and_not_executed(make, hostile, monkeypatch):
+    monkeypatch.syspath_prepend(hostile.path.parent)
+    assert torch_executes(make(hostile)), "this archive is harmless, the test proves nothing"
+    refused(hostile, EXECUTABLE[make])
+
+
+def test_hostile_sample_inputs_and_guards_are_left_out(hostile):
+    hostile.add("data/sample_inputs/model.pt", hostile.torch_pickle())
+    assert torch_executes(hostile)
+    classifier = load_classifier(f"file:{hostile.path}", hostile.path.parent)
+    assert not hostile.executed()
+    assert classifier.logits(torch.rand(5, 3, 40, 30)).shape == (5, 4)
+
+    hostile.edit("models/model.json", lambda c: c.update(guards_code=[hostile.python()]))
+    assert torch_executes(hostile)
+    load_classifier(f"file:{hostile.write()}", hostile.path.parent).logits(torch.rand(5, 3, 40, 30))
+    assert not hostile.executed()
+
+
+def test_the_second_lock_stops_every_unpickler_and_opens_again():
+    class MakesAFolder:
+        def __reduce__(self):
+            return os.mkdir, ("never",)
+
+    stolen = pickle.dumps(MakesAFolder())
+    buffer = io.BytesIO()
+    torch.save(MakesAFolder(), buffer)
+    with no_pickle():
+        for unpickler in (pickle.loads, pickle._loads):
+            with pytest.raises(pickle.UnpicklingError, match="not executed"):
+                unpickler(stolen)
+        with pytest.raises(pickle.UnpicklingError, match="not executed"):
+            torch.load(io.BytesIO(buffer.getvalue()), weights_only=False)
+    assert not Path("never").exists()
+    assert pickle.loads(pickle.dumps(Path("a"))) == Path("a")  # the door opens again
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "torch.ops.aten.save.default",
+        "torch.ops.aten.from_file.default",
+        "torch.ops.aten.relu.__class__",
+        "torch.ops.aten.__class__.mro",
+        "torch.ops.higher_order.cond",
+        "torch.os.mkdir",
+        "torch.hub.load",
+        "_operator.methodcaller",
+        "math.__loader__.load_module",
+        "#extension:x",
+        "relu",
+    ],
+)
+def test_operators_that_are_not_on_the_list_are_refused(target, hostile):
+    hostile.edit("models/model.json", lambda c: node(c).update(target=target))
+    refused(hostile, "with the operator '" + target.replace(".", "\\."))
+
+
+@pytest.mark.parametrize(
+    "name", ["data/aotinductor/model/x.so", "../evil.json", "models/other.json", "code/x.py", "data.pkl"]
+)
+def test_members_that_are_not_on_the_list_are_refused(name, hostile):
+    refused(hostile.add(name, b"x"), "pickle" if name == "data.pkl" else "the usual members")
+
+
+def test_a_second_member_of_the_same_name_is_refused(hostile):
+    hostile.write()
+    with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(hostile.path, "a") as archive:
+        archive.writestr(f"{hostile.root}/models/model.json", b"{}")
+    with pytest.raises(Refused, match="usual members"):
+        load_program(hostile.path)
+
+
+def test_absurd_sizes_are_refused(hostile):
+    def huge(content):
+        for meta in content["config"].values():
+            meta["tensor_meta"]["sizes"] = [{"as_int": 1 << 40}]
+
+    refused(hostile.edit("data/weights/model_weights_config.json", huge), "absurd size")
+
+
+def test_a_file_of_absurd_size_is_refused_unread(hostile, monkeypatch):
+    hostile.write()
+    monkeypatch.setattr(program, "MAX_BYTES", 1000)
+    monkeypatch.setattr(Path, "read_bytes", lambda self: pytest.fail("it was read"))
+    with pytest.raises(Refused, match="which is larger"):
+        load_program(hostile.path)
+
+
+def test_a_compressed_bomb_is_refused(hostile):
+    hostile.add("data/weights/weight_7", bytes(50_000_000))
+    with zipfile.ZipFile(hostile.path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in hostile.members.items():
+            archive.writestr(name, content)
+    with pytest.raises(Refused, match="members are larger than the file"):
+        load_program(hostile.path)
+
+
+def test_files_that_are_no_whole_archive_are_refused(hostile):
+    whole = hostile.write().read_bytes()
+    flipped = bytearray(whole)
+    flipped[whole.index(b"graph_module") + 3] ^= 1  # one bit: the zip's checksum no longer fits
+    for content in (whole[: len(whole) // 2], bytes(flipped), b"", hostile.pickle(), whole[:-30], b"PK\x03\x04"):
+        hostile.path.write_bytes(content)
+        with pytest.raises(
+            Refused, match=r"(no whole zip archive|a pickle or an older layout).*: save the network with"
+        ):
+            load_program(hostile.path)
+        assert not hostile.executed()
+
+
+def test_pickles_by_name_or_in_disguise_are_refused(hostile):
+    hostile.path.write_bytes(hostile.torch_pickle())
+    with pytest.raises(Refused, match=r"with archive/data.pkl, a pickle"):
+        load_program(hostile.path)
+    for suffix in (".pt", ".pth", ".pkl", ".pt2.bin"):
+        other = hostile.path.with_suffix(suffix)
+        other.write_bytes(hostile.pickle())
+        with pytest.raises(Refused, match=r"save it with torch\.export\.save as NAME"):
+            load_classifier(f"file:{other}", other.parent)
+    assert not hostile.executed()
+
+
+@pytest.mark.parametrize(
+    ("card", "sentence"),
+    [
+        (None, "Expected the JSON file .*hostile.json, got none: write"),
+        ("{", "that cannot be read"),
+        ("[]", "input_px"),
+        ('{"input_px": "16", "labels": ["a", "b"]}', "input_px.*'16'"),
+        ('{"input_px": 16, "labels": ["a"]}', "labels, a list of two or more names"),
+        ('{"input_px": 16, "labels": "names.json"}', "names.json, got none: lay the list of labels there"),
+        ('{"input_px": 16, "labels": ["a", "b", "c"]}', "3 logits for each picture.*\\(3, 4\\)"),
+        ('{"input_px": 12, "labels": ["a", "b", "c", "d"]}', "takes N×3×S×S pictures"),
+    ],
+)
+def test_a_card_that_is_missing_or_wrong_is_refused(card, sentence, hostile):
+    if card is None:
+        hostile.path.with_suffix(".json").unlink()
+    else:
+        hostile.path.with_suffix(".json").write_text(card)
+    refused(hostile, sentence)
+
+
+def test_an_honest_program_gives_the_networks_logits_and_gradients(honest):
+    classifier = load_classifier("file:small.pt2", honest.parent)
+    assert (classifier.name, classifier.input_px, list(classifier.labels)) == ("file:small.pt2", 16, LABELS)
+    assert len(classifier.sha256) == 64
+    photos = torch.rand(70, 3, 16, 16, requires_grad=True)  # more than the 64 that the program takes at once
+    torch.testing.assert_close(classifier.logits(photos), Small()(photos))
+    ours, theirs = (torch.autograd.grad(f(photos)[:, 0].sum(), photos)[0] for f in (classifier.logits, Small()))
+    torch.testing.assert_close(ours, theirs)
+    torch.testing.assert_close(classifier.logits(photos[:1]), classifier.logits(photos)[:1])
+
+
+def test_a_program_of_one_batch_size_takes_any_number(tmp_path, honest):
+    classifier = load_program(save(tmp_path, batch=3))
+    photos = torch.rand(7, 3, 16, 16)
+    torch.testing.assert_close(classifier.logits(photos), Small()(photos))
+
+
+def test_labels_may_lie_in_a_list_beside_the_card(tmp_path, honest):
+    shutil.copy(honest, tmp_path / "n.pt2")
+    (tmp_path / "n.json").write_text('{"input_px": 16, "labels": "list.json"}')
+    (tmp_path / "list.json").write_text(json.dumps(LABELS))
+    assert load_program(tmp_path / "n.pt2").labels == tuple(LABELS)
+
+
+def test_batches_are_cut_and_filled_up():
+    seen = []
+
+    def network(photos):
+        seen.append(len(photos))
+        return photos.mean((2, 3))
+
+    photos = torch.rand(7, 3, 2, 2)
+    assert torch.equal(in_batches(network, 2, 3)(photos), photos.mean((2, 3)))
+    assert seen == [3, 3, 2]
+
+
+@pytest.mark.skipif(DATA is None, reason="PATCHPROOF_DATA is not set: no real networks to load")
+def test_real_networks_recognize_a_photograph():
+    import numpy as np
+    from PIL import Image
+
+    photo = np.asarray(Image.open(Path(DATA, "photos", "skimage_coffee.png")).convert("RGB")).copy()
+    photo = torch.from_numpy(photo).permute(2, 0, 1)[None].float() / 255
+    for name in ("mobilenet_v1_0.25_128", "squeezenet1.1_224"):
+        classifier = load_classifier(f"file:${{PATCHPROOF_DATA}}/models/{name}.pt2", Path("."))
+        assert classifier.logits(photo).argmax() == 967  # espresso

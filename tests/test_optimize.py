@@ -1,0 +1,199 @@
+"""The loop on a network whose best design is known: what it learns, keeps, repeats and resumes."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof.claims import wilson
+from patchproof.optimize.goals import target_loss, total_variation
+from patchproof.optimize.loop import start, steps
+from patchproof.optimize.problem import as_pixels, from_pixels, set_problem
+from patchproof.optimize.promise import CONTROLS, promise_from, try_out
+from patchproof.optimize.run import load_run, optimize
+from patchproof.render.photograph import photograph
+from patchproof.scene.scene import build_scene
+from patchproof.settings import Refused, SceneSettings, validated
+
+SCENE = {
+    "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
+    "patch": {"side": "+z", "width_mm": 90, "height_mm": 90},
+    "target": {"label": "red", "models": ["module:fake_networks.red_against_blue"]},
+    "view": {"azimuth_deg": [-30, 30], "elevation_deg": [0, 20], "distance_mm": [400, 500], "look_at_jitter": 0},
+    "camera": {"photo_px": [400, 300]},
+    "optimize": {"steps": 12, "views": 4, "gamut": 0.0},
+}
+
+
+def scene_with(tmp_path, **changes):
+    data = {key: dict(value) for key, value in SCENE.items()}
+    for key, value in changes.items():
+        table, name = key.split("__")
+        data.setdefault(table, {})[name] = value
+    return build_scene(validated(SceneSettings, data, "test"), tmp_path)
+
+
+def toml(path, **changes):
+    lines = []
+    data = {key: dict(value) for key, value in SCENE.items()}
+    for key, value in changes.items():
+        table, name = key.split("__")
+        data.setdefault(table, {})[name] = value
+    for table, values in data.items():
+        lines += [f"[{table}]", *(f"{name} = {json.dumps(value)}" for name, value in values.items())]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+def last(problem):
+    return list(steps(problem))[-1]
+
+
+def test_cross_entropy_of_the_accepted_labels_by_hand():
+    """Logits 0, ln 2, ln 5: probabilities 1/8, 2/8, 5/8."""
+    logits = torch.tensor([[0.0, math.log(2), math.log(5)]])
+    assert float(target_loss(logits, [0, 1], "assist")) == pytest.approx(-math.log(3 / 8))
+    assert float(target_loss(logits, [0, 1], "deceive")) == pytest.approx(-math.log(5 / 8))
+    certain = torch.tensor([[60.0, 0.0]], requires_grad=True)
+    (gradient,) = torch.autograd.grad(target_loss(certain, [1], "assist").sum(), certain)
+    assert float(gradient[0, 0]) == pytest.approx(1)  # a sure network still says which way
+
+
+def test_total_variation_by_hand():
+    checks = torch.tensor([[0.0, 1.0], [1.0, 0.0]]).expand(3, 2, 2)
+    assert float(total_variation(checks)) == 2 and float(total_variation(torch.ones(3, 4, 4))) == 0
+
+
+def test_the_gradient_through_printer_scene_and_camera_is_a_difference_of_losses(tmp_path):
+    """Along a random direction: the whole chain against central differences."""
+    problem = set_problem(scene_with(tmp_path))
+    conditions = problem.scene.draw("train", 4)
+
+    def loss(design):
+        pictures = photograph(problem.stage, problem.piece_picture(design), conditions, (32, 32))
+        return target_loss(problem.classifiers[0].logits(pictures), (0,), "assist").mean()
+
+    torch.manual_seed(0)
+    design = (0.4 + 0.2 * torch.rand(start(problem).design.shape)).requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(design), design)
+    direction = torch.rand_like(design) - 0.5 + torch.tensor([0.5, 0, -0.5])[:, None, None]
+    with torch.no_grad():
+        difference = (loss(design + 0.01 * direction) - loss(design - 0.01 * direction)) / 0.02
+    assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=0.02)
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "sign"])
+def test_assist_turns_the_patch_red_and_deceive_blue(tmp_path, optimizer):
+    for goal, channel in (("assist", 0), ("deceive", 2)):
+        problem = set_problem(scene_with(tmp_path, target__goal=goal, optimize__optimizer=optimizer))
+        state = last(problem).state
+        color = state.best.mean((1, 2))
+        assert int(color.argmax()) == channel and float(color[channel] - color[2 - channel]) > 0.5
+
+
+def test_a_signed_step_moves_each_pixel_by_the_step_size(tmp_path):
+    problem = set_problem(scene_with(tmp_path, optimize__optimizer="sign", optimize__step_size=0.03))
+    step = next(steps(problem))
+    moved = (step.state.design - 0.5).abs()
+    assert float(moved.max()) == pytest.approx(0.03, abs=1e-6)
+    assert step.gradient > 0
+
+
+def test_the_design_kept_is_the_best_on_the_selection_set(tmp_path):
+    problem = set_problem(scene_with(tmp_path, optimize__steps=30))
+    tried = [step for step in steps(problem) if step.select_loss is not None]
+    assert [step.state.number for step in tried] == [10, 20, 30]
+    assert tried[-1].state.best_loss == min(step.select_loss for step in tried)
+
+
+def test_variation_and_gamut_terms_do_what_they_say(tmp_path):
+    """From noise in strong colors: the one smooths it, the other draws it towards what can be printed."""
+
+    def after(**weights):
+        problem = set_problem(scene_with(tmp_path, optimize__step_size=0.02, **weights))
+        noise = torch.rand(start(problem).design.shape, generator=torch.Generator().manual_seed(0)).round()
+        return problem, list(steps(problem, replace(start(problem), design=noise)))[-1].state.design
+
+    problem, plain = after()
+    assert float(total_variation(after(optimize__tv=20.0)[1])) < 0.8 * float(total_variation(plain))
+    assert float(problem.gamut_excess(after(optimize__gamut=50.0)[1])) < 0.8 * float(problem.gamut_excess(plain))
+
+
+def test_a_design_survives_its_own_pixels():
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    np.testing.assert_array_equal(as_pixels(from_pixels(pixels)), pixels)
+
+
+def test_the_promise_counts_what_was_recognized(tmp_path):
+    problem = set_problem(scene_with(tmp_path, target__label="blue"))
+    blue = np.zeros((problem.design_px[1], problem.design_px[0], 3), np.uint8)
+    blue[..., 2] = 255
+    outcomes = try_out(problem, blue, problem.scene.draw("promise", 40))
+    promise = promise_from(problem, outcomes)
+    assert promise.n == 40 and len(promise.conditions) == 40
+    assert promise.rate == sum(c.recognized for c in promise.conditions) / 40
+    assert promise.interval == wilson(round(promise.rate * 40), 40)
+    assert set(promise.controls) == set(CONTROLS)
+    for claim in promise.controls.values():
+        assert claim.difference == pytest.approx(promise.rate - claim.rate)
+    assert promise.rate == 1 and all(promise.controls[kind].rate < 1 for kind in ("bare", "grey"))
+    views = problem.scene.settings.view
+    assert all(views.azimuth_deg[0] - 12 < c.azimuth_deg < views.azimuth_deg[1] + 12 for c in promise.conditions)
+
+
+def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png")):
+    return all((a / name).read_bytes() == (b / name).read_bytes() for name in names)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
+    scene = toml(tmp_path / "scene.toml")
+    for out, seed in (("a", 0), ("b", 0), ("c", 1)):
+        optimize(scene, tmp_path / out, seed=seed)
+    assert same_files(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "a" / "run.json").read_bytes() == (tmp_path / "b" / "run.json").read_bytes()
+    assert not same_files(tmp_path / "a", tmp_path / "c", ("design.png",))
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
+    scene = toml(tmp_path / "scene.toml", optimize__steps=24)
+
+    def kill(step, total):
+        if step.state.number == 17:
+            raise Killed
+
+    optimize(scene, tmp_path / "whole")
+    with pytest.raises(Killed):
+        optimize(scene, tmp_path / "cut", on_step=kill)
+    with pytest.raises(Refused, match="an unfinished one"):
+        load_run(tmp_path / "cut")
+    run = optimize(scene, tmp_path / "cut", resume=True)
+    assert same_files(tmp_path / "whole", tmp_path / "cut")
+    assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 24
+    np.testing.assert_array_equal(load_run(tmp_path / "cut").design, run.design)
+
+
+def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path):
+    scene = toml(tmp_path / "scene.toml")
+    optimize(scene, tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    with pytest.raises(Refused, match="--overwrite"):
+        optimize(scene, tmp_path / "run")
+    with pytest.raises(Refused, match="this scene and seed"):
+        optimize(scene, tmp_path / "run", seed=5, resume=True)
+    broken = toml(tmp_path / "broken.toml", target__label="no such label")
+    with pytest.raises(Refused, match="no such label"):
+        optimize(broken, tmp_path / "run", overwrite=True)
+    assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    optimize(scene, tmp_path / "run", overwrite=True)
+    (tmp_path / "run" / "thesis.txt").write_text("mine")
+    with pytest.raises(Refused, match=r"thesis\.txt"):
+        optimize(scene, tmp_path / "run", overwrite=True)

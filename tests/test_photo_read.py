@@ -1,0 +1,103 @@
+"""Any photograph comes out upright, 8-bit and whole, or is refused with a sentence."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from patchproof.photo import read
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.read import read_photo
+
+UPRIGHT = np.zeros((40, 60, 3), np.uint8)
+UPRIGHT[:20, :30], UPRIGHT[:20, 30:], UPRIGHT[20:, :30] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+# how a camera stores the upright picture so that the tag's turn brings it back (EXIF 2.32, tag 0x0112)
+STORED = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.transpose(1, 0, 2),
+    6: lambda a: np.rot90(a, 1),
+    7: lambda a: a[::-1, ::-1].transpose(1, 0, 2),
+    8: lambda a: np.rot90(a, -1),
+}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_every_orientation_comes_out_upright(tmp_path, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "photo.png"
+    Image.fromarray(np.ascontiguousarray(STORED[orientation](UPRIGHT))).save(path, exif=exif)
+    assert (read_photo(path).srgb == UPRIGHT).all()
+
+
+def test_the_focal_length_is_scaled_to_the_photos_own_diagonal(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 26
+    Image.fromarray(UPRIGHT).save(tmp_path / "a.jpg", exif=exif)
+    Image.fromarray(UPRIGHT).save(tmp_path / "b.jpg")
+    # 26 / 43.2666 of the diagonal √(60² + 40²)
+    assert read_photo(tmp_path / "a.jpg").focal_px == pytest.approx(26 / 43.2666 * math.hypot(60, 40))
+    assert read_photo(tmp_path / "b.jpg").focal_px is None
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "L", "P", "RGBA", "LA", "1", "I;16"])
+def test_every_mode_becomes_rgb(tmp_path, mode):
+    gray = np.full((30, 40), 128, np.uint8)
+    if mode == "I;16":
+        image = Image.fromarray(np.full((30, 40), 128 * 257, np.uint16))
+    elif mode == "1":
+        image = Image.fromarray(gray > 0)
+    else:
+        image = Image.fromarray(gray).convert("RGB").convert("L" if mode == "LA" else mode)
+        image = image.convert("LA") if mode == "LA" else image
+        image = Image.fromarray(gray).convert("RGB").quantize(4) if mode == "P" else image
+    path = tmp_path / ("photo.tif" if mode == "CMYK" else "photo.png")
+    image.save(path)
+    srgb = read_photo(path).srgb
+    assert srgb.shape == (30, 40, 3) and srgb.dtype == np.uint8
+    assert srgb.astype(float) == pytest.approx(255 if mode == "1" else 128, abs=2)
+
+
+def test_see_through_pixels_lie_on_white(tmp_path):
+    Image.fromarray(np.zeros((8, 8, 4), np.uint8)).save(tmp_path / "clear.png")
+    assert (read_photo(tmp_path / "clear.png").srgb == 255).all()
+
+
+def test_a_text_file_a_cut_file_and_a_missing_one_are_unreadable(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "whole.jpg")
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "whole.jpg").read_bytes()[:4000])
+    (tmp_path / "text.jpg").write_text("not a picture")
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    for name in ("cut.jpg", "text.jpg", "empty.jpg", "gone.jpg"):
+        with pytest.raises(CannotJudge) as caught:
+            read_photo(tmp_path / name)
+        assert caught.value.code == "unreadable" and caught.value.advice
+
+
+def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
+    Image.fromarray(UPRIGHT).save(tmp_path / "a.png")
+    monkeypatch.setattr(read, "LARGEST_PX", 1000)
+    with pytest.raises(CannotJudge) as caught:
+        read_photo(tmp_path / "a.png")
+    assert (caught.value.figure, caught.value.threshold) == (2400, 1000)
+
+
+def test_heic_without_its_extra_says_what_to_install(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    (tmp_path / "a.heic").write_bytes(b"x")
+    with pytest.raises(CannotJudge, match=r"pip install 'patchproof\[heic\]'"):
+        read_photo(tmp_path / "a.heic")
+
+
+def test_codes_are_those_of_the_report():
+    with pytest.raises(ValueError, match="expected one of unreadable"):
+        CannotJudge("odd", None, None, "nothing")

@@ -1,0 +1,158 @@
+"""Scenes: what is read, what is refused, and photographs that agree with the geometry they claim."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import SCENE
+
+from patchproof import geometry
+from patchproof.color import linear_from_srgb
+from patchproof.render.photograph import PiecePicture, expose, photograph, see, set_stage
+from patchproof.scene.scene import load_scene
+from patchproof.settings import Refused
+from patchproof.sheet.piece import MODULES, frame_image
+
+QUIET = """
+exposure_ev = [0, 0]
+white_balance = 0
+blur_px = [0, 0]
+noise = [0, 0]
+"""
+
+
+def scene_of(tmp_path, text):
+    path = tmp_path / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_scene(path)
+
+
+def piece_of(scene, design_px=(180, 180)):
+    frame = frame_image(scene.piece, design_px)
+    return PiecePicture(linear_from_srgb(torch.tensor(np.asarray(frame.srgb), dtype=torch.float32)), frame.piece_box_px)
+
+
+def test_a_scene_knows_its_piece_card_and_id(scene_file):
+    scene = load_scene(scene_file)
+    assert scene.card.size_mm == scene.piece.size_mm
+    assert scene.piece.size_mm[0] > 90 and len(scene.piece.markers) >= 4
+    assert load_scene(scene_file).sheet_id == scene.sheet_id != load_scene(scene_file, seed=1).sheet_id
+
+
+def test_markers_follow_from_the_views(tmp_path):
+    """Twice the distance needs markers twice as large, until the page or the object cannot hold them."""
+    near = scene_of(tmp_path, SCENE.replace("[500, 900]", "[400, 450]"))
+    far = scene_of(tmp_path, SCENE.replace("[500, 900]", "[4000, 9000]"))
+    assert near.piece.module_mm * MODULES < far.piece.module_mm * MODULES
+    assert near.unreadable_share <= 0.05 < far.unreadable_share
+    assert any("unreadable" in warning for warning in far.warnings)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("width_mm = 90", "widht_mm = 90", r'got "patch.widht_mm": did you mean "width_mm"'),
+        ("length_mm = 300", "length_mm = nan", r"length_mm.*nan.*finite"),
+        ("[-40, 40]", "[40, -40]", r"low <= high"),
+        ("width_mm = 90", "width_mm = 900", r"Expected a piece no larger|Expected .* design"),
+        ('"primitive:carton"', '"no_such.glb"', r"no_such\.glb"),
+        ('"primitive:carton"', '"primitive:cartoon"', r'did you mean "carton"'),
+        ("[500, 900]", "[50, 90]", r"cameras outside the object"),
+        ("[-40, 40]", "[180, 180]", r"views from which the patch can be seen"),
+        ("[view]", "[veiw]", r'did you mean "view"'),
+        ("[optimize]", '[background]\nimages = "nowhere"\n[optimize]', r"folder of pictures.*nowhere"),
+        ("[optimize]", '[background]\nimages = "${NO_SUCH_VARIABLE}"\n[optimize]', r"environment variable NO_SUCH_VARIABLE"),
+        ("steps = 3", "steps = 0", r"optimize\.steps"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_sentence(tmp_path, old, new, sentence):
+    assert old in SCENE
+    with pytest.raises(Refused, match=sentence) as caught:
+        scene_of(tmp_path, SCENE.replace(old, new))
+    assert "\n" not in str(caught.value) and str(caught.value).startswith("Expected ")
+
+
+def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
+    """White card in the dark: the centroid of what is bright is where the card's middle falls, in photo and square alike."""
+    scene = scene_of(tmp_path, SCENE.replace("[optimize]", "[background]\ncolor = [0, 0, 0]\n[optimize]"))
+    stage, conditions = set_stage(scene), scene.draw("promise", 5)
+    piece = PiecePicture(torch.ones(64, 64, 3), (0, 0, 64, 64))
+    for size in ((800, 600), (300, 300)):
+        seen = see(stage, piece, conditions, size)
+        homographies = scene.piece_homographies(conditions, size)
+        width, height = size
+        for i in range(5):
+            mine = seen.piece_pixel[seen.piece_view == i] - i * width * height
+            centers = np.stack([mine % width + 0.5, mine // width + 0.5], 1)
+            back = geometry.apply_homography(np.linalg.inv(homographies[i]), centers)
+            size_mm = np.array(scene.card.size_mm)
+            assert (back > -0.01).all() and (back < size_mm + 0.01).all()
+            covered = geometry.apply_homography(homographies[i], geometry.rect_corners([0, 0, *size_mm]))
+            x, y = covered.T
+            area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+            assert len(mine) == pytest.approx(area, rel=0.02)
+
+
+def test_the_square_is_the_middle_of_the_photograph(tmp_path):
+    """The classifier's square rendered directly, and cut out of the full photograph, where both have the same pixels."""
+    text = SCENE.replace("[800, 600]", "[400, 300]" + QUIET).replace(
+        "[optimize]", '[background]\nimages = "backgrounds"\n[optimize]'
+    )
+    (tmp_path / "backgrounds").mkdir()
+    from PIL import Image
+
+    for i in range(3):
+        noise = np.random.default_rng(i).integers(0, 256, (12, 16, 3), np.uint8)
+        Image.fromarray(noise).resize((640, 480), 3).save(tmp_path / "backgrounds" / f"{i}.png")
+    scene = scene_of(tmp_path, text)
+    stage, conditions, piece = set_stage(scene), scene.draw("promise", 4), piece_of(scene)
+    photo = photograph(stage, piece, conditions, (400, 300), jpeg=False)[..., 50:350]
+    square = photograph(stage, piece, conditions, (300, 300), jpeg=False)
+    assert float((photo - square).abs().mean()) < 1e-3
+    assert float((photo - square).abs().max()) < 0.1  # a background resampled at another phase
+
+
+def test_a_patch_turned_away_is_not_seen(tmp_path, scene_file):
+    scene = load_scene(scene_file)
+    stage, conditions = set_stage(scene), replace(scene.draw("promise", 2), azimuth_deg=np.array([180.0, 165.0]))
+    seen = see(stage, piece_of(scene), conditions, (96, 96))
+    assert len(seen.piece_pixel) == 0
+
+
+def test_views_seen_once_can_be_shaded_with_another_design(tmp_path, scene_file):
+    scene = load_scene(scene_file)
+    stage, conditions, piece = set_stage(scene), scene.draw("train", 3), piece_of(scene)
+    dark = PiecePicture(piece.linear * 0.1, piece.box_px)
+    seen = see(stage, piece, conditions, (96, 96))
+    torch.testing.assert_close(expose(stage, seen, dark), photograph(stage, dark, conditions, (96, 96)))
+    assert not torch.equal(expose(stage, seen, dark), expose(stage, seen, piece))
+
+
+def test_the_gradient_reaches_the_texels_that_were_seen_and_no_other(scene_file):
+    scene = load_scene(scene_file)
+    stage, conditions, piece = set_stage(scene), scene.draw("train", 2), piece_of(scene)
+    linear = piece.linear.clone().requires_grad_()
+    picture = photograph(stage, PiecePicture(linear, piece.box_px), conditions, (96, 96))
+    (gradient,) = torch.autograd.grad(picture.sum(), linear)
+    x0, y0, x1, y1 = piece.box_px
+    middle = gradient[int(y0) + 2 : int(y1) - 2, int(x0) + 2 : int(x1) - 2]
+    assert (middle.abs().sum(-1) > 0).float().mean() > 0.99
+    assert bool(torch.isfinite(gradient).all())
+
+
+def test_what_trains_and_what_is_photographed_agree_in_rate(tmp_path):
+    """The network's square with adapted effects against full photographs reduced to it, on the same conditions."""
+    from patchproof.classifier.view import center_square
+
+    scene = scene_of(tmp_path, SCENE)
+    stage, conditions, piece = set_stage(scene), scene.draw("evaluate", 12), piece_of(scene)
+    with torch.no_grad():
+        small = photograph(stage, piece, conditions, (96, 96), reduced=True)
+        large = center_square(photograph(stage, piece, conditions, (800, 600)), 96)
+    difference = (small - large).abs()
+    assert float(difference.mean()) < 0.02
+    plain = photograph(stage, piece, conditions, (96, 96))
+    assert float(difference.mean()) < float((plain - large).abs().mean())

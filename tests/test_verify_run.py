@@ -1,0 +1,203 @@
+"""Whole folders of photographs: every code, every count, and nothing that stops the batch."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof.channel.printer import identity_printer
+from patchproof.classifier import Classifier
+from patchproof.photo.read import Photo
+from patchproof.settings import Refused
+from patchproof.verify.measure import measure
+from patchproof.verify.ranges import promised_ranges
+from patchproof.verify.run import verify_photos
+from patchproof.verify.surface import promised_of, surface_of
+from test_photo_synthetic import make_manifest, page_raster, photograph, save, view
+
+
+def promise(conditions=()):
+    model = dict(name="net", sha256="ab" * 32, rate=0.9, interval=[0.85, 0.93], confidence=0.8)
+    target = dict(label="bright", indices=[0], goal="assist")
+    return dict(
+        target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=400, controls={}, conditions=conditions
+    )
+
+
+def brightness(photos):
+    level = photos.mean((1, 2, 3))
+    return torch.stack([level * 20, torch.full_like(level, 5.0)], 1)  # "bright" above a mean of 0.25
+
+
+NET = Classifier("net", "ab" * 32, 32, ("bright", "dark"), brightness)
+
+
+@functools.cache
+def raster(only_piece: bool, first_id: int = 0):
+    return page_raster(make_manifest(first_id=first_id), only_piece)
+
+
+def shot(azimuth=10, distance=550, only_piece=True, first_id=0, **look):
+    homography = view(azimuth, 5, distance, size_px=(800, 600))
+    return photograph(raster(only_piece, first_id), homography, (800, 600), fine=3, **{"blur_px": 0.5, **look})
+
+
+def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
+    manifest = manifest or make_manifest()
+    surface = surface_of(manifest)
+    promised = promised_of(manifest, surface, identity_printer())
+    return measure(Photo(srgb, focal_px, Path("a")), "a", surface, promised, promised_ranges(conditions), scan_dpi)
+
+
+def test_a_good_photo_is_measured_and_its_pose_is_right():
+    # 800×600 at 40° across the short side: focal length 300 / tan 20° = 824.2 px
+    look = measured(shot(30, 550, jpeg=92, noise=0.003), focal_px=824.2)
+    entry = look.entry
+    assert (entry.status, entry.code, entry.markers_found, look.counted) == ("measured", None, 8, True)
+    assert entry.azimuth_deg == pytest.approx(30, abs=0.5) and entry.distance_mm == pytest.approx(550, rel=0.01)
+    assert entry.tilt_deg == pytest.approx(30.4, abs=1) and entry.blur_px == pytest.approx(0.5, abs=0.2)
+    assert entry.px_per_mm == pytest.approx(824.2 / 550 * np.sqrt(np.cos(np.radians(30.4))), rel=0.02)
+    assert entry.color_fit == "affine12" and entry.delta_e00_mean < 2.5 and entry.scale_x is None
+    assert entry.contrast == pytest.approx(0.8, abs=0.05)
+
+
+def test_light_and_white_balance_are_no_color_difference_but_another_design_is():
+    plain = measured(shot()).entry.delta_e00_mean
+    tinted = measured(shot(light=np.array([0.8, 0.6, 0.45]))).entry.delta_e00_mean
+    assert tinted == pytest.approx(plain, abs=0.5)
+    faded = np.clip(make_manifest().design.pixels() * 0.5 + 90, 0, 255).astype(np.uint8)
+    assert measured(shot(), manifest=make_manifest(design=faded)).entry.delta_e00_mean > plain + 5
+
+
+def test_without_swatches_paper_and_ink_fix_the_color():
+    manifest = make_manifest().model_copy(update={"chart": ()})
+    entry = measured(shot(light=np.array([0.8, 0.6, 0.45])), manifest=manifest).entry
+    assert entry.color_fit == "white_black" and entry.delta_e00_mean < 4
+
+
+@pytest.mark.parametrize(
+    ("srgb", "status", "code"),
+    [
+        (lambda: np.full((300, 400, 3), 120, np.uint8), "rejected", "too_few_markers"),
+        (lambda: np.ascontiguousarray(shot()[:, ::-1]), "rejected", "mirrored"),
+        (lambda: shot(first_id=300), "rejected", "wrong_sheet"),
+        (lambda: np.concatenate([shot(), shot()], 1), "rejected", "several_sheets"),
+        (lambda: np.concatenate([shot(), shot(first_id=300)], 1), "rejected", "several_sheets"),
+        (lambda: shot(light=2.0), "judged", "clipped"),
+        (lambda: shot(82, 250), "judged", "tilted"),
+    ],
+)
+def test_each_trouble_has_its_code_and_advice(srgb, status, code):
+    look = measured(srgb())
+    assert (look.entry.status, look.entry.code) == (status, code)
+    assert look.entry.advice and look.counted == (status != "rejected")
+
+
+def test_a_corner_of_the_frame_identifies_the_sheet_but_is_not_measured():
+    photo = shot(0, 400)
+    photo[:, 330:] = 120  # only the left markers stay
+    photo[200:] = 120
+    look = measured(photo)
+    assert (look.entry.status, look.entry.code, look.counted) == ("judged", "too_few_markers", True)
+
+
+def test_bent_paper_is_never_measured_as_flat():
+    import cv2
+
+    photo = shot(0, 400)
+    rows, columns = np.mgrid[0:600, 0:800].astype(np.float32)
+    bent = cv2.remap(photo, columns, rows + 14 * np.sin(columns / 90), cv2.INTER_LINEAR)
+    entry = measured(bent).entry
+    assert entry.status == "judged" or entry.residual_mm > 0.3
+
+
+def test_views_outside_of_the_promise_are_not_counted():
+    claims = make_manifest(
+        promise([dict(px_per_mm=s, tilt_deg=t, azimuth_deg=t, contrast=None, blur_px=None, recognized=True)
+                 for s, t in ((1.2, 0.0), (2.0, 30.0))])
+    ).promise.conditions  # fmt: skip
+    assert measured(shot(10, 550), claims).entry.code is None
+    for outside in (shot(10, 1100), shot(50, 450)):
+        look = measured(outside, claims)
+        assert (look.entry.status, look.entry.code, look.counted) == ("rejected", "out_of_range", False)
+
+
+def test_the_uncut_page_and_scans_are_measured_but_not_counted():
+    page = measured(shot(10, 900, only_piece=False))
+    assert page.entry.status == "measured" and not page.counted and page.entry.scale_x is None
+    for sx, sy, code in ((1.0, 1.0, None), (0.97, 0.965, "scale_off"), (1.003, 0.997, None)):
+        homography = np.diag([100 / 25.4 * sx, 100 / 25.4 * sy, 1.0])
+        homography[:2, 2] = 7.3, 4.9
+        scan = photograph(raster(False), homography, (860, 1200), blur_px=0.5, light=0.9, fine=3)
+        look = measured(scan, scan_dpi=100)
+        assert (look.entry.status, look.entry.code, look.counted) == ("measured", code, False)
+        assert look.entry.scale_x == pytest.approx(sx, abs=0.002) and look.entry.scale_y == pytest.approx(sy, abs=0.002)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    photos = tmp_path_factory.mktemp("photos")
+    for i in range(6):
+        save(shot(8 * i - 20, 500 + 20 * i, seed=i, noise=0.003), photos / f"b{i}.jpg")
+    (photos / "a.JPG").write_text("no picture")
+    save(np.full((200, 300, 3), 99, np.uint8), photos / "c.png")
+    (photos / "truth.json").write_text("{ broken")
+    (photos / "notes.txt").write_text("x")
+    (photos / ".hidden.jpg").write_text("x")
+    return photos
+
+
+def verified(folder, **options):
+    return verify_photos(folder, make_manifest(promise()), models=[NET], printer=identity_printer(), **options)
+
+
+def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
+    calls = []
+    report = verified(folder, progress=lambda done, total: calls.append((done, total))).report
+    assert [p.file for p in report.photos] == ["a.JPG", *(f"b{i}.jpg" for i in range(6)), "c.png"]
+    assert [p.code for p in report.photos] == ["unreadable", *[None] * 6, "too_few_markers"]
+    summary = report.summary
+    assert (summary.photos, summary.judged, summary.measured, summary.rate) == (8, 6, 6, 1.0)
+    # one of seven readable photographs shows no marker: more than 10 %
+    assert (summary.verdict, summary.effect, summary.ledger) == ("cannot_tell", "not_tested", None)
+    assert calls[-1] == (8, 8)
+    prediction = report.photos[1].predictions["net"]
+    assert prediction.label == "bright" and prediction.recognized
+    assert prediction.confidence == prediction.target_confidence > 0.5
+    assert report.photos[0].predictions == {} and report.photos[-1].predictions
+
+
+def test_two_processes_give_the_same_bytes_as_one(folder):
+    assert verified(folder, jobs=2).report.dump() == verified(folder).report.dump()
+
+
+def test_controls_decide_the_effect(folder, tmp_path):
+    for i in range(6):
+        save(np.full((100, 100, 3), 20, np.uint8), tmp_path / f"b{i}.jpg")
+    evidence = verified(folder, controls=tmp_path)
+    assert evidence.report.summary.effect == "shown"
+    (control,) = evidence.controls
+    assert (control.recognized, control.n, control.pairs) == (0, 6, 6)
+
+
+def test_only_scans_have_no_rate(tmp_path):
+    homography = np.diag([4.0, 4.0, 1.0])
+    save(photograph(raster(False), homography, (860, 1200), light=0.9, fine=3), tmp_path / "scan.png")
+    summary = verified(tmp_path, scan_dpi=101.6).report.summary
+    assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 1, None, "cannot_tell")
+
+
+def test_folders_and_judges_that_will_not_do_are_refused_in_a_sentence(tmp_path):
+    for path, words in ((tmp_path / "gone", "no folder at"), (tmp_path, "got none")):
+        with pytest.raises(Refused, match=words):
+            verified(path)
+    save(np.zeros((50, 50, 3), np.uint8), tmp_path / "a.jpg")
+    other = Classifier("other", None, 32, ("bright", "dark"), brightness)
+    retrained = Classifier("net", "cd" * 32, 32, ("bright", "dark"), brightness)
+    for model, words in ((other, "the promise's own network net"), (retrained, "another file under that name")):
+        with pytest.raises(Refused, match=words):
+            verify_photos(tmp_path, make_manifest(promise()), models=[model], printer=identity_printer())
