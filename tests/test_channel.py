@@ -26,7 +26,9 @@ def conditions(n, **camera):
 
 def test_paper_facing_the_light_is_white_and_facing_away_gets_the_ambient_part():
     normal = torch.tensor([[0.0, 0, 1], [0, 0, -1], [1, 0, 0]])
-    light = irradiance(normal, torch.tensor([0, 0, 0]), torch.tensor([0.4]), torch.tensor([0.6]), torch.tensor([[0.0, 0, 1]]))
+    light = irradiance(
+        normal, torch.tensor([0, 0, 0]), torch.tensor([0.4]), torch.tensor([0.6]), torch.tensor([[0.0, 0, 1]])
+    )
     torch.testing.assert_close(light, torch.tensor([1.0, 0.4, 0.4]))
 
 
@@ -38,7 +40,9 @@ def test_a_perfect_camera_only_encodes():
 def test_one_stop_doubles_the_light_and_what_is_too_much_is_clipped():
     drawn = conditions(1, exposure_ev=[1, 1])
     linear = torch.tensor([0.1, 0.3, 0.7]).view(1, 1, 1, 3).expand(1, 3, 1, 3)
-    torch.testing.assert_close(linear_from_srgb(develop(linear, drawn, 0.1))[0, 0, 0], torch.tensor([0.2, 0.6, 1.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        linear_from_srgb(develop(linear, drawn, 0.1))[0, 0, 0], torch.tensor([0.2, 0.6, 1.0]), atol=1e-5, rtol=0
+    )
 
 
 def test_white_balance_keeps_green_and_moves_red_and_blue():
@@ -93,7 +97,9 @@ def test_jpeg_is_near_a_real_encoder_and_carries_gradients():
     (gradient,) = torch.autograd.grad(ours.sum(), picture)
     assert bool((gradient != 0).any())
     buffer = BytesIO()
-    Image.fromarray((picture[0].detach().permute(1, 2, 0).numpy() * 255).round().astype("uint8")).save(buffer, "JPEG", quality=75)
+    Image.fromarray((picture[0].detach().permute(1, 2, 0).numpy() * 255).round().astype("uint8")).save(
+        buffer, "JPEG", quality=75
+    )
     theirs = torch.tensor(np.asarray(Image.open(buffer))).permute(2, 0, 1)[None] / 255
     assert float((ours.detach() - theirs).abs().mean()) < 0.012
 

@@ -15,7 +15,7 @@ from patchproof.optimize.goals import target_loss, total_variation
 from patchproof.optimize.loop import start, steps
 from patchproof.optimize.problem import as_pixels, from_pixels, set_problem
 from patchproof.optimize.promise import CONTROLS, promise_from, try_out
-from patchproof.optimize.run import load_run, optimize
+from patchproof.optimize.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.scene import build_scene
 from patchproof.settings import Refused, SceneSettings, validated
@@ -153,7 +153,7 @@ def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
     scene = toml(tmp_path / "scene.toml")
     for out, seed in (("a", 0), ("b", 0), ("c", 1)):
-        optimize(scene, tmp_path / out, seed=seed)
+        optimize_scene(scene, tmp_path / out, seed=seed)
     assert same_files(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "a" / "run.json").read_bytes() == (tmp_path / "b" / "run.json").read_bytes()
     assert not same_files(tmp_path / "a", tmp_path / "c", ("design.png",))
@@ -170,12 +170,12 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
         if step.state.number == 17:
             raise Killed
 
-    optimize(scene, tmp_path / "whole")
+    optimize_scene(scene, tmp_path / "whole")
     with pytest.raises(Killed):
-        optimize(scene, tmp_path / "cut", on_step=kill)
+        optimize_scene(scene, tmp_path / "cut", on_step=kill)
     with pytest.raises(Refused, match="an unfinished one"):
         load_run(tmp_path / "cut")
-    run = optimize(scene, tmp_path / "cut", resume=True)
+    run = optimize_scene(scene, tmp_path / "cut", resume=True)
     assert same_files(tmp_path / "whole", tmp_path / "cut")
     assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 24
     np.testing.assert_array_equal(load_run(tmp_path / "cut").design, run.design)
@@ -183,17 +183,17 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
 
 def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path):
     scene = toml(tmp_path / "scene.toml")
-    optimize(scene, tmp_path / "run")
+    optimize_scene(scene, tmp_path / "run")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     with pytest.raises(Refused, match="--overwrite"):
-        optimize(scene, tmp_path / "run")
+        optimize_scene(scene, tmp_path / "run")
     with pytest.raises(Refused, match="this scene and seed"):
-        optimize(scene, tmp_path / "run", seed=5, resume=True)
+        optimize_scene(scene, tmp_path / "run", seed=5, resume=True)
     broken = toml(tmp_path / "broken.toml", target__label="no such label")
     with pytest.raises(Refused, match="no such label"):
-        optimize(broken, tmp_path / "run", overwrite=True)
+        optimize_scene(broken, tmp_path / "run", overwrite=True)
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    optimize(scene, tmp_path / "run", overwrite=True)
+    optimize_scene(scene, tmp_path / "run", overwrite=True)
     (tmp_path / "run" / "thesis.txt").write_text("mine")
     with pytest.raises(Refused, match=r"thesis\.txt"):
-        optimize(scene, tmp_path / "run", overwrite=True)
+        optimize_scene(scene, tmp_path / "run", overwrite=True)

@@ -36,7 +36,14 @@ def card_on(mesh, size=(50, 40), **patch):
 
 @pytest.mark.parametrize(
     ("side", "middle"),
-    [("+x", (100, 0, 0)), ("-x", (-100, 0, 0)), ("+y", (0, 60, 0)), ("-y", (0, -60, 0)), ("+z", (0, 0, 40)), ("-z", (0, 0, -40))],
+    [
+        ("+x", (100, 0, 0)),
+        ("-x", (-100, 0, 0)),
+        ("+y", (0, 60, 0)),
+        ("-y", (0, -60, 0)),
+        ("+z", (0, 0, 40)),
+        ("-z", (0, 0, -40)),
+    ],
 )
 def test_a_card_lies_on_its_side_facing_out(box, side, middle):
     card = card_on(box, side=side)

@@ -130,7 +130,10 @@ def test_two_triangles_cover_each_pixel_of_their_square_once():
     rng = np.random.default_rng(0)
     for _ in range(50):
         eye = rng.uniform([-1, -1, 2], [1, 1, 5])
-        one, two = (set(rasterize(corners, torch.tensor([f]), cameras([eye]), 0.01).pixel.tolist()) for f in ([0, 1, 2], [0, 2, 3]))
+        one, two = (
+            set(rasterize(corners, torch.tensor([f]), cameras([eye]), 0.01).pixel.tolist())
+            for f in ([0, 1, 2], [0, 2, 3])
+        )
         both = set(rasterize(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), cameras([eye]), 0.01).pixel.tolist())
         assert not one & two and one | two == both
 
@@ -203,7 +206,9 @@ def test_chunks_do_not_change_the_picture(monkeypatch):
 
 @pytest.mark.parametrize("name", ["gz_suv", "teapot"])
 def test_agrees_with_another_rasterizer(data, name):
-    """PyTorch3D's fragments of the same views; both round, so pixels on an edge may differ and coincident faces may swap."""
+    """PyTorch3D's fragments of the same views; both round, so pixels on an edge may differ and coincident faces may
+    swap.
+    """
     theirs = np.load(data / "reference" / f"{name}.npz")
     rotation, center = theirs["rotation"].astype(float), theirs["center"].astype(float)
     size = int(theirs["size_px"])

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import SCENE
 
+from conftest import SCENE
 from patchproof import geometry
 from patchproof.color import linear_from_srgb
 from patchproof.render.photograph import PiecePicture, expose, photograph, see, set_stage
@@ -64,7 +64,11 @@ def test_markers_follow_from_the_views(tmp_path):
         ("[-40, 40]", "[180, 180]", r"views from which the patch can be seen"),
         ("[view]", "[veiw]", r'did you mean "view"'),
         ("[optimize]", '[background]\nimages = "nowhere"\n[optimize]', r"folder of pictures.*nowhere"),
-        ("[optimize]", '[background]\nimages = "${NO_SUCH_VARIABLE}"\n[optimize]', r"environment variable NO_SUCH_VARIABLE"),
+        (
+            "[optimize]",
+            '[background]\nimages = "${NO_SUCH_VARIABLE}"\n[optimize]',
+            r"environment variable NO_SUCH_VARIABLE",
+        ),
         ("steps = 3", "steps = 0", r"optimize\.steps"),
     ],
 )
@@ -76,7 +80,9 @@ def test_what_cannot_be_is_refused_in_one_sentence(tmp_path, old, new, sentence)
 
 
 def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
-    """White card in the dark: the centroid of what is bright is where the card's middle falls, in photo and square alike."""
+    """White card in the dark: the centroid of what is bright is where the card's middle falls, in photo and square
+    alike.
+    """
     scene = scene_of(tmp_path, SCENE.replace("[optimize]", "[background]\ncolor = [0, 0, 0]\n[optimize]"))
     stage, conditions = set_stage(scene), scene.draw("promise", 5)
     piece = PiecePicture(torch.ones(64, 64, 3), (0, 0, 64, 64))
@@ -97,7 +103,7 @@ def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
 
 
 def test_the_square_is_the_middle_of_the_photograph(tmp_path):
-    """The classifier's square rendered directly, and cut out of the full photograph, where both have the same pixels."""
+    """The classifier's square rendered directly, and cut out of the full photograph at the same pixels."""
     text = SCENE.replace("[800, 600]", "[400, 300]" + QUIET).replace(
         "[optimize]", '[background]\nimages = "backgrounds"\n[optimize]'
     )

@@ -33,7 +33,9 @@ def test_a_texture_seen_texel_by_texel_is_itself():
 def test_wrap_repeats_and_clamp_goes_on():
     texture = torch.rand(8, 8, 3)
     uv = centers(8, 8)
-    torch.testing.assert_close(look(texture, uv + 3, *per_pixel(8, 8), wrap=True, taps=1), texture.view(-1, 3), atol=2e-5, rtol=0)
+    torch.testing.assert_close(
+        look(texture, uv + 3, *per_pixel(8, 8), wrap=True, taps=1), texture.view(-1, 3), atol=2e-5, rtol=0
+    )
     beyond = look(texture, uv + torch.tensor([5.0, 0]), *per_pixel(8, 8), taps=1)
     torch.testing.assert_close(beyond.view(8, 8, 3), texture[:, -1:].expand(8, 8, 3))
 
@@ -41,7 +43,9 @@ def test_wrap_repeats_and_clamp_goes_on():
 def test_seen_from_afar_a_texture_is_its_mean():
     texture = torch.rand(64, 64, 3)
     far = torch.tensor([[1.0, 0]]), torch.tensor([[0.0, 1]])
-    torch.testing.assert_close(look(texture, torch.tensor([[0.3, 0.6]]), *far), texture.mean((0, 1))[None], atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        look(texture, torch.tensor([[0.3, 0.6]]), *far), texture.mean((0, 1))[None], atol=1e-5, rtol=0
+    )
 
 
 @pytest.mark.parametrize("reduction", [2, 4, 8])
@@ -88,6 +92,8 @@ def test_several_textures_of_different_sizes_do_not_mix():
     where = layout([(4, 4), (16, 32), (1, 1)], wrap=True)
     texture = torch.tensor([0, 1, 2]).repeat(20)
     derivative = torch.rand(60, 2, generator=torch.Generator().manual_seed(1)) * 0.6
-    seen = look_up(footprint(where, texture, torch.rand(60, 2) * 9 - 4, derivative, derivative.flip(1)), texel_table(textures))
+    seen = look_up(
+        footprint(where, texture, torch.rand(60, 2) * 9 - 4, derivative, derivative.flip(1)), texel_table(textures)
+    )
     expected = torch.tensor([0.1, 0.5, 0.9])[texture][:, None].expand(60, 3)
     torch.testing.assert_close(seen, expected, atol=1e-6, rtol=0)

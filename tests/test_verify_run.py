@@ -15,7 +15,7 @@ from patchproof.photo.read import Photo
 from patchproof.settings import Refused
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges
-from patchproof.verify.run import verify_photos
+from patchproof.verify.run import gather_evidence
 from patchproof.verify.surface import promised_of, surface_of
 from test_photo_synthetic import make_manifest, page_raster, photograph, save, view
 
@@ -152,7 +152,7 @@ def folder(tmp_path_factory):
 
 
 def verified(folder, **options):
-    return verify_photos(folder, make_manifest(promise()), models=[NET], printer=identity_printer(), **options)
+    return gather_evidence(folder, make_manifest(promise()), models=[NET], printer=identity_printer(), **options)
 
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
@@ -200,4 +200,4 @@ def test_folders_and_judges_that_will_not_do_are_refused_in_a_sentence(tmp_path)
     retrained = Classifier("net", "cd" * 32, 32, ("bright", "dark"), brightness)
     for model, words in ((other, "the promise's own network net"), (retrained, "another file under that name")):
         with pytest.raises(Refused, match=words):
-            verify_photos(tmp_path, make_manifest(promise()), models=[model], printer=identity_printer())
+            gather_evidence(tmp_path, make_manifest(promise()), models=[model], printer=identity_printer())

@@ -1,7 +1,7 @@
 """patchproof: optimise a patch on a 3D object, print it at true size, photograph it, judge the photographs.
 
-The public names tell the story in order: scene → optimize → sheet → photographs → verify. They are imported when first used,
-so that `import patchproof` and `patchproof --help` stay quick.
+The public names tell the story in order: scene → optimize → sheet → photographs → verify. They are imported when first
+used, so that `import patchproof` and `patchproof --help` stay quick.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ _HOME = {
     "load_printer": "patchproof.channel.printer",
     "photograph": "patchproof.render.photograph",
     "set_stage": "patchproof.render.photograph",
-    "optimize": "patchproof.optimize.run",
-    "evaluate": "patchproof.optimize.evaluate",
+    "optimize_scene": "patchproof.optimize.run",
+    "evaluate_run": "patchproof.optimize.evaluate",
     "load_run": "patchproof.optimize.run",
     "sheet_of": "patchproof.study.sheet",
     "reprint": "patchproof.study.reprint",
     "load_manifest": "patchproof.sheet.manifest",
-    "verify": "patchproof.study.verify",
+    "verify_photos": "patchproof.study.verify",
     "Refused": "patchproof.settings",
 }
 

@@ -6,7 +6,8 @@ their own: a beta-binomial prediction interval with the Jeffreys prior Beta(1/2,
 conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10, applies.
 Left out on purpose: corrections for looking more than once. The promise set is looked at once.
 
-Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650 (paired).
+Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
+(paired).
 """
 
 from __future__ import annotations

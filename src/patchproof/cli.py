@@ -1,6 +1,7 @@
 """The command line: verbs only. Each one reads its arguments, calls one function, and prints a short summary.
 
-Heavy imports happen inside the verbs, so that help is quick. What a user can cause ends in one sentence and exit code 1.
+Heavy imports happen inside the verbs, so that help is quick. What a user can cause ends in one sentence and exit code
+1.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def optimize(
     seed: Seed = None,
 ) -> None:
     """Optimise the patch of a scene and promise its rate."""
-    from patchproof.optimize.run import optimize as optimize_scene
+    from patchproof.optimize.run import optimize_scene
     from patchproof.report.summary import promise_lines
 
     with _progress() as bar:
@@ -102,7 +103,7 @@ def evaluate(
     device: Device = "cpu",
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers."""
-    from patchproof.optimize.evaluate import evaluate as evaluate_run
+    from patchproof.optimize.evaluate import evaluate_run
     from patchproof.report.summary import evaluation_lines
 
     with _progress() as bar:
@@ -150,9 +151,7 @@ def reprint(
     printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
     print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
-    scan_dpi: Annotated[
-        float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")
-    ] = None,
+    scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
@@ -192,16 +191,14 @@ def verify(
     scan_dpi: Annotated[
         float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
     ] = None,
-    ruler_mm: Annotated[
-        str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")
-    ] = None,
+    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that measure photographs.")] = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure photographs of the print and judge them against the promise."""
     from patchproof.report.summary import verdict_lines
-    from patchproof.study.verify import verify as verify_photos
+    from patchproof.study.verify import verify_photos
 
     if require not in (None, "kept"):
         raise typer.BadParameter('takes "kept" only', param_hint="--require")

@@ -1,8 +1,9 @@
 """Colour maths: sRGB ↔ linear light ↔ CIELAB, and the colour difference CIEDE2000.
 
-In and out: numpy arrays or torch tensors with the channels in the *last* axis (`... × 3`), or any shape where a function
-works per value. `*_srgb` is display-encoded in [0, 1], `*_linear` is light relative to sRGB white. CIELAB is D65, 2°.
-The same code serves both libraries, so that the loss while training and the figure in the report are one formula.
+In and out: numpy arrays or torch tensors with the channels in the *last* axis (`... × 3`), or any shape where a
+function works per value. `*_srgb` is display-encoded in [0, 1], `*_linear` is light relative to sRGB white. CIELAB is
+D65, 2°. The same code serves both libraries, so that the loss while training and the figure in the report are one
+formula.
 
 Sources: IEC 61966-2-1 (sRGB); CIE 15:2004 (CIELAB); Sharma, Wu, Dalal, Color Res. Appl. 30 (2005) 21-30 (CIEDE2000).
 """
@@ -90,8 +91,8 @@ def ciede2000(lab_a, lab_b):
     S_L = 1 + 0.015 * (L_bar - 50) ** 2 / xp.sqrt(20 + (L_bar - 50) ** 2)
     S_C, S_H = 1 + 0.045 * C_barp, 1 + 0.015 * C_barp * T
     R_T = -xp.sin(2 * d_theta) * R_C
-    l, c, h = dL / S_L, dC / S_C, dH / S_H
-    return xp.sqrt(_at_least(xp, l**2 + c**2 + h**2 + R_T * c * h, 0.0) + tiny)
+    light, chroma, hue = dL / S_L, dC / S_C, dH / S_H
+    return xp.sqrt(_at_least(xp, light**2 + chroma**2 + hue**2 + R_T * chroma * hue, 0.0) + tiny)
 
 
 def _hue(xp, b, a):

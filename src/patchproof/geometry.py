@@ -1,11 +1,12 @@
 """Poses, pinhole cameras and homographies, in float64 numpy.
 
-Frames. World: millimetres, right-handed, y up, origin at the centre of the object's bounding box. Camera: x right, y down,
-z forward. Page and piece: millimetres, x right, y down. Image: pixels, pixel centres at .5. `camera_from_world` is 4×4
-and `camera_from_world @ [X, 1]` is the point as the camera sees it; names say frame to frame, right to left.
+Frames. World: millimetres, right-handed, y up, origin at the centre of the object's bounding box. Camera: x right, y
+down, z forward. Page and piece: millimetres, x right, y down. Image: pixels, pixel centres at .5. `camera_from_world`
+is 4×4 and `camera_from_world @ [X, 1]` is the point as the camera sees it; names say frame to frame, right to left.
 Left out on purpose: lens distortion. It is applied only where a camera file has it.
 
-Source of the homography's meaning and the normalised DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1 and 8.1.
+Source of the homography's meaning and the normalised DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1
+and 8.1.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 
 
 def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray:
-    """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to its right when positive.
+    """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to its right when
+    positive.
 
     Seen from outside, facing the side, positive azimuth moves the camera to the right. Arrays give N×3.
     """
@@ -26,7 +28,7 @@ def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray
 
 
 def look_at(eye_mm, target_mm, roll_deg=0.0, up=(0.0, 1.0, 0.0)) -> np.ndarray:
-    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, its picture turned clockwise by roll."""
+    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by roll."""
     eye, target = np.asarray(eye_mm, float), np.asarray(target_mm, float)
     z = _unit(target - eye)
     side = np.cross(z, _unit(up))

@@ -1,7 +1,8 @@
 """Output that replaces what was there only when it is complete.
 
-In: where a command should write. Out: a place to write to that becomes the real one at the end. What exists is refused unless the
-user asked to overwrite it, and overwriting a folder removes only what the command itself writes: a mistyped folder loses nothing.
+In: where a command should write. Out: a place to write to that becomes the real one at the end. What exists is refused
+unless the user asked to overwrite it, and overwriting a folder removes only what the command itself writes: a mistyped
+folder loses nothing.
 """
 
 from __future__ import annotations

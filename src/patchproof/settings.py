@@ -1,8 +1,8 @@
 """Scene files read strictly, the one way to refuse, and where shipped data lies.
 
-In: a TOML file (paths relative to it, `${VAR}` expanded). Out: frozen settings, every value checked: an unknown key names
-the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three things in one sentence: what was
-expected, what was there, and what to do. The command line prints that sentence and exits with 1.
+In: a TOML file (paths relative to it, `${VAR}` expanded). Out: frozen settings, every value checked: an unknown key
+names the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three things in one sentence:
+what was expected, what was there, and what to do. The command line prints that sentence and exits with 1.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class TargetSettings(Strict):
 
 
 class ViewSettings(Strict):
-    """Ranges of the camera's place; azimuth 0 faces the patch's side; distance from the camera's centre to `look_at`."""
+    """Where the camera may be; azimuth 0 faces the patch's side; distance from the camera's centre to `look_at`."""
 
     look_at: Literal["object", "patch"] = "object"
     look_at_jitter: Share = 0.05  # share of the object's length
@@ -220,7 +220,7 @@ def expand(text: str, base: Path) -> str:
     prefix, colon, rest = text.partition(":")
     if colon and prefix == "file":
         return f"file:{_absolute(rest, base)}"
-    if colon and (prefix in {"primitive", "torchvision", "timm", "module"}) or text == "builtin":
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "module"})) or text == "builtin":
         return text
     return str(_absolute(text, base))
 

@@ -1,12 +1,13 @@
 """The camera: linear light at the sensor becomes a display-encoded picture.
 
-In: N×3×H×W linear light and the drawn camera conditions. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur (optics, focus),
-exposure and white balance, shot and read noise, clipping, tone curve (sRGB's).
+In: N×3×H×W linear light and the drawn camera conditions. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur
+(optics, focus), exposure and white balance, shot and read noise, clipping, tone curve (sRGB's).
 
-Blur, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the photograph gets
-what is left of them after averaging: blur and noise shrink with `scale`; what falls under the threshold of visibility is skipped,
-since it would cost time and show nothing. What stands for a photograph that was already reduced to a network's input also gets the
-blur of that reduction. At full size the photograph is stored as a real JPEG by whoever writes it.
+Blur, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
+photograph gets what is left of them after averaging: blur and noise shrink with `scale`; what falls under the threshold
+of visibility is skipped, since it would cost time and show nothing. What stands for a photograph that was already
+reduced to a network's input also gets the blur of that reduction. At full size the photograph is stored as a real JPEG
+by whoever writes it.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from patchproof.color import srgb_from_linear
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4
-# The antialiased bilinear filter that reduces photographs is a triangle of two pixels: variance 1/6 px². Without it 40 photographs of
-# an optimized patch were judged 0.07 too confidently at the network's size, with it 0.04.
+# The antialiased bilinear filter that reduces photographs is a triangle of two pixels: variance 1/6 px². Without it 40
+# photographs of an optimized patch were judged 0.07 too confidently at the network's size, with it 0.04.
 REDUCTION_VARIANCE = 1 / 6
 # Noise below half an 8-bit step is lost in rounding.
 SMALLEST_NOISE = 0.5 / 255

@@ -1,7 +1,7 @@
 """Evaluate a run again: fresh conditions, its controls, and networks it was not optimized with.
 
-In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control. Conditions come
-from the evaluate stream, which neither training nor the promise has seen.
+In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control. Conditions
+come from the evaluate stream, which neither training nor the promise has seen.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from patchproof.optimize.run import load_run
 from patchproof.output import write_whole
 
 
-def evaluate(
+def evaluate_run(
     run_folder: str | Path,
     *,
     models: tuple[str, ...] | None = None,

@@ -3,8 +3,9 @@
 In: logits and label indices, or a design. Out: scalars. Goals add. The target term is the cross-entropy of the *summed*
 probability of all accepted labels, the quantity that is reported as confidence; for `deceive`, of its complement.
 
-The paper's printed update Θ + α∇L raises the loss (Pestana et al., Algorithm 1); recognition needs the descent done here.
-TV: Mahendran and Vedaldi, CVPR 2015. Left out on purpose: a list of printable colors; the printer's own gamut is known.
+The paper's printed update Θ + α∇L raises the loss (Pestana et al., Algorithm 1); recognition needs the descent done
+here. TV: Mahendran and Vedaldi, CVPR 2015. Left out on purpose: a list of printable colors; the printer's own gamut is
+known.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from torch import Tensor
 
 
 def target_loss(logits: Tensor, indices: Sequence[int], goal: str) -> Tensor:
-    """N losses: -log p of the accepted labels (`assist`) or of all others (`deceive`), in float64 so that none saturates."""
+    """N losses: -log p of the accepted labels (`assist`) or of all others (`deceive`), in float64 so that none
+    saturates.
+    """
     log_p = torch.log_softmax(logits.double(), 1)
     wanted = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
     wanted[list(indices)] = True

@@ -1,9 +1,9 @@
 """The loop: draw conditions, photograph the piece, descend.
 
-In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's business.
-The design starts at mid-gray. Adam, or signed steps as in FGSM and PGD (Goodfellow et al. 2015, Madry et al. 2018), always
-clipped to [0, 1]. Every few steps the design is tried on a fixed selection set, and the best one is kept: a design that
-suited its last twelve views only is not what gets printed. The promise set is never touched here.
+In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's
+business. The design starts at mid-gray. Adam, or signed steps as in FGSM and PGD (Goodfellow et al. 2015, Madry et al.
+2018), always clipped to [0, 1]. Every few steps the design is tried on a fixed selection set, and the best one is kept:
+a design that suited its last twelve views only is not what gets printed. The promise set is never touched here.
 
 A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes.
 """
@@ -40,7 +40,9 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """What one step did. Rates and confidence are over this step's training views; `select_*` where the design was tried."""
+    """What one step did. Rates and confidence are over this step's training views; `select_*` where the design was
+    tried.
+    """
 
     state: State
     loss: float

@@ -1,7 +1,8 @@
 """What is optimized: one design on one stage, in front of one or more classifiers.
 
-In: a scene, the names of its classifiers and its printer. Out: `Problem`, from which the loop, the promise and `evaluate` take
-the pictures that each design gives. The whole piece is shown, design and printed frame, because that is what will hang there.
+In: a scene, the names of its classifiers and its printer. Out: `Problem`, from which the loop, the promise and
+`evaluate` take the pictures that each design gives. The whole piece is shown, design and printed frame, because that is
+what will hang there.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""The promise: what rate the finished design will reach on conditions that nobody has looked at yet, beside its controls.
+"""The promise: what rate the finished design will reach on conditions that nobody has looked at yet, beside its
+controls.
 
-In: a `Problem`, the design's pixels, and a stream of conditions. Out: `Outcomes` (per classifier and control, per condition) and
-from them the manifest's `Promise`. Controls are shown on the very same conditions, so that differences are paired: the bare
-object, and a mean-color, a gray and a noise design in the same printed frame. The set is drawn and looked at once, after the
-design is frozen.
+In: a `Problem`, the design's pixels, and a stream of conditions. Out: `Outcomes` (per classifier and control, per
+condition) and from them the manifest's `Promise`. Controls are shown on the very same conditions, so that differences
+are paired: the bare object, and a mean-color, a gray and a noise design in the same printed frame. The set is drawn and
+looked at once, after the design is frozen.
 """
 
 from __future__ import annotations

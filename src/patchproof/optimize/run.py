@@ -1,8 +1,8 @@
 """A run's folder: what an optimization leaves behind, written so that a kill at any moment loses ten steps at most.
 
-In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl` (one flushed
-line per step), `views.png` and `checkpoint.safetensors` (replaced atomically). Nothing in it depends on the time of day, so that
-the same seed gives the same bytes on one machine with one thread count and device.
+In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
+(one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically). Nothing in it depends on
+the time of day, so that the same seed gives the same bytes on one machine with one thread count and device.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Run:
     details: dict[str, Any]
 
 
-def optimize(
+def optimize_scene(
     scene_path: str | Path,
     out: str | Path,
     *,

@@ -1,9 +1,9 @@
 """`photograph`: what the camera of each drawn condition makes of the object with the piece on it.
 
-In: a scene set on a `Stage` (its tensors on one device), the piece's picture in linear reflectance, and conditions. Out: N×3×H×W sRGB.
-The work has three parts that can be kept apart: `see` (rasterize, texture the object, find which texels of the piece each pixel
-looks at), `shade` (light and composite; the only part through which gradients reach the piece) and the camera. Views that were
-seen once can be shaded again with another design, light or camera.
+In: a scene set on a `Stage` (its tensors on one device), the piece's picture in linear reflectance, and conditions.
+Out: N×3×H×W sRGB. The work has three parts that can be kept apart: `see` (rasterize, texture the object, find which
+texels of the piece each pixel looks at), `shade` (light and composite; the only part through which gradients reach the
+piece) and the camera. Views that were seen once can be shaded again with another design, light or camera.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ _CARD_FACES = ((0, 3, 2), (0, 2, 1))
 
 @dataclass(frozen=True)
 class PiecePicture:
-    """The whole piece, frame and design, as H×W×3 linear reflectance; `box_px` (x0, y0, x1, y1) is where the cut line falls."""
+    """The whole piece, frame and design, as H×W×3 linear reflectance; `box_px` (x0, y0, x1, y1) is where the cut line
+    falls.
+    """
 
     linear: Tensor
     box_px: tuple[float, float, float, float]
@@ -170,9 +172,7 @@ def shade(stage: Stage, seen: Seen, piece: PiecePicture | None) -> Tensor:
     return image.view(len(conditions), height, width, 3).permute(0, 3, 1, 2)
 
 
-def expose(
-    stage: Stage, seen: Seen, piece: PiecePicture | None, reduced: bool = False, jpeg: bool = True
-) -> Tensor:
+def expose(stage: Stage, seen: Seen, piece: PiecePicture | None, reduced: bool = False, jpeg: bool = True) -> Tensor:
     """The photographs of views already seen."""
     scale = min(seen.size_px) / min(stage.scene.settings.camera.photo_px)
     return develop(shade(stage, seen, piece), seen.conditions, scale, reduced, jpeg)

@@ -1,14 +1,15 @@
 """A z-buffer rasterizer in plain torch: which face does each pixel center see, and where on that face.
 
-In: faces in world millimetres and a batch of pinhole cameras. Out: `Fragments`, one per covered pixel, with perspective-correct
-barycentrics, camera depth and what texture filtering needs. Visibility is hard and carries no gradient: shape is never optimized.
+In: faces in world millimetres and a batch of pinhole cameras. Out: `Fragments`, one per covered pixel, with
+perspective-correct barycentrics, camera depth and what texture filtering needs. Visibility is hard and carries no
+gradient: shape is never optimized.
 
-Triangles become row spans, spans become fragments, and depth is settled by one integer minimum per pixel, so that work follows
-what is covered. Coverage is exact: corners are snapped to 1/256 pixel and the edge functions of Pineda (1988) are evaluated on
-integers held in float64 with the top-left rule, hence two triangles that share an edge never both take a pixel and never leave
-one out. Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano and Greer, 1997), which stays
-well-defined for faces that reach behind the camera; such faces are cut at the near plane, not dropped.
-Where depths are equal to float32 the lower face index wins. Left out on purpose: transparency.
+Triangles become row spans, spans become fragments, and depth is settled by one integer minimum per pixel, so that work
+follows what is covered. Coverage is exact: corners are snapped to 1/256 pixel and the edge functions of Pineda (1988)
+are evaluated on integers held in float64 with the top-left rule, hence two triangles that share an edge never both take
+a pixel and never leave one out. Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano and
+Greer, 1997), which stays well-defined for faces that reach behind the camera; such faces are cut at the near plane, not
+dropped. Where depths are equal to float32 the lower face index wins. Left out on purpose: transparency.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ _FACE_BITS = (1 << 31) - 1  # a key is 31 bits of depth over 31 bits of face ind
 
 @dataclass(frozen=True)
 class Cameras:
-    """N pinhole cameras: `camera_from_world` N×4×4 and `matrix_px` N×3×3, float64, for pictures of `size_px` (width, height)."""
+    """N pinhole cameras: `camera_from_world` N×4×4 and `matrix_px` N×3×3, float64, for pictures of `size_px` (width,
+    height).
+    """
 
     camera_from_world: Tensor
     matrix_px: Tensor
@@ -41,8 +44,8 @@ class Cameras:
 class Fragments:
     """What P covered pixels see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
 
-    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `barycentric_dx`, `_dy` P×3: change per pixel to the right, down.
-    `front` tells whether the face shows its outside.
+    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `barycentric_dx`, `_dy` P×3: change per pixel to the
+    right, down. `front` tells whether the face shows its outside.
     """
 
     pixel: Tensor
@@ -76,7 +79,8 @@ class Fragments:
 def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float, cull_back: bool = False) -> Fragments:
     """The nearest face at every pixel center of every camera.
 
-    `vertices` V×3 (world mm), `faces` F×3 (counter-clockwise seen from outside). Faces nearer than `near_mm` are cut there.
+    `vertices` V×3 (world mm), `faces` F×3 (counter-clockwise seen from outside). Faces nearer than `near_mm` are cut
+    there.
     """
     width, height = cameras.size_px
     pose, matrix = cameras.camera_from_world.double(), cameras.matrix_px.double()
@@ -109,7 +113,9 @@ def _planes(corners: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _clipped(corners: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """Triangles T×3×2 in pixels, cut at the near plane and, where they are huge, at the guard band; and whose face they are."""
+    """Triangles T×3×2 in pixels, cut at the near plane and, where they are huge, at the guard band; and whose face they
+    are.
+    """
     z = corners[..., 2]
     reach = corners[..., :2].abs().amax(-1)
     plain = ((z > near) & (reach < GUARD_PX * z)).all(-1)
@@ -143,13 +149,15 @@ def _cut(triangles: Tensor, owner: Tensor, distance: Tensor) -> tuple[Tensor, Te
 
 
 def _crossing(turned: Tensor, d: Tensor, which: Tensor, inside: int, outside: int) -> Tensor:
-    """Where edges meet the plane, always reckoned from the inside corner: faces that share an edge get the same point."""
+    """Where edges meet the plane, always reckoned from the inside corner: faces with a common edge agree."""
     share = d[which, inside] / (d[which, inside] - d[which, outside])
     return turned[which, inside] + share[:, None] * (turned[which, outside] - turned[which, inside])
 
 
 def _setup(triangles: Tensor, size_px: tuple[int, int]):
-    """Snapped triangles of one orientation that can hold a pixel center, in chunks of bounded row count, with their indices."""
+    """Snapped triangles of one orientation that can hold a pixel center, in chunks of bounded row count, with their
+    indices.
+    """
     snapped = (triangles * SUBPIXELS).round()
     low, high = snapped.amin(1), snapped.amax(1)
     first = ((low - SUBPIXELS // 2) / SUBPIXELS).ceil().clamp_min(0)
@@ -186,8 +194,8 @@ def _fill(nearest: Tensor, spans, target: Tensor, inverse_depth: Tensor, faces: 
 def _spans(snapped: Tensor, rows: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(triangle, y, first x, length) of every row of pixel centers inside the triangles.
 
-    A center at k + ½ lies inside when dx·(Y - a_y) - dy·(256k + 128 - a_x) ≥ t for all edges, t = 0 on top and left edges, else 1.
-    All terms are integers below 2^53, so that a float64 quotient has the right floor.
+    A center at k + ½ lies inside when dx·(Y - a_y) - dy·(256k + 128 - a_x) ≥ t for all edges, t = 0 on top and left
+    edges, else 1. All terms are integers below 2^53, so that a float64 quotient has the right floor.
     """
     triangle = torch.repeat_interleave(torch.arange(len(rows), device=rows.device), rows[:, 1])
     start = rows[:, 1].cumsum(0) - rows[:, 1]

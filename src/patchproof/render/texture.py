@@ -1,11 +1,12 @@
 """Textures with mip levels: where each fragment looks (`Footprint`) and what it sees there (`look_up`).
 
-In: textures H×W×3 in linear light and, per fragment, uv (textures, v down from the top-left) with its screen derivatives. Out:
-P×3 linear light. A footprint depends on the view alone, so one footprint serves every content that the texture takes while
-it is optimized; `look_up` is the only step that backpropagates, and its gradient reaches each texel that was seen and no other.
+In: textures H×W×3 in linear light and, per fragment, uv (textures, v down from the top-left) with its screen
+derivatives. Out: P×3 linear light. A footprint depends on the view alone, so one footprint serves every content that
+the texture takes while it is optimized; `look_up` is the only step that backpropagates, and its gradient reaches each
+texel that was seen and no other.
 
-Filtering: mip levels by box averages, trilinear, and up to `taps` samples along the longer axis of the pixel's footprint, the
-scheme of Feline (McCormack et al., 1999) in its simplest form. Left out on purpose: elliptical weights.
+Filtering: mip levels by box averages, trilinear, and up to `taps` samples along the longer axis of the pixel's
+footprint, the scheme of Feline (McCormack et al., 1999) in its simplest form. Left out on purpose: elliptical weights.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def look_up(seen: Footprint, texels: Tensor) -> Tensor:
 
 
 class _LookUp(torch.autograd.Function):
-    """A weighted gather. The library's own backward of the same sum was measured seven times slower (2 cores, 75k × 8)."""
+    """A weighted gather. The library's own backward of the same sum took seven times longer (2 cores, 75k × 8)."""
 
     @staticmethod
     def forward(ctx, texels: Tensor, index: Tensor, weight: Tensor) -> Tensor:

@@ -55,8 +55,9 @@ def verdict_lines(report: Any) -> list[str]:
 def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     rows = []
     for kind, claim in controls.items():
-        low, high = claim["difference_interval"]
+        low, high = (100 * bound for bound in claim["difference_interval"])
         rows.append(
-            f"  {kind:>6}: {claim['rate']:6.1%}   difference {100 * claim['difference']:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]"
+            f"  {kind:>6}: {claim['rate']:6.1%}   "
+            f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
         )
     return rows

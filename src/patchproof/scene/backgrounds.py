@@ -1,7 +1,7 @@
 """Pictures behind the object: a folder of photographs or one plain color.
 
-In: the folder and, per view, five numbers in [0, 1) that choose picture, crop and mirroring. Out: H×W×3 uint8 sRGB. The photograph
-and its centered square show the same crop, so that what trains and what is photographed agree.
+In: the folder and, per view, five numbers in [0, 1) that choose picture, crop and mirroring. Out: H×W×3 uint8 sRGB. The
+photograph and its centered square show the same crop, so that what trains and what is photographed agree.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class Backgrounds:
         return tuple(pyramids)
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
-        """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is square."""
+        """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is
+        square.
+        """
         import cv2
 
         levels = self._reduced[int(choice[0] * len(self.pictures))]

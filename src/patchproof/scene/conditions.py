@@ -1,9 +1,11 @@
-"""Conditions: draws from a scene's ranges of pose, light, background, print and camera (expectation over transformation).
+"""Conditions: draws from a scene's ranges of pose, light, background, print and camera (expectation over
+transformation).
 
-In: the scene's settings and a stream. Out: `Conditions`, arrays of one value per view in physical units. Five streams share
-nothing: what trains, what selects, what is promised, what is reprinted and what is evaluated. Training and selection use
-scrambled Sobol points, which cover the ranges with fewer views; the others draw independently, so that their intervals hold.
-All follow from one seed, and a view's draw depends on its index alone: step 70 sees the same views after a resume.
+In: the scene's settings and a stream. Out: `Conditions`, arrays of one value per view in physical units. Five streams
+share nothing: what trains, what selects, what is promised, what is reprinted and what is evaluated. Training and
+selection use scrambled Sobol points, which cover the ranges with fewer views; the others draw independently, so that
+their intervals hold. All follow from one seed, and a view's draw depends on its index alone: step 70 sees the same
+views after a resume.
 
 Source of EoT: Athalye et al., Synthesizing Robust Adversarial Examples, ICML 2018.
 """
@@ -28,7 +30,9 @@ LIGHT_ELEVATION_DEG = (10.0, 80.0)
 
 @dataclass(frozen=True)
 class Conditions:
-    """N draws; every array has N rows. Angles are relative to the patch's side, offsets are shares of the object's length."""
+    """N draws; every array has N rows. Angles are relative to the patch's side, offsets are shares of the object's
+    length.
+    """
 
     azimuth_deg: np.ndarray
     elevation_deg: np.ndarray

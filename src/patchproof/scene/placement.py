@@ -1,8 +1,9 @@
 """Where the paper lies: a flat rigid card that touches the highest surface points under it.
 
-In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Card` with the piece's frame in the world,
-and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and shares.
-A card wider or higher than the object's side, or with nothing under it, is refused. Left out here on purpose: bent pieces.
+In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Card` with the piece's frame in the
+world, and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and
+shares. A card wider or higher than the object's side, or with nothing under it, is refused. Left out here on purpose:
+bent pieces.
 """
 
 from __future__ import annotations
@@ -90,7 +91,9 @@ def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:
 
 
 def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Card:
-    """Lay a card of `size_mm` on the surface, its middle at the frame's origin; spin turns it clockwise as one faces it."""
+    """Lay a card of `size_mm` on the surface, its middle at the frame's origin; spin turns it clockwise as one faces
+    it.
+    """
     width, height = size_mm
     c, s = np.cos(np.radians(spin_deg)), np.sin(np.radians(spin_deg))
     right, up = c * frame.right - s * frame.up, s * frame.right + c * frame.up

@@ -1,8 +1,8 @@
 """A scene: the object, the piece that hangs on it, and what is behind it, ready to be photographed.
 
-In: a scene file. Out: `MeshScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the layout of
-the printed piece (the design with its frame of markers; the marker size follows from the views), where the card lies, and the
-camera of every drawn view.
+In: a scene file. Out: `MeshScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
+layout of the printed piece (the design with its frame of markers; the marker size follows from the views), where the
+card lies, and the camera of every drawn view.
 """
 
 from __future__ import annotations

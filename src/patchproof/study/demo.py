@@ -1,7 +1,7 @@
 """The demo: the whole journey on an object and a classifier that come with the package, offline, in two minutes.
 
-In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard ones on purpose: far, dim, oblique and
-cluttered, so that the bare object and the controls are often misread and there is something to gain.
+In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard ones on purpose: far,
+dim, oblique and cluttered, so that the bare object and the controls are often misread and there is something to gain.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from patchproof.optimize.run import optimize
+from patchproof.optimize.run import optimize_scene
 from patchproof.output import new_folder
 from patchproof.report.summary import promise_lines, verdict_lines
 from patchproof.study.reprint import reprint
 from patchproof.study.sheet import sheet_of
-from patchproof.study.verify import verify
+from patchproof.study.verify import verify_photos
 
 PHOTOS = 40
 OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
@@ -56,13 +56,16 @@ views = 16
 
 
 def run_demo(
-    out: str | Path, *, overwrite: bool = False, on_stage: Callable[[str, int, int], None] = lambda name, done, total: None
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[str]:
     """Run every step into the folder `out`; returns the summary's lines."""
     with new_folder(out, OWN, overwrite) as folder:
         scene = folder / "scene.toml"
         scene.write_text(SCENE, encoding="utf-8")
-        run = optimize(
+        run = optimize_scene(
             scene,
             folder / "run",
             on_step=lambda step, total: on_stage("optimise", step.state.number, total),
@@ -70,17 +73,24 @@ def run_demo(
         )
         sheet_of(run, folder / "sheet.pdf")
         reprint(
-            folder / "sheet.pdf", run, PHOTOS, folder / "photos", on_photo=lambda done, total: on_stage("photograph", done, total)
+            folder / "sheet.pdf",
+            run,
+            PHOTOS,
+            folder / "photos",
+            on_photo=lambda done, total: on_stage("photograph", done, total),
         )
-        report = verify(
+        report = verify_photos(
             folder / "photos",
             folder / "sheet.json",
             folder / "report",
             on_photo=lambda done, total: on_stage("verify", done, total),
         )
     lines = [
-        "Hard conditions on purpose: far, dim, oblique and cluttered, so that bare object and controls are often misread.",
+        "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
         *promise_lines(run.promise),
         *verdict_lines(report),
     ]
-    return [*lines, *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html"))]
+    return [
+        *lines,
+        *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
+    ]

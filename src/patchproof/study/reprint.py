@@ -1,9 +1,10 @@
 """Simulated reprints: the PDF itself, printed by a printer model, put back on the object and photographed.
 
-In: a sheet's PDF and the run it belongs to. Out: a folder of JPEG photographs at the scene's `photo_px`, as a phone would write
-them (EXIF focal length), and `truth.json` with each one's homography, marker corners and conditions. What is photographed are
-the pixels that another library reads from the PDF, so that an error in the page shows here and not at the print shop.
-With `scan_dpi` the uncut page is scanned flat instead. Conditions come from the reprint stream, which nothing else has seen.
+In: a sheet's PDF and the run it belongs to. Out: a folder of JPEG photographs at the scene's `photo_px`, as a phone
+would write them (EXIF focal length), and `truth.json` with each one's homography, marker corners and conditions. What
+is photographed are the pixels that another library reads from the PDF, so that an error in the page shows here and not
+at the print shop. With `scan_dpi` the uncut page is scanned flat instead. Conditions come from the reprint stream,
+which nothing else has seen.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ def scan(
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, MeshScene]:
-    """A sheet's manifest and the scene with its template's frame; refused where the sheet was not made from this run."""
+    """A sheet's manifest and the scene with its template's frame; refused where the sheet is not of this run."""
     manifest = attached_manifest(pdf_path)
     settings, scene = run.scene.settings, run.scene
     template = manifest.settings.get("sheet", {}).get("template", settings.sheet.template)

@@ -1,7 +1,8 @@
-"""A run's sheets: the design's own page and those of its controls, each with the marker ids that tell it from the others.
+"""A run's sheets: the design's own page and those of its controls, each with the marker ids that tell it from the
+others.
 
-In: a finished run. Out: SHEET.pdf and SHEET.json. The promise belongs to the design in the piece it was optimized with: another
-template, and with it another frame, would be another promise, which is then made anew.
+In: a finished run. Out: SHEET.pdf and SHEET.json. The promise belongs to the design in the piece it was optimized with:
+another template, and with it another frame, would be another promise, which is then made anew.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from patchproof.sheet.write import write_sheet
 
 
 def sheet_of(run: Run, pdf_path: str | Path, *, template: str | None = None, control: str | None = None) -> Manifest:
-    """Write the run's sheet; `control` is mean, grey, noise, shuffled or blank, `template` a name or file in place of the scene's."""
+    """Write the run's sheet; `control` is mean, grey, noise, shuffled or blank, `template` a name or file in place of
+    the scene's.
+    """
     scene, promise = run.scene, run.promise
     settings = scene.settings
     if template is not None and template != settings.sheet.template:

@@ -1,7 +1,8 @@
 """Verify: photographs and a manifest in, a report out.
 
-In: a folder of photographs and SHEET.json. Out: REPORT/ with report.json, report.html and pictures. This joins what must not know
-each other: the judge, its networks and the page. The promise's primary network always judges, whatever others are named.
+In: a folder of photographs and SHEET.json. Out: REPORT/ with report.json, report.html and pictures. This joins what
+must not know each other: the judge, its networks and the page. The promise's primary network always judges, whatever
+others are named.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from patchproof.report.write import write_report
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest, load_manifest
 from patchproof.verify.results import Evidence, Report
-from patchproof.verify.run import verify_photos
+from patchproof.verify.run import gather_evidence
 
 OWN = ("report.json", "report.html", "photos.csv", "pictures")
 
 
-def verify(
+def verify_photos(
     photos: str | Path,
     sheet: str | Path,
     out: str | Path,
@@ -42,11 +43,13 @@ def verify(
     manifest = load_manifest(sheet)
     base = Path(sheet).resolve().parent
     with new_folder(out, OWN, overwrite) as folder:
-        evidence = verify_photos(
+        evidence = gather_evidence(
             photos,
             manifest,
             models=[load_classifier(name, base) for name in _names(manifest, models)],
-            printer=load_printer(manifest.settings["printer"]["profile"], base) if "printer" in manifest.settings else None,
+            printer=load_printer(manifest.settings["printer"]["profile"], base)
+            if "printer" in manifest.settings
+            else None,
             scan_dpi=scan_dpi,
             controls=controls,
             jobs=jobs,
@@ -56,7 +59,11 @@ def verify(
             evidence = _with_ruler(evidence, manifest, ruler_mm)
         report = evidence.report
         write_report(
-            report.model_dump(mode="json"), manifest.model_dump(mode="json"), evidence.pictures, folder, evidence.notes()
+            report.model_dump(mode="json"),
+            manifest.model_dump(mode="json"),
+            evidence.pictures,
+            folder,
+            evidence.notes(),
         )
     return report
 
@@ -65,7 +72,9 @@ def _names(manifest: Manifest, models: tuple[str, ...] | None) -> tuple[str, ...
     """The primary network first, then the others asked for, or else the promise's."""
     if manifest.promise is None:
         if not models:
-            raise Refused("a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models")
+            raise Refused(
+                "a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models"
+            )
         return models
     promised = tuple(model.name for model in manifest.promise.models)
     return tuple(dict.fromkeys((promised[0], *(models or promised))))

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 
 
-def verify_photos(
+def gather_evidence(
     photos: str | Path,
     manifest: Manifest,
     *,
