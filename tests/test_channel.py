@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from patchproof.channel.camera import blurred, compressed, develop, noisy
-from patchproof.channel.light import irradiance
+from patchproof.channel.light import Light, irradiance
 from patchproof.color import linear_from_srgb
 from patchproof.scene.conditions import draw
 from patchproof.settings import SceneSettings, validated
@@ -26,9 +26,8 @@ def conditions(n, **camera):
 
 def test_paper_facing_the_light_is_white_and_facing_away_gets_the_ambient_part():
     normal = torch.tensor([[0.0, 0, 1], [0, 0, -1], [1, 0, 0]])
-    light = irradiance(
-        normal, torch.tensor([0, 0, 0]), torch.tensor([0.4]), torch.tensor([0.6]), torch.tensor([[0.0, 0, 1]])
-    )
+    lamp = Light(torch.tensor([0.4]), torch.tensor([0.6]), torch.tensor([[0.0, 0, 1]]))
+    light = irradiance(normal, torch.tensor([0, 0, 0]), lamp)
     torch.testing.assert_close(light, torch.tensor([1.0, 0.4, 0.4]))
 
 

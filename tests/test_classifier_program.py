@@ -17,7 +17,6 @@ from patchproof.classifier.program import in_batches, load_program, no_pickle
 from patchproof.settings import Refused
 
 LABELS = ["red", "green", "blue", "none"]
-DATA = os.environ.get("PATCHPROOF_DATA")
 
 
 class Small(nn.Module):
@@ -41,6 +40,15 @@ def save(folder: Path, batch: int | None = None) -> Path:
     torch.export.save(torch.export.export(Small().eval(), example, dynamic_shapes=sizes), str(path))
     path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
     return path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Small batches gain nothing from threads, and lose much where another process wants the cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -367,12 +375,11 @@ def test_batches_are_cut_and_filled_up():
     assert seen == [3, 3, 2]
 
 
-@pytest.mark.skipif(DATA is None, reason="PATCHPROOF_DATA is not set: no real networks to load")
-def test_real_networks_recognize_a_photograph():
+def test_real_networks_recognize_a_photograph(data):
     import numpy as np
     from PIL import Image
 
-    photo = np.asarray(Image.open(Path(DATA, "photos", "skimage_coffee.png")).convert("RGB")).copy()
+    photo = np.asarray(Image.open(data / "photos" / "skimage_coffee.png").convert("RGB")).copy()
     photo = torch.from_numpy(photo).permute(2, 0, 1)[None].float() / 255
     for name in ("mobilenet_v1_0.25_128", "squeezenet1.1_224"):
         classifier = load_classifier(f"file:${{PATCHPROOF_DATA}}/models/{name}.pt2", Path("."))

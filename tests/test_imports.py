@@ -41,7 +41,8 @@ def imported(source: str) -> set[str]:
 
 
 def test_the_reader_of_imports_sees_them():
-    source = "from patchproof.sheet.piece import A\ndef f():\n    import patchproof.scene.mesh\nfrom patchproof import color"
+    deep = "def f():\n    import patchproof.scene.mesh"
+    source = f"from patchproof.sheet.piece import Piece\n{deep}\nfrom patchproof import color"
     assert imported(source) == {"sheet", "scene", "color"}
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from patchproof.claims import wilson
+from patchproof.optimize import run
 from patchproof.optimize.goals import target_loss, total_variation
 from patchproof.optimize.loop import start, steps
 from patchproof.optimize.problem import as_pixels, from_pixels, set_problem
@@ -25,7 +26,7 @@ SCENE = {
     "patch": {"side": "+z", "width_mm": 90, "height_mm": 90},
     "target": {"label": "red", "models": ["module:fake_networks.red_against_blue"]},
     "view": {"azimuth_deg": [-30, 30], "elevation_deg": [0, 20], "distance_mm": [400, 500], "look_at_jitter": 0},
-    "camera": {"photo_px": [400, 300]},
+    "camera": {"photo_px": [1600, 1200]},
     "optimize": {"steps": 12, "views": 4, "gamut": 0.0},
 }
 
@@ -131,7 +132,7 @@ def test_a_design_survives_its_own_pixels():
 
 def test_the_promise_counts_what_was_recognized(tmp_path):
     problem = set_problem(scene_with(tmp_path, target__label="blue"))
-    blue = np.zeros((problem.design_px[1], problem.design_px[0], 3), np.uint8)
+    blue = np.zeros((*problem.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
     outcomes = try_out(problem, blue, problem.scene.draw("promise", 40))
     promise = promise_from(problem, outcomes)
@@ -141,16 +142,22 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
     assert set(promise.controls) == set(CONTROLS)
     for claim in promise.controls.values():
         assert claim.difference == pytest.approx(promise.rate - claim.rate)
-    assert promise.rate == 1 and all(promise.controls[kind].rate < 1 for kind in ("bare", "grey"))
+    assert promise.rate > 0.9 and all(promise.controls[kind].rate < 0.5 for kind in ("bare", "grey"))
     views = problem.scene.settings.view
     assert all(views.azimuth_deg[0] - 12 < c.azimuth_deg < views.azimuth_deg[1] + 12 for c in promise.conditions)
+
+
+@pytest.fixture
+def few_views(monkeypatch):
+    """A promise of fewer views, where its rate does not matter."""
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 32)
 
 
 def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png")):
     return all((a / name).read_bytes() == (b / name).read_bytes() for name in names)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml")
     for out, seed in (("a", 0), ("b", 0), ("c", 1)):
         optimize_scene(scene, tmp_path / out, seed=seed)
@@ -163,7 +170,7 @@ class Killed(Exception):
     pass
 
 
-def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
+def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml", optimize__steps=24)
 
     def kill(step, total):
@@ -175,13 +182,13 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
         optimize_scene(scene, tmp_path / "cut", on_step=kill)
     with pytest.raises(Refused, match="an unfinished one"):
         load_run(tmp_path / "cut")
-    run = optimize_scene(scene, tmp_path / "cut", resume=True)
+    resumed = optimize_scene(scene, tmp_path / "cut", resume=True)
     assert same_files(tmp_path / "whole", tmp_path / "cut")
     assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 24
-    np.testing.assert_array_equal(load_run(tmp_path / "cut").design, run.design)
+    np.testing.assert_array_equal(load_run(tmp_path / "cut").design, resumed.design)
 
 
-def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path):
+def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml")
     optimize_scene(scene, tmp_path / "run")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}

@@ -10,7 +10,6 @@ import torch
 
 from conftest import SCENE
 from patchproof import geometry
-from patchproof.color import linear_from_srgb
 from patchproof.render.photograph import PiecePicture, expose, photograph, see, set_stage
 from patchproof.scene.scene import load_scene
 from patchproof.settings import Refused
@@ -32,7 +31,7 @@ def scene_of(tmp_path, text):
 
 def piece_of(scene, design_px=(180, 180)):
     frame = frame_image(scene.piece, design_px)
-    return PiecePicture(linear_from_srgb(torch.tensor(np.asarray(frame.srgb), dtype=torch.float32)), frame.piece_box_px)
+    return PiecePicture(torch.tensor(np.asarray(frame.srgb), dtype=torch.float32), frame.piece_box_px)
 
 
 def test_a_scene_knows_its_piece_card_and_id(scene_file):
@@ -131,7 +130,7 @@ def test_a_patch_turned_away_is_not_seen(tmp_path, scene_file):
 def test_views_seen_once_can_be_shaded_with_another_design(tmp_path, scene_file):
     scene = load_scene(scene_file)
     stage, conditions, piece = set_stage(scene), scene.draw("train", 3), piece_of(scene)
-    dark = PiecePicture(piece.linear * 0.1, piece.box_px)
+    dark = PiecePicture(piece.srgb * 0.3, piece.box_px)
     seen = see(stage, piece, conditions, (96, 96))
     torch.testing.assert_close(expose(stage, seen, dark), photograph(stage, dark, conditions, (96, 96)))
     assert not torch.equal(expose(stage, seen, dark), expose(stage, seen, piece))
@@ -140,9 +139,9 @@ def test_views_seen_once_can_be_shaded_with_another_design(tmp_path, scene_file)
 def test_the_gradient_reaches_the_texels_that_were_seen_and_no_other(scene_file):
     scene = load_scene(scene_file)
     stage, conditions, piece = set_stage(scene), scene.draw("train", 2), piece_of(scene)
-    linear = piece.linear.clone().requires_grad_()
-    picture = photograph(stage, PiecePicture(linear, piece.box_px), conditions, (96, 96))
-    (gradient,) = torch.autograd.grad(picture.sum(), linear)
+    colors = piece.srgb.clone().requires_grad_()
+    picture = photograph(stage, PiecePicture(colors, piece.box_px), conditions, (96, 96))
+    (gradient,) = torch.autograd.grad(picture.sum(), colors)
     x0, y0, x1, y1 = piece.box_px
     middle = gradient[int(y0) + 2 : int(y1) - 2, int(x0) + 2 : int(x1) - 2]
     assert (middle.abs().sum(-1) > 0).float().mean() > 0.99
@@ -162,3 +161,17 @@ def test_what_trains_and_what_is_photographed_agree_in_rate(tmp_path):
     assert float(difference.mean()) < 0.02
     plain = photograph(stage, piece, conditions, (96, 96))
     assert float(difference.mean()) < float((plain - large).abs().mean())
+
+
+def test_the_shortcut_for_sharp_clean_pictures_changes_nothing(tmp_path, monkeypatch):
+    """The piece's pixels developed alone against the whole picture developed, front, back and bare."""
+    from patchproof.render import photograph as module
+
+    scene = scene_of(tmp_path, SCENE)
+    stage, piece = set_stage(scene), piece_of(scene)
+    conditions = replace(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]))
+    for shown in (piece, None):
+        quick = photograph(stage, shown, conditions, (192, 192))
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "is_pointwise", lambda *arguments: False)
+            torch.testing.assert_close(photograph(stage, shown, conditions, (192, 192)), quick, atol=1e-6, rtol=0)

@@ -7,10 +7,21 @@ predicted.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
 
-def irradiance(normal: Tensor, view: Tensor, ambient: Tensor, directional: Tensor, toward_light: Tensor) -> Tensor:
-    """Light on P fragments of N views: `normal` P×3, `view` P; `ambient`, `directional` N; `toward_light` N×3 (unit)."""
-    cosine = (normal * toward_light.index_select(0, view)).sum(-1).clamp_min(0)
-    return ambient.index_select(0, view) + directional.index_select(0, view) * cosine
+@dataclass(frozen=True)
+class Light:
+    """The light of N views: `ambient` and `directional` N, and the unit directions `toward` the light, N×3."""
+
+    ambient: Tensor
+    directional: Tensor
+    toward: Tensor
+
+
+def irradiance(normal: Tensor, view: Tensor, light: Light) -> Tensor:
+    """Light on P fragments with unit `normal` P×3, each in one of the views (`view` P)."""
+    cosine = (normal * light.toward.index_select(0, view)).sum(-1).clamp_min(0)
+    return light.ambient.index_select(0, view) + light.directional.index_select(0, view) * cosine

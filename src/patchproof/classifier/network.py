@@ -45,8 +45,10 @@ class Classifier:
         return self.network(center_square(photos_srgb, self.input_px))
 
 
-def weights_sha256(network: torch.nn.Module) -> str:
-    """SHA-256 over names, types, shapes and bytes of a module's state, in the order of the names."""
+def weights_sha256(network: torch.nn.Module) -> str | None:
+    """SHA-256 over names, types, shapes and bytes of a module's state, in the order of the names; None without any."""
+    if not network.state_dict():
+        return None
     digest = hashlib.sha256()
     for name, tensor in sorted(network.state_dict().items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from patchproof.optimize.goals import target_loss, total_variation
-from patchproof.optimize.problem import Problem, as_pixels, from_pixels
+from patchproof.optimize.problem import Problem, from_pixels
 from patchproof.render.photograph import Seen, expose, photograph, see
 
 SELECT_EVERY = 10
@@ -80,8 +80,8 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
 def _step(problem: Problem, state: State, conditions) -> Step:
     settings = problem.scene.settings
     design = state.design.clone().requires_grad_()
-    size = (problem.network_px, problem.network_px)
-    pictures = photograph(problem.stage, problem.piece_picture(design), conditions, size, reduced=True)
+    size = (problem.training_px, problem.training_px)
+    pictures = photograph(problem.stage, problem.piece_picture(design), conditions, size, problem.reduced)
     losses, confidences, rates = _score(problem, pictures)
     loss = losses + settings.optimize.tv * total_variation(design)
     if settings.optimize.gamut:
@@ -125,7 +125,7 @@ def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
 def _selection(problem: Problem) -> list[Seen]:
     """The selection views, seen once and shaded anew for each design."""
     conditions = problem.scene.draw("select", SELECT_VIEWS)
-    size = (problem.network_px, problem.network_px)
+    size = (problem.training_px, problem.training_px)
     piece = problem.piece_picture(start(problem).design)
     with torch.no_grad():
         parts = (conditions[i : i + SELECT_CHUNK] for i in range(0, SELECT_VIEWS, SELECT_CHUNK))
@@ -135,10 +135,10 @@ def _selection(problem: Problem) -> list[Seen]:
 def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
     """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
     state = step.state
-    printed = from_pixels(as_pixels(state.design), problem.device)
+    printed = from_pixels(problem.pixels(state.design), problem.device)
     with torch.no_grad():
         piece = problem.piece_picture(printed)
-        scores = [_score(problem, expose(problem.stage, seen, piece, reduced=True)) for seen in selection]
+        scores = [_score(problem, expose(problem.stage, seen, piece, problem.reduced)) for seen in selection]
     loss = sum(float(score[0]) for score in scores) / len(scores)
     rate = sum(score[2] for score in scores) / len(scores)
     if loss < state.best_loss:

@@ -20,7 +20,7 @@ from patchproof import geometry
 from patchproof.claims import paired_difference, wilson
 from patchproof.color import linear_from_srgb
 from patchproof.optimize.problem import Problem, from_pixels
-from patchproof.render.photograph import expose, photograph, see
+from patchproof.render.photograph import expose, see
 from patchproof.scene.conditions import Conditions
 from patchproof.sheet.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 from patchproof.sheet.piece import control_design
@@ -28,8 +28,6 @@ from patchproof.sheet.piece import control_design
 PROMISE_VIEWS = 400  # the Wilson interval of a rate of 0.9 is then 6 points wide
 CONTROLS = ("bare", "mean", "grey", "noise")
 CHUNK = 16
-# Views for figures are rendered at twice the network's size and averaged down, as a photograph's pixels are.
-SUPERSAMPLING = 2
 
 
 @dataclass(frozen=True)
@@ -50,13 +48,13 @@ def try_out(
     with torch.no_grad():
         pieces = {kind: problem.piece_picture(from_pixels(pixels, device), kind) for kind, pixels in shown.items()}
         parts: dict[str, list] = {kind: [] for kind in ("design", *CONTROLS)}
-        side = SUPERSAMPLING * problem.network_px
+        side = problem.figure_px
         for first in range(0, len(conditions), CHUNK):
             part = conditions[first : first + CHUNK]
             seen = see(problem.stage, pieces["design"], part, (side, side))
             for kind, piece in pieces.items():
                 parts[kind].append(_judge(problem, expose(problem.stage, seen, piece)))
-            parts["bare"].append(_judge(problem, photograph(problem.stage, None, part, (side, side))))
+            parts["bare"].append(_judge(problem, expose(problem.stage, seen, None)))
             progress(len(part))
     joined = {kind: np.concatenate(part, -1) for kind, part in parts.items()}  # 2×M×N
     recognized = {kind: both[0] > 0.5 for kind, both in joined.items()}

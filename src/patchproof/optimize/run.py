@@ -22,7 +22,7 @@ from PIL import Image
 
 import patchproof
 from patchproof.optimize.loop import SELECT_EVERY, State, Step, start, steps
-from patchproof.optimize.problem import Problem, as_pixels, set_problem
+from patchproof.optimize.problem import Problem, set_problem
 from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.scene import MeshScene, build_scene, load_scene
@@ -122,7 +122,7 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             if state.number == total:
                 write_whole(out / _VIEWS, lambda path, step=step: _contact_sheet(step.pictures).save(path, "PNG"))
             on_step(step, total)
-    return as_pixels(state.best)
+    return problem.pixels(state.best)
 
 
 def _promise(problem: Problem, design: np.ndarray, on_promise: Callable[[int, int], None]) -> Promise:

@@ -19,6 +19,7 @@ from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.mesh import Mesh, load_mesh
 from patchproof.scene.placement import Card, Frame, patch_frame, place_card
 from patchproof.settings import Refused, SceneSettings, expand, load_scene_settings
+from patchproof.sheet.page import largest_piece_mm
 from patchproof.sheet.piece import Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheet.template import load_template
 
@@ -97,8 +98,8 @@ def build_scene(settings: SceneSettings, base: Path, seed: int | None = None) ->
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
     identity = sheet_id(settings.model_dump(mode="json"), seed)
-    *_, zone_width, zone_height = load_template(settings.sheet.template).piece.zone_mm
-    largest_mm = (min(frame.extent_mm[0], zone_width), min(frame.extent_mm[1], zone_height))
+    page_mm = largest_piece_mm(load_template(settings.sheet.template))
+    largest_mm = (min(frame.extent_mm[0], page_mm[0]), min(frame.extent_mm[1], page_mm[1]))
     marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
     piece = lay_out_piece(design_mm, marker_mm, identity, "design")
     card = place_card(mesh, frame, piece.size_mm, patch.spin_deg)

@@ -21,7 +21,6 @@ from PIL import Image
 
 from patchproof import geometry
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.color import linear_from_srgb
 from patchproof.optimize.run import Run
 from patchproof.output import new_folder
 from patchproof.render.photograph import PiecePicture, Stage, photograph, set_stage
@@ -151,8 +150,8 @@ def printed_piece(pdf_path: str | Path, manifest: Manifest, scene: MeshScene, pr
     finest = scene.matrix_px(scene.settings.camera.photo_px)[0, 0] / closest_mm  # px per mm
     dpi = float(np.clip(OVERSAMPLING * finest * 25.4, *DPI_RANGE))
     pixels = torch.tensor(piece_pixels(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
-    linear = linear_from_srgb(printer.apply(pixels)[0]).permute(1, 2, 0)
-    return PiecePicture(linear, (0, 0, linear.shape[1], linear.shape[0]))
+    printed = printer.apply(pixels)[0].permute(1, 2, 0)
+    return PiecePicture(printed, (0, 0, printed.shape[1], printed.shape[0]))
 
 
 def scaled_print(scene: MeshScene, print_scale: tuple[float, float]) -> MeshScene:

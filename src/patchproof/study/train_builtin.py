@@ -32,6 +32,7 @@ from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.mesh import Mesh
 from patchproof.scene.scene import bare_scene
 from patchproof.settings import SceneSettings, validated
+from patchproof.study import patterns
 
 LENGTH_MM = 300.0
 PHOTO_PX = 2 * INPUT_PX
@@ -117,7 +118,7 @@ def train(images: Tensor, labels: Tensor, recipe: Recipe) -> Iterator[tuple[int,
     optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
     loss_of = torch.nn.CrossEntropyLoss(label_smoothing=recipe.label_smoothing)
-    cards = torch.from_numpy(np.stack([_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
+    cards = torch.from_numpy(np.stack([patterns.card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
     for epoch in range(recipe.epochs):
         losses = []
         order = torch.randperm(len(images))
@@ -187,7 +188,7 @@ def _views(name: str, seed: int, rng: np.random.Generator) -> Tensor:
     mesh = primitives.build(name, seed)
     scale = LENGTH_MM / np.ptp(mesh.vertices, axis=0).max()
     mesh = dressed(dataclasses.replace(mesh, vertices=mesh.vertices * scale), rng)
-    behind = Backgrounds(tuple(background(rng) for _ in range(VIEWS_PER_SHAPE)))
+    behind = Backgrounds(tuple(patterns.background(rng) for _ in range(VIEWS_PER_SHAPE)))
     stage = set_stage(bare_scene(_settings(rng), mesh, behind))
     conditions = stage.scene.draw("evaluate", VIEWS_PER_SHAPE, int(rng.integers(1 << 30)))
     half = VIEWS_PER_SHAPE // 2
@@ -237,91 +238,15 @@ def dressed(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     materials = []
     for material in mesh.materials:
         if kind == "worn":
-            worn = np.clip(0.8 + 0.25 * (texture(rng).mean(2, keepdims=True) - 0.5), 0, 1).repeat(3, 2)
-            material = dataclasses.replace(material, texture_srgb=_codes(worn))
+            worn = np.clip(0.8 + 0.25 * (patterns.texture(rng).mean(2, keepdims=True) - 0.5), 0, 1).repeat(3, 2)
+            material = dataclasses.replace(material, texture_srgb=patterns.codes(worn))
         if kind == "drawn" or (kind == "mixed" and rng.random() < 0.4):
             plain = rng.random() < 0.4
             color = tuple(rng.uniform(0.02, 0.9, 3)) if plain else (1.0, 1.0, 1.0)
-            drawn = None if plain else _codes(texture(rng))
+            drawn = None if plain else patterns.codes(patterns.texture(rng))
             material = dataclasses.replace(material, base_color_linear=color, texture_srgb=drawn)
         materials.append(material)
     return dataclasses.replace(mesh, materials=tuple(materials))
-
-
-def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
-    """px×px×3 in [0, 1]: clouds of noise, stripes, checks or a plain color, in two drawn colors."""
-    y, x = np.mgrid[:px, :px] / px
-    kind = rng.choice(["clouds", "stripes", "checks", "grain", "plain"], p=[0.35, 0.2, 0.15, 0.15, 0.15])
-    turn, waves = rng.uniform(0, np.pi), rng.uniform(1.5, 10)
-    if kind == "stripes":
-        blend = np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > rng.uniform(-0.7, 0.7)
-    elif kind == "checks":
-        blend = (np.floor(x * waves) + np.floor(y * waves)) % 2
-    elif kind == "grain":
-        blend = rng.random((px, px))
-    else:
-        blend = _clouds(rng, px) if kind == "clouds" else np.zeros((px, px))
-    first, second = _color(rng), _color(rng)
-    return first + (second - first) * np.asarray(blend, float)[..., None]
-
-
-def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
-    """px×px×3 uint8: a plain color, a gradient, clouds or a texture, most with a clutter of boxes and ellipses."""
-    import cv2
-
-    y, x = np.mgrid[:px, :px][..., None] / px
-    kind = rng.choice(["plain", "gradient", "clouds", "texture"], p=[0.2, 0.3, 0.3, 0.2])
-    first, second = _color(rng), _color(rng)
-    if kind == "texture":
-        picture = texture(rng, px)
-    else:
-        angle = rng.uniform(0, 2 * np.pi)
-        ramp = {"plain": 0.0 * x, "gradient": 0.5 + 0.7 * ((x - 0.5) * np.cos(angle) + (y - 0.5) * np.sin(angle))}
-        blend = _clouds(rng, px)[..., None] if kind == "clouds" else ramp[str(kind)]
-        picture = first + (second - first) * np.clip(blend, 0, 1)
-    picture = _codes(picture).copy()
-    for _ in range(int(rng.integers(0, 14)) if kind != "plain" or rng.random() < 0.4 else 0):
-        center, size = rng.integers(0, px, 2).tolist(), rng.integers(4, px // 3, 2).tolist()
-        color = (255 * _color(rng)).tolist()
-        if rng.random() < 0.5:
-            cv2.ellipse(picture, center, size, float(rng.uniform(0, 180)), 0, 360, color, -1)
-        else:
-            corners = cv2.boxPoints((center, [2 * s for s in size], float(rng.uniform(0, 180) * (rng.random() < 0.5))))
-            cv2.fillPoly(picture, [corners.astype(np.int32)], color)
-    return cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.5, 3.0)))
-
-
-def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
-    """px×px×3 float32 in [0, 1]: anything, mostly in a frame of white paper with black blocks on it."""
-    picture = texture(rng, px)
-    if rng.random() < 0.6:
-        margin, cell = int(rng.integers(4, 9)), int(rng.integers(2, 4))
-        blocks = (rng.random((px // cell + 1, px // cell + 1)) < rng.uniform(0.2, 0.6)).repeat(cell, 0).repeat(cell, 1)
-        frame = np.where(blocks[:px, :px, None], 0.08, 0.95).repeat(3, 2)
-        frame[margin:-margin, margin:-margin] = picture[margin:-margin, margin:-margin]
-        picture = frame
-    return picture.astype(np.float32)
-
-
-def _color(rng: np.random.Generator) -> np.ndarray:
-    """3 numbers in [0, 1]: any color, as often a grayish one as a strong one."""
-    color = rng.random(3)
-    return color.mean() + (color - color.mean()) * rng.uniform(0, 1)
-
-
-def _clouds(rng: np.random.Generator, px: int) -> np.ndarray:
-    """Noise of several scales, px×px in [0, 1]."""
-    import cv2
-
-    steepness, total = rng.uniform(0.4, 0.9), np.zeros((px, px))
-    for octave in range(5):
-        coarse = rng.random((2 ** (octave + 1) + 1,) * 2)
-        total += steepness**octave * cv2.resize(coarse, (px, px), interpolation=cv2.INTER_CUBIC)
-    return (total - total.min()) / max(np.ptp(total), 1e-9)
-
-
-def _codes(picture: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 
 
 if __name__ == "__main__":

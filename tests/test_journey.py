@@ -1,0 +1,231 @@
+"""The whole journey on the built-in classifier, small: optimize → sheet → reprint → verify, by the commands a user
+types.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from conftest import SCENE
+from patchproof import cli, geometry
+from patchproof.sheet.manifest import load_manifest
+from patchproof.sheet.raster import attached_manifest
+
+PHOTOS = 8
+
+
+def command(*arguments) -> int:
+    """The exit code of `patchproof ARGUMENTS`."""
+    before, sys.argv = sys.argv, ["patchproof", *map(str, arguments)]
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return stop.code or 0
+    finally:
+        sys.argv = before
+    return 0
+
+
+@pytest.fixture(scope="module")
+def journey(tmp_path_factory):
+    """A folder with scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
+    folder = tmp_path_factory.mktemp("journey")
+    scene = SCENE.replace("[800, 600]", "[1600, 1200]").replace("steps = 3", "steps = 10")
+    (folder / "scene.toml").write_text(scene, encoding="utf-8")
+    assert command("optimize", folder / "scene.toml", "--out", folder / "run") == 0
+    assert command("sheet", folder / "run", "--out", folder / "sheet.pdf", "--check") == 0
+    pdf, run, photos = folder / "sheet.pdf", folder / "run", folder / "photos"
+    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--out", photos) == 0
+    assert command("verify", photos, "--sheet", folder / "sheet.json", "--out", folder / "report") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(journey):
+    return json.loads((journey / "report" / "report.json").read_text())
+
+
+def test_every_file_of_the_contract_is_there(journey):
+    for name in ("design.png", "run.json", "steps.jsonl", "views.png", "checkpoint.safetensors"):
+        assert (journey / "run" / name).stat().st_size > 0, name
+    assert (journey / "report" / "report.html").stat().st_size > 10_000
+    assert len(list((journey / "photos").glob("*.jpg"))) == PHOTOS
+    manifest = load_manifest(journey / "sheet.json")
+    assert attached_manifest(journey / "sheet.pdf") == manifest
+    assert str(journey) not in (journey / "sheet.json").read_text()
+    assert str(journey).encode() not in (journey / "sheet.pdf").read_bytes()
+
+
+def test_photographs_are_judged_and_measured(report):
+    assert report["summary"]["judged"] == PHOTOS and report["summary"]["measured"] >= PHOTOS - 1
+    for photo in report["photos"]:
+        assert photo["scale_x"] is None and photo["scale_y"] is None  # a photograph alone cannot show it
+        assert set(photo["predictions"]) == {"builtin"}
+
+
+def test_design_corners_are_where_the_truth_says(journey, report):
+    """Half a millimetre in the median, 1.5 mm at worst, over the photographs that count as measured."""
+    truth = json.loads((journey / "photos" / "truth.json").read_text())
+    corners = geometry.rect_corners(load_manifest(journey / "sheet.json").design.rect_mm)
+    errors = []
+    for photo in report["photos"]:
+        if photo["status"] == "measured":
+            told, true = (np.array(entry["homography_px_from_mm"]) for entry in (photo, truth[photo["file"]]))
+            back = geometry.apply_homography(np.linalg.inv(true), geometry.apply_homography(told, corners))
+            errors.append(np.linalg.norm(back - corners, axis=1).max())
+    assert np.median(errors) < 0.5 and max(errors) < 1.5
+
+
+def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
+    """EXIF holds the 35 mm equivalent as a whole number, 2 % at 28 mm; distance is from the patch, not the object's
+    middle.
+    """
+    from patchproof.optimize.run import load_run
+    from patchproof.scene.conditions import Conditions
+
+    scene = load_run(journey / "run").scene
+    truth = json.loads((journey / "photos" / "truth.json").read_text())
+    for photo in report["photos"]:
+        if photo["status"] != "measured":
+            continue
+        drawn = truth[photo["file"]]["conditions"]
+        conditions = Conditions(**{k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
+        pose = scene.camera_from_world(conditions)[0] @ scene.card.world_from_piece
+        azimuth, _, distance = geometry.view_angles(pose, np.array(scene.card.size_mm) / 2)
+        assert photo["distance_mm"] == pytest.approx(distance, rel=0.04)
+        assert photo["azimuth_deg"] == pytest.approx(azimuth, abs=2)
+
+
+def test_the_sheet_is_the_same_bytes_when_made_twice(journey, tmp_path):
+    assert command("sheet", journey / "run", "--out", tmp_path / "again.pdf") == 0
+    assert (tmp_path / "again.pdf").read_bytes() == (journey / "sheet.pdf").read_bytes()
+    assert (tmp_path / "again.json").read_bytes() == (journey / "sheet.json").read_bytes()
+
+
+def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_path):
+    sheet, run = journey / "sheet.json", journey / "run"
+    arguments = ("--run", run, "--n", 1, "--out", tmp_path / "scans", "--scan-dpi", 300, "--print-scale", "0.97")
+    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
+    assert command("verify", tmp_path / "scans", "--sheet", sheet, "--out", tmp_path / "scan", "--scan-dpi", 300) == 0
+    scanned = json.loads((tmp_path / "scan" / "report.json").read_text())
+    (photo,) = scanned["photos"]
+    assert photo["scale_x"] == pytest.approx(0.97, abs=0.003) and photo["scale_y"] == pytest.approx(0.97, abs=0.003)
+    assert photo["code"] == "scale_off" and scanned["summary"]["rate"] is None
+    arguments = ("--sheet", sheet, "--out", tmp_path / "ruler", "--ruler-mm", "97.1x97.3")
+    assert command("verify", journey / "photos", *arguments) == 0
+    typed = json.loads((tmp_path / "ruler" / "report.json").read_text())["photos"][0]
+    assert (typed["scale_x"], typed["scale_y"]) == pytest.approx((0.971, 0.973))
+
+
+def test_control_photographs_test_the_effect(journey, tmp_path, report):
+    for control in ("bare", "grey"):
+        arguments = ("--run", journey / "run", "--n", PHOTOS, "--out", tmp_path / "controls" / control)
+        assert command("reprint", journey / "sheet.pdf", *arguments, "--control", control) == 0
+    arguments = ("--sheet", journey / "sheet.json", "--out", tmp_path / "report", "--controls", tmp_path / "controls")
+    assert command("verify", journey / "photos", *arguments) == 0
+    tested = json.loads((tmp_path / "report" / "report.json").read_text())["summary"]
+    assert report["summary"]["effect"] == "not_tested" and tested["effect"] in ("shown", "not_shown")
+
+
+def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
+    arguments = ("--run", journey / "run", "--n", 1, "--out", tmp_path / "photos", "--print-scale", "0.9x0.9")
+    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
+    full, small = (
+        json.loads((folder / "truth.json").read_text())["photo_0001.jpg"]
+        for folder in (journey / "photos", tmp_path / "photos")
+    )
+    sides = []
+    for photo in (full, small):
+        corners = np.array(next(iter(photo["marker_corners_px"].values())))
+        sides.append(np.linalg.norm(corners[0] - corners[1]))
+    assert sides[1] / sides[0] == pytest.approx(0.9, rel=0.02)
+
+
+def test_evaluate_writes_fresh_rates(journey):
+    assert command("evaluate", journey / "run", "--n", 40) == 0
+    result = json.loads((journey / "run" / "evaluate.json").read_text())
+    assert result["n"] == 40 and set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "grey", "noise"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("optimize", "no.toml", "--out", "x"), "no file at no.toml"),
+        (("optimize", "{j}/scene.toml", "--out", "{j}/run"), "--overwrite"),
+        (("evaluate", "{j}"), "a finished run"),
+        (("sheet", "{j}/photos", "--out", "x.pdf"), "a finished run"),
+        (("sheet", "{j}/run", "--out", "{j}/sheet.pdf"), "which exists"),
+        (("sheet", "{j}/run", "--out", "x.pdf", "--template", "a5"), "a4"),
+        (("reprint", "{j}/sheet.json", "--run", "{j}/run", "--n", "1", "--out", "x"), "a PDF of a sheet"),
+        (("reprint", "{j}/sheet.pdf", "--run", "{j}/run", "--n", "1", "--out", "x", "--printer", "cotaed"), '"coated"'),
+        (("verify", "{j}/photos", "--sheet", "{j}/run/run.json", "--out", "x"), "run.json"),
+        (("verify", "{j}/photos", "--sheet", "{j}/nothing.json", "--out", "x"), "no file"),
+        (("verify", "{j}/nowhere", "--sheet", "{j}/sheet.json", "--out", "x"), "a folder of photographs"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "{j}/report"), "--overwrite"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "file:no.pt2"), "no.pt2"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "resnet"), '"resnet"'),
+    ],
+)
+def test_bad_input_ends_in_one_sentence_and_exit_code_1(journey, tmp_path, monkeypatch, capsys, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    assert command(*(argument.replace("{j}", str(journey)) for argument in arguments)) == 1
+    error = capsys.readouterr().err.strip()
+    assert sentence in error.splitlines()[-1] and error.splitlines()[-1].startswith("Expected ")
+    assert "Traceback" not in error
+    assert not (tmp_path / "x").exists() and not list(tmp_path.glob("*.pdf"))
+
+
+def test_a_folder_in_which_nothing_can_be_judged_exits_with_1_and_still_reports(journey, tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "note.jpg").write_text("this is no picture")
+    arguments = ("verify", tmp_path / "photos", "--sheet", journey / "sheet.json", "--out", tmp_path / "report")
+    assert command(*arguments) == 1
+    assert "got none" in capsys.readouterr().err
+    (photo,) = json.loads((tmp_path / "report" / "report.json").read_text())["photos"]
+    assert (photo["status"], photo["code"]) == ("rejected", "unreadable")
+
+
+def test_require_kept_makes_any_other_verdict_exit_with_1(journey, tmp_path):
+    import shutil
+
+    few = tmp_path / "few"
+    few.mkdir()
+    for name in ("photo_0001.jpg", "photo_0002.jpg"):
+        shutil.copy(journey / "photos" / name, few)
+    sheet = ("--sheet", journey / "sheet.json")
+    assert command("verify", few, *sheet, "--out", tmp_path / "a") == 0
+    assert command("verify", few, *sheet, "--out", tmp_path / "b", "--require", "kept") == 1
+    assert json.loads((tmp_path / "a" / "report.json").read_text())["summary"]["verdict"] == "cannot_tell"
+
+
+def test_bad_meshes_end_in_one_sentence_or_a_warning(data, tmp_path, capsys):
+    from patchproof.scene.mesh import load_mesh
+    from patchproof.settings import Refused
+
+    names = sorted(path.name for path in (data / "meshes" / "bad").iterdir() if path.suffix in {".obj", ".glb", ".stl"})
+    refused = 0
+    for name in names:
+        mesh = data / "meshes" / "bad" / name
+        scene = tmp_path / f"{name}.toml"
+        scene.write_text(SCENE.replace("primitive:carton", str(mesh)), encoding="utf-8")
+        try:
+            assert load_mesh(mesh, 300, "y").warnings, f"{name} is taken as if it were whole"
+        except Refused:
+            refused += 1
+            assert command("optimize", scene, "--out", tmp_path / name) == 1
+            assert capsys.readouterr().err.strip().splitlines()[-1].startswith("Expected ")
+            assert not (tmp_path / name).exists()
+    assert refused >= 5 and len(names) == 20
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    import subprocess
+
+    code = (
+        "import sys, patchproof.cli; sys.exit(any(m in sys.modules for m in ('torch', 'cv2', 'scipy', 'matplotlib')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
