@@ -61,14 +61,28 @@ def layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str 
 def texel_table(textures: list[Tensor]) -> Tensor:
     """The T×3 texels of all mip levels of H×W×3 textures, in the order of `layout`; differentiable."""
     parts = []
-    for texture in textures:
-        height, width, _ = texture.shape
-        level = texture.permute(2, 0, 1)[None]
-        for k in range(max(width, height).bit_length()):
+    for level in textures:
+        for k in range(max(level.shape[:2]).bit_length()):
             if k:
-                level = F.adaptive_avg_pool2d(level, (max(height >> k, 1), max(width >> k, 1)))
-            parts.append(level[0].flatten(1).T)
+                level = _halved(_halved(level).transpose(0, 1)).transpose(0, 1)
+            parts.append(level.flatten(0, 1))
     return torch.cat(parts)
+
+
+def _halved(level: Tensor) -> Tensor:
+    """Half the rows (rounded down, at least one), each the average of exactly what it covers.
+
+    Of 2m + 1 rows, row i of m covers two and 1/m; weights of Guthe and Heckbert, Non-Power-of-Two Mipmapping (2005).
+    Averages over whole rows instead would stretch a texture by up to half a row at either end.
+    """
+    rows = len(level)
+    if rows == 1:
+        return level
+    if rows % 2 == 0:
+        return (level[0::2] + level[1::2]) / 2
+    half = rows // 2
+    i = torch.arange(half, dtype=level.dtype, device=level.device)[:, None, None]
+    return ((half - i) * level[0:-1:2] + half * level[1::2] + (i + 1) * level[2::2]) / rows
 
 
 def footprint(where: Layout, texture: Tensor, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int = TAPS) -> Footprint:

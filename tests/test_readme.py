@@ -1,0 +1,56 @@
+"""The README's own blocks, run as they stand."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from test_journey import command
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("readme")
+    (toml,) = blocks("toml")
+    # fewer steps than a user would take
+    (folder / "scene.toml").write_text(toml + "\n[optimize]\nsteps = 3\nviews = 4\n", encoding="utf-8")
+    return folder
+
+
+def test_commands(here, monkeypatch, capsys):
+    (shell,) = blocks("console")
+    monkeypatch.chdir(here)
+    for line in shell.splitlines():
+        program, *arguments = shlex.split(line)
+        assert program == "patchproof"
+        assert command(*arguments) == 0, capsys.readouterr().err
+
+
+def test_python(tmp_path, here, monkeypatch, capsys):
+    (code,) = blocks("python")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text((here / "scene.toml").read_text())
+    names: dict = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert tuple(names["pictures"].shape) == (4, 3, 96, 96) and tuple(names["logits"].shape) == (4, 12)
+    assert capsys.readouterr().out.split()[0] in {"kept", "broken", "cannot_tell"}
+
+
+def test_pictures_and_files_that_it_names_exist():
+    text = README.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        assert (README.parent / target).exists(), target
+
+
+def test_the_two_commands_are_there():
+    text = README.read_text(encoding="utf-8")
+    assert "pip install . && patchproof demo" in text and 'pip install -e ".[test]" && pytest' in text
