@@ -233,6 +233,9 @@ def main() -> None:
     except Refused as error:
         print(error, file=sys.stderr)
         raise SystemExit(1) from None
+    except OSError as error:
+        print(f"Expected files that can be read and written, got {error}: mend that and try again.", file=sys.stderr)
+        raise SystemExit(1) from None
     except KeyboardInterrupt:
         print("Stopped.", file=sys.stderr)
         raise SystemExit(130) from None

@@ -21,6 +21,7 @@ from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.render.photograph import PiecePicture, Stage, set_stage
 from patchproof.scene.scene import MeshScene
+from patchproof.settings import Refused
 from patchproof.sheet.piece import FrameImage, frame_image, lay_out_piece
 
 # A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
@@ -112,6 +113,7 @@ class Problem:
 
 def set_problem(scene: MeshScene, device: str = "cpu", models: tuple[str, ...] | None = None) -> Problem:
     """The problem that a scene states; `models` replaces the scene's own classifiers."""
+    _check_device(device)
     settings = scene.settings
     classifiers = tuple(load_classifier(name, scene.base, device) for name in models or settings.target.models)
     accept = settings.target.accept
@@ -119,6 +121,14 @@ def set_problem(scene: MeshScene, device: str = "cpu", models: tuple[str, ...] |
     printer = load_printer(settings.printer.profile, scene.base)
     network_px = max(classifier.input_px for classifier in classifiers)
     return Problem(scene, set_stage(scene, device), printer, classifiers, indices, scene.design_px(network_px))
+
+
+def _check_device(device: str) -> None:
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise Refused("a device that this torch can use", f"{device} ({reason})", "use --device cpu") from error
 
 
 def as_pixels(design_srgb: Tensor) -> np.ndarray:
