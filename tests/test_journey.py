@@ -80,6 +80,21 @@ def test_design_corners_are_where_the_truth_says(journey, report):
     assert np.median(errors) < 0.5 and max(errors) < 1.5
 
 
+def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
+    """The conditions of these very photographs, rendered as for a promise: at most one in eight is judged otherwise."""
+    from patchproof.optimize.problem import set_problem
+    from patchproof.optimize.promise import try_out
+    from patchproof.optimize.run import load_run
+
+    run = load_run(journey / "run")
+    outcomes = try_out(set_problem(run.scene), run.design, run.scene.draw("reprint", PHOTOS))
+    seen = [photo["predictions"]["builtin"] for photo in report["photos"]]
+    differ = outcomes.recognized["design"][0] != np.array([one["recognized"] for one in seen])
+    confidence = np.array([one["target_confidence"] for one in seen])
+    assert differ.mean() <= 1 / 8
+    assert abs(outcomes.confidence["design"][0].mean() - confidence.mean()) < 0.05
+
+
 def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
     """EXIF holds the 35 mm equivalent as a whole number, 2 % at 28 mm; distance is from the patch, not the object's
     middle.

@@ -223,8 +223,8 @@ def _reduces(stage: Stage, size_px: tuple[int, int]) -> bool:
     """Whether a picture stands for a larger photograph that was reduced.
 
     A sensor averages light, but what reduces a photograph averages its code values, and a fine pattern of strong colors
-    is darker that way. Textures of smaller pictures are therefore averaged as code values: on 40 photographs of an
-    optimized patch, averaging light instead promised 0.09 more confidence than they had.
+    is darker that way. Textures of smaller pictures are therefore averaged as code values: at twice a network's size,
+    40 photographs had 0.04 less confidence than promised that way, and 0.09 less when light was averaged.
     """
     return min(size_px) < min(stage.scene.settings.camera.photo_px)
 

@@ -113,7 +113,7 @@ def look_up(seen: Footprint, texels: Tensor) -> Tensor:
 
 
 class _LookUp(torch.autograd.Function):
-    """A weighted gather. The library's own backward of the same sum took seven times longer (2 cores, 75k × 8)."""
+    """A weighted gather. The library's own backward of the same sum took six times longer (2 cores, 75k × 8)."""
 
     @staticmethod
     def forward(ctx, texels: Tensor, index: Tensor, weight: Tensor) -> Tensor:

@@ -17,9 +17,8 @@ from patchproof.settings import PatchSettings, Refused
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
-WARN_GAP_SHARE = (
-    0.15  # of the card's shorter edge; a hand lays such a card down without thinking, but it casts a shadow
-)
+# Assumed: beyond this share of its shorter edge a card stands so far off the object that its shadow shows.
+WARN_GAP_SHARE = 0.15
 WARN_OVERHANG_SHARE = 0.02
 
 _SIDES = {  # side: (up, normal); right is up × normal
