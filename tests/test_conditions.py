@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
-from patchproof.scene.conditions import draw
+from patchproof.scene.conditions import draw, with_poses_of
 from patchproof.settings import SceneSettings, validated
 
 SETTINGS = validated(
@@ -67,3 +69,60 @@ def test_sobol_covers_a_range_more_evenly_than_independent_draws():
         return counts.std()
 
     assert unevenness("train") == 0 and unevenness("promise") > 1.5
+
+
+EVERYTHING = SETTINGS.model_copy(
+    update={
+        "light": SETTINGS.light.model_copy(
+            update={"point": (0.2, 0.9), "sh2": (0.1, 0.4), "gloss": (0.01, 0.1), "shininess": (10.0, 90.0)}
+        ),
+        "camera": SETTINGS.camera.model_copy(update={"motion_px": (0.0, 12.0), "vignetting": (0.0, 0.4)}),
+    }
+)
+ADDED = (
+    *("point", "point_azimuth_deg", "point_elevation_deg", "point_distance_mm", "sh2", "gloss", "shininess"),
+    *("motion_px", "motion_deg", "vignetting"),
+)
+
+
+def test_lamp_gloss_motion_and_vignetting_fill_their_ranges():
+    drawn, light, camera = draw(EVERYTHING, "train", 1024, 0), EVERYTHING.light, EVERYTHING.camera
+    ranges = (light.point, (-90, 90), (10, 80), light.point_distance_mm, light.sh2, light.gloss, light.shininess)
+    for name, (low, high) in zip(ADDED, (*ranges, camera.motion_px, (0, 180), camera.vignetting), strict=True):
+        share = (getattr(drawn, name) - low) / (high - low)
+        assert 0 <= share.min() < 0.01 and 0.99 < share.max() <= 1, name
+        assert (np.histogram(share, 16, (0, 1))[0] == 64).all(), name  # Sobol points: every bin alike
+    off = draw(SETTINGS, "train", 64, 0)
+    assert not any(getattr(off, name).any() for name in ("point", "sh2", "gloss", "motion_px", "vignetting"))
+
+
+def test_terms_that_are_on_leave_the_other_draws_as_they_were():
+    on, off = draw(EVERYTHING, "promise", 50, 3), draw(SETTINGS, "promise", 50, 3)
+    for name in ("azimuth_deg", "ambient", "background", "print_draw", "jpeg", "noise_seed"):
+        np.testing.assert_array_equal(getattr(on, name), getattr(off, name))
+
+
+def test_coefficients_of_uneven_light_are_independent_standard_normals():
+    drawn = draw(EVERYTHING, "promise", 4000, 0).sh2_coefficients
+    assert drawn.shape == (4000, 8) and np.abs(drawn).max() < 3.1
+    np.testing.assert_allclose(drawn.mean(0), 0, atol=0.06)
+    np.testing.assert_allclose(np.cov(drawn.T), np.eye(8), atol=0.07)
+
+
+def test_no_two_columns_move_together():
+    drawn = draw(EVERYTHING, "train", 1024, 0)
+    columns = [getattr(drawn, name) for name in (*ADDED, "azimuth_deg", "distance_mm", "ambient", "blur_px")]
+    columns = np.corrcoef([*columns, *drawn.sh2_coefficients.T])
+    assert np.abs(columns - np.eye(len(columns))).max() < 0.1
+
+
+def test_poses_are_kept_while_the_rest_is_drawn_anew():
+    poses, new = draw(EVERYTHING, "train", 12, 0), draw(EVERYTHING, "train", 12, 0, start=12)
+    kept = with_poses_of(new, poses)
+    pose = {"azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background"}
+    for field in fields(kept):
+        source, other = (poses, new) if field.name in pose else (new, poses)
+        np.testing.assert_array_equal(getattr(kept, field.name), getattr(source, field.name))
+        assert not np.array_equal(getattr(kept, field.name), getattr(other, field.name)), field.name
+    with pytest.raises(ValueError, match="12 conditions cannot take the poses of 3"):
+        with_poses_of(new, poses[:3])

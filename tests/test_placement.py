@@ -75,6 +75,16 @@ def test_lengths_on_the_card_are_millimetres_of_the_sheet(box):
     np.testing.assert_allclose(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1), [50, 40, 50, 40])
 
 
+def test_a_card_is_two_triangles_that_face_out(box):
+    card = card_on(box, side="+x", spin_deg=20)
+    assert card.is_flat and card.stretch == 0
+    np.testing.assert_allclose(card.world(card.piece_mm), card.vertices_mm, atol=1e-12)
+    a, b, c = card.vertices_mm[card.faces].transpose(1, 0, 2)
+    facing = np.cross(b - a, c - a) / (50 * 40)  # each triangle is half of the card
+    np.testing.assert_allclose(facing, [[1, 0, 0]] * 2, atol=1e-12)
+    np.testing.assert_allclose(card.normals, [[1, 0, 0]] * 4, atol=1e-12)
+
+
 def test_gap_on_a_ball_is_its_sagitta(ball):
     """A 60 × 60 card touches the pole; at its corners the ball is r - sqrt(r² - 2·30²) lower."""
     card = card_on(ball, side="+y", size=(60, 60))

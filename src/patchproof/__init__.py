@@ -14,7 +14,7 @@ _HOME = {
     "load_classifier": "patchproof.classifier.load",
     "load_printer": "patchproof.channel.printer",
     "photograph": "patchproof.render.photograph",
-    "set_stage": "patchproof.render.photograph",
+    "set_stage": "patchproof.render.stage",
     "optimize_scene": "patchproof.optimize.run",
     "evaluate_run": "patchproof.optimize.evaluate",
     "load_run": "patchproof.optimize.run",

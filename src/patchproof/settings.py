@@ -65,24 +65,63 @@ class Strict(BaseModel):
 
 
 class ObjectSettings(Strict):
-    """The thing that the patch hangs on; `mesh` is a file or `primitive:NAME`."""
+    """The thing that the patch hangs on: a mesh (a file or `primitive:NAME`), photographs of it with a blank sheet on
+    it, or a folder of labeled images.
+    """
 
-    mesh: str
-    length_mm: Positive  # longest extent
+    mesh: str | None = None
+    length_mm: Positive | None = None  # a mesh's longest extent
     up: Literal["y", "z"] = "z"
+    photos: str | None = None
+    sheet: str | None = None  # the blank sheet's manifest
+    images: str | None = None
+    labels: str | None = None  # CSV: file name, label
+
+    @model_validator(mode="after")
+    def _one_kind(self):
+        pairs = {"mesh": "length_mm", "photos": "sheet", "images": "labels"}
+        given = [name for name in pairs if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError("takes one of mesh, photos or images")
+        for name, other in pairs.items():
+            if (name in given) != (getattr(self, other) is not None):
+                raise ValueError(f"takes {other} together with {name}")
+        return self
 
 
 class PatchSettings(Strict):
-    """The design's size and where it sits; `offset_mm` is [right, up] as one faces the side."""
+    """What is optimized. A patch has a size and a place; `offset_mm` is [right, up] as one faces the side. A texture
+    covers the object's own UV map or vertices, `masked` only what mask, materials or faces name.
+    """
 
-    width_mm: Positive
-    height_mm: Positive
-    kind: Literal["patch"] = "patch"
+    width_mm: Positive | None = None
+    height_mm: Positive | None = None
+    kind: Literal["patch", "texture", "masked"] = "patch"
     side: Side = "+x"
     offset_mm: tuple[Finite, Finite] = (0.0, 0.0)
     at_mm: tuple[Finite, Finite, Finite] | None = None  # a point in the scene instead of a side's middle
     spin_deg: Finite = 0.0
-    bend: Literal[False] = False  # flat cards only
+    bend: bool = False  # follow the surface instead of standing off it as a flat card
+    mask: str | None = None  # an image over the UV map, white where the texture may change
+    materials: tuple[str, ...] = ()
+    faces: str | None = None  # a text file of face numbers
+    start: Literal["original", "grey"] = "original"
+    epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
+
+    @model_validator(mode="after")
+    def _fits_kind(self):
+        if (self.width_mm is None) != (self.height_mm is None):
+            raise ValueError("takes width_mm and height_mm together")
+        masks = [name for name in ("mask", "materials", "faces") if getattr(self, name)]
+        if self.kind == "masked" and len(masks) != 1:
+            raise ValueError('takes one of mask, materials or faces with kind = "masked"')
+        if self.kind != "masked" and masks:
+            raise ValueError(f'takes {masks[0]} with kind = "masked" only')
+        if self.kind == "patch" and self.epsilon is not None:
+            raise ValueError("takes epsilon with textures only: a patch starts from nothing")
+        if self.kind != "patch" and self.bend:
+            raise ValueError("takes bend with patches only")
+        return self
 
 
 class SheetSettings(Strict):
@@ -110,13 +149,20 @@ class ViewSettings(Strict):
     distance_mm: PositiveRange = (440.0, 800.0)
     roll_deg: Range = (-5.0, 5.0)
     fov_deg: Annotated[Positive, Field(lt=170)] = 50.0
+    zoom: PositiveRange = (0.9, 1.1)  # of a photographed scene's pictures about their middle
+    patch_share: ShareRange = (0.1, 0.3)  # design's longer side over the picture's shorter side, in a folder of images
 
 
 class LightSettings(Strict):
-    """Ambient and directional light; 1 is the light in which white paper is sRGB white at exposure 0."""
+    """Ambient and directional light, a lamp, gloss; 1 is the light in which white paper is sRGB white at exposure 0."""
 
     ambient: NotNegativeRange = (0.3, 0.7)
     directional: NotNegativeRange = (0.2, 0.8)
+    point: NotNegativeRange = (0.0, 0.0)  # a lamp's light on the patch's middle where it faces the lamp
+    point_distance_mm: PositiveRange = (300.0, 2000.0)  # of the lamp from the patch's middle
+    sh2: ShareRange = (0.0, 0.0)  # standard deviation of the ambient light over directions, share of its mean
+    gloss: ShareRange = (0.0, 0.0)  # share of the light that the paper reflects as a highlight (Blinn-Phong)
+    shininess: PositiveRange = (20.0, 80.0)  # the highlight's exponent: larger is smaller and brighter
 
 
 class BackgroundSettings(Strict):
@@ -124,6 +170,7 @@ class BackgroundSettings(Strict):
 
     images: str | None = None
     color: tuple[Share, Share, Share] | None = None
+    erasing: Share = 0.5  # chance that a random box is erased in training, in a folder of images
 
     @model_validator(mode="after")
     def _one_of_them(self):
@@ -146,6 +193,9 @@ class CameraSettings(Strict):
     white_balance: Annotated[Share, Field(le=0.5)] = 0.05
     blur_px: NotNegativeRange = (0.0, 1.0)
     noise: ShareRange = (0.0, 0.01)
+    motion_px: NotNegativeRange = (0.0, 0.0)  # length of a straight motion blur at photo_px
+    vignetting: Annotated[ShareRange, AfterValidator(lambda r: _within(r, 0, 0.95))] = (0.0, 0.0)  # lost in corners
+    file: str | None = None  # a calibrated camera: intrinsics and lens distortion in place of fov_deg
     jpeg: Annotated[
         tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(_ordered)
     ] = (60, 95)
@@ -156,6 +206,7 @@ class OptimizeSettings(Strict):
 
     steps: Annotated[int, Field(ge=1)] = 120
     views: Annotated[int, Field(ge=1)] = 12
+    refresh: Annotated[int, Field(ge=1)] = 1  # steps for which views keep their poses, lit and printed anew
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
     step_size: Positive = 0.1
@@ -176,6 +227,14 @@ class SceneSettings(Strict):
     printer: PrinterSettings = PrinterSettings()
     camera: CameraSettings = CameraSettings()
     optimize: OptimizeSettings = OptimizeSettings()
+
+    @model_validator(mode="after")
+    def _has_its_parts(self):
+        if self.patch.kind != "patch" and self.object.mesh is None:
+            raise ValueError("takes a texture with a mesh only")
+        if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
+            raise ValueError("takes patch.width_mm and patch.height_mm")
+        return self
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

@@ -1,13 +1,14 @@
-"""The camera: linear light at the sensor becomes a display-encoded picture.
+"""The camera: linear light at the lens becomes a display-encoded picture.
 
-In: N×3×H×W linear light and the drawn camera conditions. Out: N×3×H×W sRGB in [0, 1], differentiable. Order: blur
-(optics, focus), exposure and white balance, shot and read noise, clipping, tone curve (sRGB's).
+In: N×3×H×W linear light and the drawn camera conditions. Out: N×3×H×W sRGB in [0, 1], differentiable. Order:
+vignetting, blur (optics, focus, straight motion), exposure and white balance, shot and read noise, clipping, tone curve
+(sRGB's). The lens's distortion has its own module.
 
-Blur, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
-photograph gets what is left of them after averaging: blur and noise shrink with `scale`; what falls under the threshold
-of visibility is skipped, since it would cost time and show nothing. What stands for a photograph that was already
-reduced to a network's input also gets the blur of that reduction. At full size the photograph is stored as a real JPEG
-by whoever writes it.
+Blur, motion, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
+photograph gets what is left of them after averaging: they shrink with `scale`; what falls under the threshold of
+visibility is skipped, since it would cost time and show nothing. What stands for a photograph that was already reduced
+to a network's input also gets the blur of that reduction. At full size the photograph is stored as a real JPEG by
+whoever writes it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from patchproof.color import srgb_from_linear
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4
+SMALLEST_MOTION_PX = SMALLEST_BLUR_PX * 12**0.5  # the length of an even streak of that sigma
 # The antialiased bilinear filter that reduces photographs is a triangle of two pixels: variance 1/6 px². Without it 40
 # photographs of an optimized patch were judged 0.07 too confidently at the network's size, with it 0.04.
 REDUCTION_VARIANCE = 1 / 6
@@ -30,13 +32,18 @@ SMALLEST_JPEG_SCALE = 0.5
 READ_SHARE = 0.25
 
 
-def develop(linear: Tensor, conditions, scale: float, reduced: bool = False, jpeg: bool = True) -> Tensor:
+def develop(
+    linear: Tensor, conditions, scale: float, reduced: bool = False, jpeg: bool = True, diagonal_share: float = 1.0
+) -> Tensor:
     """The picture that a camera makes; `conditions` as in `scene.conditions.Conditions`, one row per picture.
 
     `scale` is the pictures' size over the photograph's. `reduced`: they stand for photographs reduced to this size.
-    `jpeg=False` leaves JPEG to the writer of a real file.
+    `jpeg=False` leaves JPEG to the writer of a real file. `diagonal_share` is what vignetting needs to know, from
+    `diagonal_share_of`.
     """
+    linear = vignetted(linear, torch.as_tensor(conditions.vignetting).to(linear), diagonal_share)
     linear = blurred(linear, torch.as_tensor(_sigma_px(conditions, scale, reduced)).to(linear))
+    linear = moved(linear, torch.as_tensor(conditions.motion_px * scale).to(linear), conditions.motion_deg)
     linear = linear * gains(conditions, linear)[:, :, None, None]
     linear = noisy(linear, torch.as_tensor(conditions.noise * scale).to(linear), conditions.noise_seed)
     picture = encoded(linear)
@@ -46,10 +53,22 @@ def develop(linear: Tensor, conditions, scale: float, reduced: bool = False, jpe
 
 
 def is_pointwise(conditions, scale: float, reduced: bool, jpeg: bool) -> bool:
-    """Whether `develop` treats every pixel alone, so that a changed part can be developed without the rest."""
+    """Whether `develop` treats every pixel alone and alike, so that a changed part can be developed without the rest.
+
+    Vignetting is not alike: it depends on the place.
+    """
     sharp = _sigma_px(conditions, scale, reduced).max() < SMALLEST_BLUR_PX
+    still = (conditions.motion_px * scale).max() < SMALLEST_MOTION_PX
+    even = not conditions.vignetting.any()
     clean = (conditions.noise * scale).max() < SMALLEST_NOISE
-    return bool(sharp and clean and not (jpeg and scale >= SMALLEST_JPEG_SCALE))
+    return bool(sharp and still and even and clean and not (jpeg and scale >= SMALLEST_JPEG_SCALE))
+
+
+def diagonal_share_of(size_px: tuple[int, int], photo_px: tuple[int, int]) -> float:
+    """How much of the photograph's diagonal a picture of `size_px` spans: 1, or less for its centered square."""
+    width, height = size_px
+    diagonal = (width**2 + height**2) ** 0.5 / min(size_px)
+    return min(1.0, diagonal * min(photo_px) / (photo_px[0] ** 2 + photo_px[1] ** 2) ** 0.5)
 
 
 def gains(conditions, like: Tensor) -> Tensor:
@@ -62,8 +81,23 @@ def encoded(linear: Tensor) -> Tensor:
     return srgb_from_linear(linear.clamp(0, 1))
 
 
+def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tensor:
+    """Light that falls off from the middle as cos⁴ of an angle does; the photograph's corners lose the share `lost` N.
+
+    At r, as a share of the photograph's half diagonal, (1 + t²r²)⁻² of the light is left, with t² from `lost` < 1.
+    """
+    if not bool(lost.any()):
+        return linear
+    height, width = linear.shape[-2:]
+    y = torch.arange(height).to(linear) + 0.5 - height / 2
+    x = torch.arange(width).to(linear) + 0.5 - width / 2
+    square = (y[:, None] ** 2 + x**2) * (4 * diagonal_share**2 / (height**2 + width**2))
+    tangent_square = (1 - lost) ** -0.5 - 1
+    return linear * (1 + tangent_square[:, None, None, None] * square) ** -2
+
+
 def _sigma_px(conditions, scale: float, reduced: bool):
-    """N sigmas of all that blurs a picture."""
+    """N sigmas of all that blurs a picture alike in all directions."""
     variance = (conditions.blur_px * scale) ** 2 + (REDUCTION_VARIANCE * max(0.0, 1 - scale**2) if reduced else 0)
     return variance**0.5
 
@@ -78,6 +112,33 @@ def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:
     taps = 2 * int(3 * largest + 0.5) + 1
     sigma = sigma_px.clamp_min(0.05)[:, None].expand(-1, 2)  # 0.05 px leaves a picture as it was
     return gaussian_blur2d(linear, (taps, taps), sigma, border_type="replicate")
+
+
+def moved(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
+    """Blur of an even, straight motion, one length and angle (counter-clockwise from x) per picture.
+
+    Nothing where all are too short to be seen; length 0 leaves a picture as it was.
+    """
+    from kornia.filters import filter2d
+
+    if float(length_px.max()) < SMALLEST_MOTION_PX:
+        return linear
+    return filter2d(linear, _streaks(length_px, torch.as_tensor(angle_deg).to(linear)), border_type="replicate")
+
+
+def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
+    """N×k×k kernels of sum 1: points along a line, each shared out bilinearly between four pixels.
+
+    kornia's own motion kernels have one odd length for the whole batch and, turned, jump from pixel to pixel.
+    """
+    reach = int(length_px.max() / 2) + 1
+    pixels = torch.arange(-reach, reach + 1).to(length_px)
+    steps = 8 * reach  # four or more per pixel
+    along = length_px[:, None] * ((torch.arange(steps).to(length_px) + 0.5) / steps - 0.5)
+    angle = torch.deg2rad(angle_deg)[:, None]
+    x, y = along * torch.cos(angle), -along * torch.sin(angle)  # rows run down
+    tent_x, tent_y = ((1 - (pixels - at[..., None]).abs()).clamp_min(0) for at in (x, y))
+    return tent_y.mT @ tent_x / steps
 
 
 def noisy(linear: Tensor, noise: Tensor, seeds) -> Tensor:

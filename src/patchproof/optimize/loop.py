@@ -16,9 +16,11 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from patchproof.optimize.goals import target_loss, total_variation
-from patchproof.optimize.problem import Problem, from_pixels
-from patchproof.render.photograph import Seen, expose, photograph, see
+from patchproof.optimize.goals import target_loss
+from patchproof.optimize.pixels import from_pixels
+from patchproof.optimize.problem import Problem
+from patchproof.render.photograph import expose
+from patchproof.render.views import Seen, relit
 
 SELECT_EVERY = 10
 SELECT_VIEWS = 64
@@ -55,9 +57,8 @@ class Step:
 
 
 def start(problem: Problem) -> State:
-    """The state before the first step: a mid-gray design."""
-    width, height = problem.design_px
-    design = torch.full((3, height, width), 0.5, device=problem.device)
+    """The state before the first step."""
+    design = problem.subject.start()
     zero = torch.zeros_like(design)
     return State(0, design, zero, zero, design)
 
@@ -67,26 +68,26 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
     state = start(problem) if state is None else state
     settings = problem.scene.settings.optimize
     conditions = problem.scene.draw("train", settings.steps * settings.views)
-    selection = _selection(problem)
+    selection, pool = _selection(problem), None
     while state.number < settings.steps:
         first = state.number * settings.views
-        step = _step(problem, state, conditions[first : first + settings.views])
+        drawn = conditions[first : first + settings.views]
+        if pool is None or state.number % settings.refresh == 0:
+            first = state.number // settings.refresh * settings.refresh * settings.views
+            poses = conditions[first : first + settings.views]
+            pool = problem.see(problem.subject.shown(state.design), poses, problem.training_px)
+        step = _step(problem, state, relit(pool, drawn) if settings.refresh > 1 else pool)
         if step.state.number % SELECT_EVERY == 0 or step.state.number == settings.steps:
             step = _select(problem, selection, step)
         state = step.state
         yield step
 
 
-def _step(problem: Problem, state: State, conditions) -> Step:
-    settings = problem.scene.settings
+def _step(problem: Problem, state: State, seen: Seen) -> Step:
     design = state.design.clone().requires_grad_()
-    size = (problem.training_px, problem.training_px)
-    pictures = photograph(problem.stage, problem.piece_picture(design), conditions, size, problem.reduced)
+    pictures = expose(seen, problem.subject.shown(design), problem.reduced)
     losses, confidences, rates = _score(problem, pictures)
-    loss = losses + settings.optimize.tv * total_variation(design)
-    if settings.optimize.gamut:
-        # ΔE00 / 100: one unit of loss for black in place of white
-        loss = loss + settings.optimize.gamut * problem.gamut_excess(design) / 100
+    loss = losses + problem.subject.penalty(design)
     (gradient,) = torch.autograd.grad(loss, design)
     moved = _descend(state, gradient, problem)
     return Step(
@@ -95,17 +96,17 @@ def _step(problem: Problem, state: State, conditions) -> Step:
 
 
 def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
-    """One update of the design, clipped to what can be printed."""
-    settings = problem.scene.settings.optimize
+    """One update of the design, clipped to what it may become."""
+    clipped, settings = problem.subject.clipped, problem.scene.settings.optimize
     number = state.number + 1
     if settings.optimizer == "sign":
-        design = (state.design - settings.step_size * gradient.sign()).clamp(0, 1)
+        design = clipped(state.design - settings.step_size * gradient.sign())
         return replace(state, number=number, design=design)
     mean = torch.lerp(gradient, state.mean, _BETAS[0])
     square = torch.lerp(gradient**2, state.square, _BETAS[1])
     unbiased = mean / (1 - _BETAS[0] ** number)
     scale = (square / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON
-    design = (state.design - settings.step_size * unbiased / scale).clamp(0, 1)
+    design = clipped(state.design - settings.step_size * unbiased / scale)
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 
@@ -125,20 +126,19 @@ def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
 def _selection(problem: Problem) -> list[Seen]:
     """The selection views, seen once and shaded anew for each design."""
     conditions = problem.scene.draw("select", SELECT_VIEWS)
-    size = (problem.training_px, problem.training_px)
-    piece = problem.piece_picture(start(problem).design)
+    shown = problem.subject.shown(start(problem).design)
     with torch.no_grad():
         parts = (conditions[i : i + SELECT_CHUNK] for i in range(0, SELECT_VIEWS, SELECT_CHUNK))
-        return [see(problem.stage, piece, part, size) for part in parts]
+        return [problem.see(shown, part, problem.training_px) for part in parts]
 
 
 def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
     """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
     state = step.state
-    printed = from_pixels(problem.pixels(state.design), problem.device)
+    printed = from_pixels(problem.subject.pixels(state.design), problem.device)
     with torch.no_grad():
-        piece = problem.piece_picture(printed)
-        scores = [_score(problem, expose(problem.stage, seen, piece, problem.reduced)) for seen in selection]
+        shown = problem.subject.shown(printed)
+        scores = [_score(problem, expose(seen, shown, problem.reduced)) for seen in selection]
     loss = sum(float(score[0]) for score in scores) / len(scores)
     rate = sum(score[2] for score in scores) / len(scores)
     if loss < state.best_loss:

@@ -19,11 +19,11 @@ import torch
 from patchproof import geometry
 from patchproof.claims import paired_difference, wilson
 from patchproof.color import linear_from_srgb
-from patchproof.optimize.problem import Problem, from_pixels
-from patchproof.render.photograph import expose, see
+from patchproof.optimize.pixels import from_pixels
+from patchproof.optimize.problem import Problem
+from patchproof.render.photograph import expose
 from patchproof.scene.conditions import Conditions
 from patchproof.sheet.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
-from patchproof.sheet.piece import control_design
 
 PROMISE_VIEWS = 400  # the Wilson interval of a rate of 0.9 is then 6 points wide
 CONTROLS = ("bare", "mean", "grey", "noise")
@@ -43,18 +43,16 @@ def try_out(
     problem: Problem, design: np.ndarray, conditions: Conditions, progress: Callable[[int], None] = lambda n: None
 ) -> Outcomes:
     """Show the design and its controls under every condition to every classifier."""
-    sheet_id, device = problem.scene.sheet_id, problem.device
-    shown = {"design": design} | {kind: control_design(kind, design, sheet_id) for kind in CONTROLS if kind != "bare"}
+    subject, device = problem.subject, problem.device
+    pixels = {"design": design} | {kind: subject.control(kind, design) for kind in CONTROLS if kind != "bare"}
     with torch.no_grad():
-        pieces = {kind: problem.piece_picture(from_pixels(pixels, device), kind) for kind, pixels in shown.items()}
+        shown = {kind: subject.shown(from_pixels(one, device), kind) for kind, one in pixels.items()}
         parts: dict[str, list] = {kind: [] for kind in ("design", *CONTROLS)}
-        side = problem.figure_px
         for first in range(0, len(conditions), CHUNK):
             part = conditions[first : first + CHUNK]
-            seen = see(problem.stage, pieces["design"], part, (side, side))
-            for kind, piece in pieces.items():
-                parts[kind].append(_judge(problem, expose(problem.stage, seen, piece)))
-            parts["bare"].append(_judge(problem, expose(problem.stage, seen, None)))
+            seen = problem.see(shown["design"], part, problem.figure_px)
+            for kind, one in (shown | {"bare": None}).items():
+                parts[kind].append(_judge(problem, expose(seen, one)))
             progress(len(part))
     joined = {kind: np.concatenate(part, -1) for kind, part in parts.items()}  # 2×M×N
     recognized = {kind: both[0] > 0.5 for kind, both in joined.items()}
@@ -116,26 +114,29 @@ def _judge(problem: Problem, pictures: torch.Tensor) -> np.ndarray:
 
 
 def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionClaim, ...]:
-    """What a photograph could show of each condition; null where the patch's face is turned away."""
-    scene, conditions = problem.scene, outcomes.conditions
+    """What a photograph could show of each condition; null where the patch's face is turned away or there is none."""
+    scene, conditions, recognized = problem.scene, outcomes.conditions, outcomes.recognized["design"][0]
+    if scene.piece is None:
+        return tuple(
+            ConditionClaim(blur_px=_rounded(blur), recognized=bool(seen))
+            for blur, seen in zip(conditions.blur_px, recognized, strict=True)
+        )
     x, y, width, height = scene.piece.design_rect_mm
     middle = np.array([x + width / 2, y + height / 2])
-    matrix, poses = scene.matrix_px(scene.settings.camera.photo_px), scene.camera_from_world(conditions)
-    contrast = _contrasts(problem, conditions)
+    homographies = scene.piece_homographies(conditions, scene.settings.camera.photo_px)
+    azimuths, contrast = scene.piece_azimuth_deg(conditions), _contrasts(problem, conditions)
     claims = []
-    for i, pose in enumerate(poses):
-        camera_from_piece = pose @ scene.card.world_from_piece
-        azimuth, _, _ = geometry.view_angles(camera_from_piece, middle)
-        faces = abs(azimuth) < 90
-        scale, tilt = geometry.local_scale(geometry.plane_homography(matrix, pose, scene.card.world_from_piece), middle)
+    for i, homography in enumerate(homographies):
+        faces = not abs(azimuths[i]) >= 90  # unknown angles are of photographs that show it
+        scale, tilt = geometry.local_scale(homography, middle)
         claims.append(
             ConditionClaim(
                 px_per_mm=_rounded(scale) if faces else None,
                 tilt_deg=_rounded(tilt) if faces else None,
-                azimuth_deg=_rounded(azimuth) if faces else None,
+                azimuth_deg=_rounded(azimuths[i]) if faces else None,
                 contrast=_rounded(contrast[i]) if faces else None,
                 blur_px=_rounded(conditions.blur_px[i]),
-                recognized=bool(outcomes.recognized["design"][0, i]),
+                recognized=bool(recognized[i]),
             )
         )
     return tuple(claims)
@@ -143,12 +144,7 @@ def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionCl
 
 def _contrasts(problem: Problem, conditions: Conditions) -> np.ndarray:
     """Paper white minus printed black in the photograph's linear light."""
-    scene = problem.scene
-    toward = geometry.orbit(
-        conditions.light_azimuth_deg, conditions.light_elevation_deg, scene.frame.normal, scene.frame.up
-    )
-    light = conditions.ambient + conditions.directional * np.clip(toward @ scene.card.normal, 0, None)
-    exposed = light * 2**conditions.exposure_ev
+    exposed = problem.scene.white_light(conditions) * 2**conditions.exposure_ev
     black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
     return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
 

@@ -24,19 +24,14 @@ import patchproof
 from patchproof.optimize.loop import SELECT_EVERY, State, Step, start, steps
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimize.result import RESULT_FILES, read_result, save_result
 from patchproof.output import check_folder, make_folder, write_whole
-from patchproof.scene.scene import MeshScene, build_scene, load_scene
+from patchproof.scene.scene import Scene, build_scene, load_scene
 from patchproof.settings import Refused, SceneSettings, validated
 from patchproof.sheet.manifest import Promise
 
-_CHECKPOINT, _LOG, _RUN, _DESIGN, _VIEWS = (
-    "checkpoint.safetensors",
-    "steps.jsonl",
-    "run.json",
-    "design.png",
-    "views.png",
-)
-OWN = (_CHECKPOINT, _LOG, _RUN, _DESIGN, _VIEWS, "evaluate.json", ".*.part")
+_CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
+OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, *RESULT_FILES, "evaluate.json", ".*.part")
 
 
 @dataclass(frozen=True)
@@ -44,8 +39,8 @@ class Run:
     """A finished run, read back."""
 
     folder: Path
-    scene: MeshScene
-    design: np.ndarray  # uint8 h×w×3
+    scene: Scene
+    design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimize.texture.Texture`
     promise: Promise
     details: dict[str, Any]
 
@@ -60,7 +55,7 @@ def optimize_scene(
     overwrite: bool = False,
     on_step: Callable[[Step, int], None] = lambda step, total: None,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
-    on_scene: Callable[[MeshScene], None] = lambda scene: None,
+    on_scene: Callable[[Scene], None] = lambda scene: None,
 ) -> Run:
     """Optimize the scene's patch into the folder `out` and promise its rate; `resume` goes on from its checkpoint."""
     out = Path(out)
@@ -74,7 +69,7 @@ def optimize_scene(
     make_folder(out)
     state = _resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
-    write_whole(out / _DESIGN, lambda path: Image.fromarray(design).save(path, "PNG"))
+    save_result(problem, design, out)
     promise = _promise(problem, design, on_promise)
     details = _details(problem, promise, Path(scene_path).resolve().parent, out, device)
     write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
@@ -92,20 +87,21 @@ def load_run(folder: str | Path) -> Run:
         details = json.loads((folder / _RUN).read_text(encoding="utf-8"))
         settings = validated(SceneSettings, details["settings"], str(folder / _RUN))
         promise = validated(Promise, details["promise"], str(folder / _RUN))
-        with Image.open(folder / _DESIGN) as image:
-            design = np.asarray(image.convert("RGB"))
         base, seed = folder / details["scene_folder"], details["seed"]
+        scene = build_scene(settings, base.resolve(), seed)
+        design = read_result(scene, folder)
     except (OSError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, Refused):
             raise
         raise Refused("a finished run", f"{folder} that cannot be read ({error})", "optimize again") from error
-    return Run(folder, build_scene(settings, base.resolve(), seed), design, promise, details)
+    return Run(folder, scene, design, promise, details)
 
 
 def _clear(out: Path) -> None:
     """Remove an earlier run, now that everything the new one needs has been read."""
     for name in OWN[:-1]:
-        (out / name).unlink(missing_ok=True)
+        for path in out.glob(name):
+            path.unlink()
 
 
 def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, int], None]) -> np.ndarray:
@@ -122,7 +118,7 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             if state.number == total:
                 write_whole(out / _VIEWS, lambda path, step=step: _contact_sheet(step.pictures).save(path, "PNG"))
             on_step(step, total)
-    return problem.pixels(state.best)
+    return problem.subject.pixels(state.best)
 
 
 def _promise(problem: Problem, design: np.ndarray, on_promise: Callable[[int, int], None]) -> Promise:
@@ -203,18 +199,27 @@ def _details(problem: Problem, promise: Promise, scene_folder: Path, out: Path, 
         "scene_folder": os.path.relpath(scene_folder, out.resolve()),
         "settings": scene.settings.model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
-        "placement": {
-            "gap_mm": scene.card.gap_mm,
-            "gap_mean_mm": scene.card.gap_mean_mm,
-            "overhang_share": scene.card.overhang_share,
-            "piece_mm": scene.piece.size_mm,
-            "marker_mm": scene.piece.module_mm * 7,
-            "unreadable_share": scene.unreadable_share,
-        },
+        "placement": _placement(scene),
         "warnings": list(scene.warnings),
         "select_every": SELECT_EVERY,
         "promise": promise.model_dump(mode="json"),
     }
+
+
+def _placement(scene: Scene) -> dict[str, Any] | None:
+    """Where the piece lies and how well it fits; None where there is no piece."""
+    if scene.piece is None:
+        return None
+    piece = {
+        "piece_mm": scene.piece.size_mm,
+        "marker_mm": scene.piece.module_mm * 7,
+        "unreadable_share": scene.unreadable_share,
+    }
+    placement = getattr(scene, "placement", None)
+    if placement is None:
+        return piece
+    names = ("family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
+    return piece | {name: getattr(placement, name) for name in names}
 
 
 def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:

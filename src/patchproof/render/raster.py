@@ -4,26 +4,34 @@ In: faces in world millimetres and a batch of pinhole cameras. Out: `Fragments`,
 perspective-correct barycentrics, camera depth and what texture filtering needs. Visibility is hard and carries no
 gradient: shape is never optimized.
 
-Triangles become row spans, spans become fragments, and depth is settled by one integer minimum per pixel, so that work
-follows what is covered. Coverage is exact: corners are snapped to 1/256 pixel and the edge functions of Pineda (1988)
-are evaluated on integers held in float64 with the top-left rule, hence two triangles that share an edge never both take
-a pixel and never leave one out. Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano and
-Greer, 1997), which stays well-defined for faces that reach behind the camera; such faces are cut at the near plane, not
-dropped. Where depths are equal to float32 the lower face index wins. Left out on purpose: transparency.
+Triangles are split into two trapezoids, those into row spans, spans into fragments, and depth is settled by one integer
+maximum per pixel, so that work follows what is covered. Coverage is exact: corners are snapped to 1/256 pixel, and a
+span reaches from its left edge's first pixel center to that of its right edge, each found from integers that float64
+holds exactly and in one canonical direction of the edge. Hence two triangles that share an edge never both take a pixel
+and never leave one out; a center on an edge belongs to what lies right of it or, on level edges, below (the top-left
+rule of Pineda, 1988). Depth and barycentrics come from the unsnapped face in 2D homogeneous form (Olano and Greer,
+1997), which stays well-defined for faces that reach behind the camera; such faces are cut at the near plane, not
+dropped. Where depths are equal to 24 bits the lower face index wins. Left out on purpose: transparency.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from patchproof.settings import Refused
+
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
-GUARD_PX = 1 << 16  # faces are cut here, so that edge functions stay below 2^53 and float64 holds them exactly
-CHUNK = 1 << 22  # rows or fragments held at a time; bounds memory to some hundred MB
-_NOTHING = torch.iinfo(torch.int64).max
-_FACE_BITS = (1 << 31) - 1  # a key is 31 bits of depth over 31 bits of face index; the sign stays 0
+GUARD_PX = 1 << 16  # faces are cut here, so that products of coordinates stay below 2^53 and float64 holds them exactly
+CHUNK = 1 << 20  # faces, rows, pixels or fragments held at a time; bounds what is held beside the result to some 300 MB
+_FACE_BITS = 29  # a key is a float64 of 1/z whose lower bits give way to the face; 23 of the mantissa are left
+_FACE_MASK = (1 << _FACE_BITS) - 1
+_X_BITS = 26  # a snapped corner is one integer, y above x, both from -2^25 up
+_X_MASK, _OFFSET = (1 << _X_BITS) - 1, 1 << (_X_BITS - 1)
 
 
 @dataclass(frozen=True)
@@ -44,91 +52,178 @@ class Cameras:
 class Fragments:
     """What P covered pixels see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
 
-    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `barycentric_dx`, `_dy` P×3: change per pixel to the
-    right, down. `front` tells whether the face shows its outside.
+    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells whether the face shows its outside.
+    `seen` P (into Q) and `slopes` 6×Q are what the derivatives of the barycentrics are computed from when asked for.
     """
 
     pixel: Tensor
-    view: Tensor
     face: Tensor
     barycentric: Tensor
-    barycentric_dx: Tensor
-    barycentric_dy: Tensor
     depth: Tensor
     front: Tensor
+    seen: Tensor
+    slopes: Tensor
     shape: tuple[int, int, int]  # views, height, width
 
     def __len__(self) -> int:
         return len(self.pixel)
 
+    @cached_property
+    def view(self) -> Tensor:
+        """P: the view of each fragment."""
+        return self.pixel // (self.shape[1] * self.shape[2])
+
+    @cached_property
+    def barycentric_dx(self) -> Tensor:
+        """P×3 float32: change of the barycentrics per pixel to the right."""
+        return self._derivative(0)
+
+    @cached_property
+    def barycentric_dy(self) -> Tensor:
+        """P×3 float32: change of the barycentrics per pixel down."""
+        return self._derivative(1)
+
+    def _derivative(self, axis: int) -> Tensor:
+        # d(e_i / t) = (de_i - e_i/t · dt) / t
+        first, second, total = (self.slopes[2 * i + axis].index_select(0, self.seen) for i in range(3))
+        b, z = self.barycentric, self.depth
+        first.addcmul_(b[:, 1], total, value=-1).mul_(z)
+        second.addcmul_(b[:, 2], total, value=-1).mul_(z)
+        return _columns(-(first + second), first, second)
+
     def where(self, keep: Tensor) -> Fragments:
         """The fragments where `keep` (P, bool) is true."""
-        fields = (
-            self.pixel,
-            self.view,
-            self.face,
-            self.barycentric,
-            self.barycentric_dx,
-            self.barycentric_dy,
-            self.depth,
-            self.front,
-        )
-        return Fragments(*(field[keep] for field in fields), self.shape)
+        index = keep.nonzero()[:, 0]
+        fields = (self.pixel, self.face, self.barycentric, self.depth, self.front, self.seen)
+        return Fragments(*(field.index_select(0, index) for field in fields), self.slopes, self.shape)
 
 
+@torch.no_grad()
 def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float, cull_back: bool = False) -> Fragments:
     """The nearest face at every pixel center of every camera.
 
     `vertices` V×3 (world mm), `faces` F×3 (counter-clockwise seen from outside). Faces nearer than `near_mm` are cut
-    there.
+    there; faces with a corner that is no finite number are not drawn. Refused beyond 2^29 - 1 faces.
     """
+    if len(faces) > _FACE_MASK:
+        raise Refused(f"at most {_FACE_MASK} faces", str(len(faces)), "render the mesh in parts")
     width, height = cameras.size_px
-    pose, matrix = cameras.camera_from_world.double(), cameras.matrix_px.double()
-    camera = vertices.double() @ pose[:, :3, :3].transpose(1, 2) + pose[:, None, :3, 3]
-    # homogeneous pixel coordinates: (x·z, y·z, z); everything below is linear in them
-    corners = (camera @ matrix.transpose(1, 2))[:, faces]
-    planes, det = _planes(corners)
-    nearest = torch.full((len(cameras) * height * width,), _NOTHING, device=vertices.device)
-    usable = (corners[..., 2] > near_mm).any(-1) & (det != 0) & det.isfinite()
-    if cull_back:
-        usable &= det < 0
-    target = usable.flatten().nonzero()[:, 0]  # view · F + face
-    triangles, owner = _clipped(corners.flatten(0, 1)[target], near_mm)
-    target = target[owner]
-    rows, total = planes.flatten(0, 1), planes.sum(-2).flatten(0, 1)
-    inverse_depth = total / det.flatten()[:, None]  # 1/z = row · (x, y, 1)
-    for triangle_chunk, index in _setup(triangles, (width, height)):
-        spans = _spans(*triangle_chunk, width)
-        _fill(nearest, spans, target[index], inverse_depth, len(faces), (width, height))
-    pixel = (nearest != _NOTHING).nonzero()[:, 0]
-    return _resolve(pixel, nearest[pixel] & _FACE_BITS, rows, det.flatten(), (len(cameras), height, width))
+    shape, vertices = (len(cameras), height, width), vertices.double()
+    # homogeneous pixel coordinates (x·z, y·z, z) from the world: K [R t]
+    matrix = cameras.matrix_px.double() @ cameras.camera_from_world.double()[:, :3]
+    at_once = max(1, CHUNK // max(len(vertices), len(faces), width * height, 1))
+    groups = range(0, len(cameras), at_once)
+    nearest = torch.zeros(math.prod(shape), dtype=torch.int64, device=faces.device)
+    for view in groups:
+        keys = nearest[view * height * width : (view + at_once) * height * width]
+        _settle(keys, _points(vertices, matrix[view : view + at_once]), faces, cameras.size_px, near_mm, cull_back)
+    fragments = _allocated(nearest, shape)
+    del nearest
+    slopes = [fragments.slopes]
+    for view in groups:
+        points = _points(vertices, matrix[view : view + at_once])
+        ends = fragments.pixel.new_tensor([view, view + at_once]) * (height * width)
+        first, last = torch.searchsorted(fragments.pixel, ends).tolist()
+        for start in range(first, last, CHUNK):
+            part = slice(start, min(start + CHUNK, last))
+            slopes.append(_resolve(fragments, part, points, faces, view, near_mm))
+            fragments.seen[part] += sum(s.shape[1] for s in slopes[:-1])
+    return replace(fragments, slopes=torch.cat(slopes, 1))
 
 
-def _planes(corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Per face the rows e_i with e_i · (x, y, 1) ∝ barycentric i, N×F×3×3, and the determinant of its corners, N×F."""
-    a, b, c = corners.unbind(-2)
-    bc = torch.linalg.cross(b, c)
-    planes = torch.stack([bc, torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)
-    return planes, (a * bc).sum(-1)
+def _points(vertices: Tensor, matrix: Tensor) -> Tensor:
+    """3×N×V homogeneous pixel coordinates; written out, because a matrix product rounds as its size has it."""
+    x, y, z = vertices.T
+    m = matrix.transpose(0, 1)[..., None]
+    return m[:, :, 0] * x + m[:, :, 1] * y + m[:, :, 2] * z + m[:, :, 3]
+
+
+def _settle(
+    nearest: Tensor, points: Tensor, faces: Tensor, size_px: tuple[int, int], near: float, cull_back: bool
+) -> None:
+    """Leave in `nearest` the greatest key at each of N·H·W pixels, 0 where nothing is seen."""
+    width, height = size_px
+    snapped = _snapped(points.flatten(1), near)
+    for start in range(0, len(faces), CHUNK):
+        block = faces[start : start + CHUNK]
+        index = _corner_index(points, block)
+        owner, corners = _triangles(points.flatten(1), snapped, index, size_px, near)
+        (_, _, plane), volume = _planes(_taken(points, [i.index_select(0, owner) for i in index]), near)
+        if cull_back:
+            corners = [corner * (volume < 0) for corner in corners]  # to a point: it has no rows
+        first_pixel = owner // len(block) * (height * width)
+        face_key = _FACE_MASK - start - owner % len(block)  # the lower face has the greater key
+        trapezoids = _trapezoids(corners, height)
+        owners = [t.repeat(2) for t in (*plane, first_pixel, face_key)]
+        for part in _chunks(trapezoids[1]):
+            _fill(nearest, *_spans([t[part] for t in trapezoids], [t[part] for t in owners], width))
+
+
+def _corner_index(points: Tensor, faces: Tensor) -> list[Tensor]:
+    """Where each face's first, second and third corner lies among N·V points; N·F each."""
+    _, views, count = points.shape
+    offset = torch.arange(views, device=faces.device)[:, None] * count
+    return [(offset + column).flatten() for column in faces.unbind(1)]
+
+
+def _taken(points: Tensor, index: list[Tensor]) -> list[list[Tensor]]:
+    """(x·z, y·z, z) of the three corners of faces. One axis at a time: torch is several times slower on all three."""
+    return [[axis.index_select(0, i) for axis in points.flatten(1)] for i in index]
+
+
+def _snapped(points: Tensor, near: float) -> Tensor:
+    """N·V corners on the 1/256 pixel grid, each one integer; -1 where a face must be cut or left out."""
+    x, y, z = points
+    plain = (z > near) & (torch.maximum(x.abs(), y.abs()) < GUARD_PX * z)
+    return _packed(x / z, y / z).masked_fill_(~plain, -1)
+
+
+def _packed(x: Tensor, y: Tensor) -> Tensor:
+    x, y = (x * SUBPIXELS).round_(), (y * SUBPIXELS).round_()
+    return (y * (1 << _X_BITS) + x + ((_OFFSET << _X_BITS) + _OFFSET)).nan_to_num_(0, 0, 0).long()  # below 2^53: exact
+
+
+def _unpacked(corner: Tensor) -> tuple[Tensor, Tensor]:
+    return (corner & _X_MASK) - _OFFSET, (corner >> _X_BITS) - _OFFSET
+
+
+def _center(snapped: Tensor, limit: int) -> Tensor:
+    """The first pixel whose center is at or after a snapped coordinate, within 0..limit."""
+    return (snapped + (SUBPIXELS // 2 - 1)).bitwise_right_shift_(8).clamp_(0, limit)  # 2^8 = SUBPIXELS
+
+
+def _triangles(points: Tensor, snapped: Tensor, index: list[Tensor], size_px: tuple[int, int], near: float):
+    """Snapped triangles that may hold a pixel center, and whose of the N·F faces they are; the cut ones come last."""
+    a, b, c = corners = [snapped.index_select(0, i) for i in index]
+    holds = a >= 0
+    for axis, limit in zip(zip(*(_unpacked(corner) for corner in corners), strict=True), size_px, strict=True):
+        low, high = _extent(*axis)
+        holds &= _center(low, limit) < _center(high, limit)
+    torn = torch.minimum(torch.minimum(a, b), c) < 0
+    owner = (holds & ~torn).nonzero()[:, 0]
+    corners = [corner.index_select(0, owner) for corner in corners]
+    torn = torn.nonzero()[:, 0]
+    if len(torn):
+        whole = torch.stack([points.index_select(1, i.index_select(0, torn)).T for i in index], 1)
+        triangles, of = _clipped(whole, near)
+        cut = _packed(*triangles.unbind(-1)).unbind(1)
+        owner = torch.cat([owner, torn[of]])
+        corners = [torch.cat(pair) for pair in zip(corners, cut, strict=True)]
+    return owner, corners
+
+
+def _extent(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.minimum(torch.minimum(a, b), c), torch.maximum(torch.maximum(a, b), c)
 
 
 def _clipped(corners: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """Triangles T×3×2 in pixels, cut at the near plane and, where they are huge, at the guard band; and whose face they
-    are.
-    """
-    z = corners[..., 2]
-    reach = corners[..., :2].abs().amax(-1)
-    plain = ((z > near) & (reach < GUARD_PX * z)).all(-1)
-    owner = torch.arange(len(corners), device=corners.device)
-    rest, rest_owner = corners[~plain], owner[~plain]
-    one = corners.new_tensor
-    half_spaces = [one([0, 0, 1.0])] + [
-        one(row) for row in ([1.0, 0, GUARD_PX], [-1.0, 0, GUARD_PX], [0, 1.0, GUARD_PX], [0, -1.0, GUARD_PX])
-    ]
-    for normal, offset in zip(half_spaces, [near, 0, 0, 0, 0], strict=True):
-        rest, rest_owner = _cut(rest, rest_owner, rest @ normal - offset)
-    triangles = torch.cat([corners[plain], rest])
-    return triangles[..., :2] / triangles[..., 2:], torch.cat([owner[plain], rest_owner])
+    """The parts before the near plane and within the guard band of T×3×3 faces: triangles in pixels, and whose."""
+    owner = corners.isfinite().all(-1).all(-1).nonzero()[:, 0]
+    corners = corners[owner]
+    bands = ([0.0, 0, 1], [1.0, 0, GUARD_PX], [-1.0, 0, GUARD_PX], [0.0, 1, GUARD_PX], [0.0, -1, GUARD_PX])
+    for normal, offset in zip(corners.new_tensor(bands), [near, 0, 0, 0, 0], strict=True):
+        corners, owner = _cut(corners, owner, corners @ normal - offset)
+    return corners[..., :2] / corners[..., 2:], owner
 
 
 def _cut(triangles: Tensor, owner: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,86 +249,142 @@ def _crossing(turned: Tensor, d: Tensor, which: Tensor, inside: int, outside: in
     return turned[which, inside] + share[:, None] * (turned[which, outside] - turned[which, inside])
 
 
-def _setup(triangles: Tensor, size_px: tuple[int, int]):
-    """Snapped triangles of one orientation that can hold a pixel center, in chunks of bounded row count, with their
-    indices.
+def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]], Tensor]:
+    """Planes e with e · (x, y, 1) = b/z for the second and third barycentric b and for their sum 1, and the signed
+    volume, negative from outside.
+
+    Where a face's horizon passes within 1/25 pixel of it, it is seen edge-on: a snap may turn it over, and its planes
+    say nothing. It is drawn flat at its mean 1/z.
     """
-    snapped = (triangles * SUBPIXELS).round()
-    low, high = snapped.amin(1), snapped.amax(1)
-    first = ((low - SUBPIXELS // 2) / SUBPIXELS).ceil().clamp_min(0)
-    last = ((high - SUBPIXELS // 2) / SUBPIXELS).floor().minimum(triangles.new_tensor(size_px) - 1)
-    edge_a, edge_b = snapped[:, 1] - snapped[:, 0], snapped[:, 2] - snapped[:, 0]
-    area = edge_a[:, 0] * edge_b[:, 1] - edge_a[:, 1] * edge_b[:, 0]
-    index = ((first <= last).all(-1) & (area != 0)).nonzero()[:, 0]
-    snapped = torch.where((area[index] < 0)[:, None, None], snapped[index].flip(1), snapped[index])
-    rows = torch.stack([first[index, 1], last[index, 1] - first[index, 1] + 1], 1).long()
-    for part in _chunks(rows[:, 1]):
-        yield (snapped[part], rows[part]), index[part]
+    a, b, c = corners
+    total = _cross([q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)])
+    volume = a[0] * total[0] + a[1] * total[1] + a[2] * total[2]
+    planes = [[e / volume for e in plane] for plane in (_cross(c, a), _cross(a, b), total)]
+    inverse = [1 / corner[2].clamp_min(near) for corner in corners]
+    steepness = planes[2][0].abs() + planes[2][1].abs()
+    edge_on = ~(steepness < 25 * _extent(*inverse)[1])  # true also where the volume is 0
+    if edge_on.any():
+        third = (inverse[0] + inverse[1] + inverse[2]) / 9
+        flat = ((0.0, 0.0, third), (0.0, 0.0, third), (0.0, 0.0, 3 * third))
+        planes = [
+            [torch.where(edge_on, f, e) for f, e in zip(*pair, strict=True)] for pair in zip(flat, planes, strict=True)
+        ]
+    return planes, volume
 
 
-def _fill(nearest: Tensor, spans, target: Tensor, inverse_depth: Tensor, faces: int, size_px: tuple[int, int]) -> None:
-    """Settle the nearest face of every pixel that these spans cover."""
-    width, height = size_px
-    triangle, y, x0, count = spans
-    of = target[triangle]
-    view, face = of // faces, of % faces
-    first_pixel = (view * height + y) * width + x0
-    a, b, c = inverse_depth.index_select(0, of).unbind(-1)
-    first_inverse = a * (x0 + 0.5) + b * (y + 0.5) + c
-    for part in _chunks(count):
-        lengths = count[part]
-        owner = torch.repeat_interleave(lengths)
-        step = torch.arange(len(owner), device=owner.device) - (lengths.cumsum(0) - lengths).index_select(0, owner)
-        depth = 1 / (first_inverse[part].index_select(0, owner) + a[part].index_select(0, owner) * step)
-        # float bits of positive numbers order like the numbers; slivers may extrapolate to nonsense, kept positive
-        bits = depth.clamp_(1e-30, 1e30).float().view(torch.int32).long()
-        key = bits.bitwise_left_shift_(31).bitwise_or_(face[part].index_select(0, owner))
-        nearest.scatter_reduce_(0, first_pixel[part].index_select(0, owner).add_(step), key, "amin")
+def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def _spans(snapped: Tensor, rows: Tensor, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(triangle, y, first x, length) of every row of pixel centers inside the triangles.
+def _trapezoids(corners: list[Tensor], height: int) -> list[Tensor]:
+    """The upper and the lower part of each triangle: first row, row count, its long and its short edge."""
+    a, b, c = corners
+    top, bottom = _extent(a, b, c)
+    top, middle, bottom = (_unpacked(corner) for corner in (top, a + b + c - top - bottom, bottom))
+    rows = [_center(corner[1], height) for corner in (top, middle, bottom)]
+    short = [torch.cat(pair) for pair in zip(_edge(top, middle), _edge(middle, bottom), strict=True)]
+    first, count = torch.cat(rows[:2]), torch.cat([rows[1] - rows[0], rows[2] - rows[1]])
+    return [first, count, *(t.repeat(2) for t in _edge(top, bottom)), *short]
 
-    A center at k + ½ lies inside when dx·(Y - a_y) - dy·(256k + 128 - a_x) ≥ t for all edges, t = 0 on top and left
-    edges, else 1. All terms are integers below 2^53, so that a float64 quotient has the right floor.
+
+def _edge(upper: tuple[Tensor, Tensor], lower: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """(n, k, d): in row y the first pixel center right of the edge, or on it, is pixel ceil((n + k y) / d).
+
+    All are integers below 2^53, so that the float64 quotient has the right ceiling.
     """
-    triangle = torch.repeat_interleave(torch.arange(len(rows), device=rows.device), rows[:, 1])
-    start = rows[:, 1].cumsum(0) - rows[:, 1]
-    y = rows[triangle, 0] + torch.arange(len(triangle), device=rows.device) - start[triangle]
-    center_y = (y * SUBPIXELS + SUBPIXELS // 2).double()
-    x0, x1 = torch.zeros_like(center_y), torch.full_like(center_y, width - 1)
-    half = SUBPIXELS // 2
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        a, b = snapped[:, i], snapped[:, j]
-        dx, dy = (b - a).unbind(-1)
-        threshold = 1 - ((dy < 0) | ((dy == 0) & (dx > 0))).double()
-        # the part of the inequality that a row does not change, per triangle
-        fixed = -dx * a[:, 1] - threshold - dy * (half - a[:, 0])
-        slope = dy[triangle]
-        n = dx[triangle] * center_y + fixed[triangle]
-        bound = n / (SUBPIXELS * slope)
-        x1 = torch.where(slope > 0, torch.minimum(x1, bound.floor()), x1)
-        x0 = torch.where(slope < 0, torch.maximum(x0, bound.ceil()), x0)
-        x1 = torch.where((slope == 0) & (n < 0), -1.0, x1)
-    keep = (x0 <= x1).nonzero()[:, 0]
-    first = x0[keep].long()
-    return triangle[keep], y[keep], first, x1[keep].long() - first + 1
+    (ax, ay), (bx, by) = upper, lower
+    dx, dy, half = bx - ax, by - ay, SUBPIXELS // 2
+    return ((ax - half) * dy - dx * (ay - half)).double(), (dx * SUBPIXELS).double(), (dy * SUBPIXELS).double()
 
 
-def _resolve(pixel: Tensor, face: Tensor, rows: Tensor, det: Tensor, shape: tuple[int, int, int]) -> Fragments:
-    """Barycentrics, their screen derivatives and depth at the pixels' winning faces."""
-    views, height, width = shape
-    view, y, x = pixel // (height * width), pixel // width % height, pixel % width
-    of = view * (len(rows) // views) + face
-    e_dx, e_dy, e_0 = rows.index_select(0, of).unbind(-1)  # e(x, y) = e_dx x + e_dy y + e_0, P×3 each
-    e = e_dx * (x + 0.5)[:, None] + e_dy * (y + 0.5)[:, None] + e_0
-    scale = 1 / (e[:, 0] + e[:, 1] + e[:, 2])  # 1 / Σe
-    barycentric = (e * scale[:, None]).float()
-    # d(e/Σe) = de/Σe - e/Σe · Σde/Σe
-    d = [(k * scale[:, None]).float() for k in (e_dx, e_dy)]
-    dx, dy = (k - barycentric * (k[:, 0] + k[:, 1] + k[:, 2])[:, None] for k in d)
-    volume = det.index_select(0, of)
-    return Fragments(pixel, view, face, barycentric, dx, dy, (volume * scale).float(), volume < 0, shape)
+def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[Tensor, ...]:
+    """Of each row of the trapezoids: pixel count, first pixel, 1/z there, its change per pixel, and the face key."""
+    first, count, *edges = trapezoids
+    owner = torch.repeat_interleave(count)
+    row = _ramp(count, first, owner)
+    y = row.double()
+    n, k, d, *short = (t.index_select(0, owner) for t in edges)
+    x0, x1 = (n.addcmul_(k, y).div_(d).ceil_().clamp_(0, width) for n, k, d in ((n, k, d), short))
+    length = (x1 - x0).abs_().long()
+    keep = length.nonzero()[:, 0]
+    owner, row, length = (t.index_select(0, keep) for t in (owner, row, length))
+    x = torch.minimum(x0, x1).index_select(0, keep)
+    a, b, c, first_pixel, face_key = (t.index_select(0, owner) for t in owners)
+    inverse = c + a * (x + 0.5) + b * (row + 0.5)
+    return length, first_pixel + row * width + x.long(), inverse, a, face_key
+
+
+def _ramp(count: Tensor, first: Tensor, owner: Tensor) -> Tensor:
+    """first, first + 1, ... for each owner, `count` of them."""
+    shift = first - count.cumsum(0) + count
+    return torch.arange(len(owner), device=owner.device).add_(shift.index_select(0, owner))
+
+
+def _fill(nearest: Tensor, length: Tensor, pixel: Tensor, inverse: Tensor, slope: Tensor, face_key: Tensor) -> None:
+    """Settle the nearest face of every pixel of these spans."""
+    for part in _chunks(length):
+        count, first = length[part], pixel[part]
+        owner = torch.repeat_interleave(count)
+        step = _ramp(count, torch.zeros_like(count), owner)
+        value = inverse[part].index_select(0, owner).addcmul_(slope[part].index_select(0, owner), step)
+        # bits of positive floats order like the numbers; beyond its horizon a face is far away
+        key = value.clamp_min_(1e-30).view(torch.int64).bitwise_and_(~_FACE_MASK)
+        key.bitwise_or_(face_key[part].index_select(0, owner))
+        nearest.scatter_reduce_(0, step.add_(first.index_select(0, owner)), key, "amax")
+
+
+def _allocated(nearest: Tensor, shape: tuple[int, int, int]) -> Fragments:
+    """Fragments that know their pixels and faces, with room for the rest: joining pieces would need it twice."""
+    pixel = nearest.nonzero()[:, 0]
+    face = nearest.index_select(0, pixel).bitwise_and_(_FACE_MASK).neg_().add_(_FACE_MASK)
+    depth, front = (torch.empty_like(pixel, dtype=dtype) for dtype in (torch.float32, torch.bool))
+    return Fragments(
+        pixel, face, depth.new_empty(len(pixel), 3), depth, front, torch.empty_like(pixel), depth.new_empty(6, 0), shape
+    )
+
+
+def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, view0: int, near: float) -> Tensor:
+    """Fill in one part of the fragments, all within the views of `points`; returns the slopes of the faces seen."""
+    _, height, width = fragments.shape
+    at = fragments.pixel[part].double()
+    row = (at / width).floor_()
+    view = (row / height).floor_()
+    x, y = at.sub_(row, alpha=width).add_(0.5), row.sub_(view, alpha=height).add_(0.5)
+    pair = view.long().sub_(view0).mul_(len(faces)).add_(fragments.face[part])
+    owner, seen = _ranked(pair, points.shape[1] * len(faces))
+    corners = _taken(points, [i.index_select(0, owner) for i in _corner_index(points, faces)])
+    planes, volume = _planes(corners, near)
+    second, third, inverse = (_at_center(plane, seen, x, y) for plane in planes)
+    # a center may lie up to 1/362 pixel outside of the unsnapped face, which near its horizon is far away
+    deepest = max(float(corner[2].max()) for corner in corners)
+    z = inverse.clamp_(0.5 / deepest, 1 / near).reciprocal_()
+    second, third = second.mul_(z), third.mul_(z)
+    fragments.barycentric[part] = _columns(1 - second - third, second, third)
+    fragments.depth[part] = z
+    fragments.front[part] = (volume < 0).index_select(0, seen)
+    fragments.seen[part] = seen
+    return torch.stack([t for plane in planes for t in plane[:2]]).float()
+
+
+def _columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """P×3 float32; `torch.stack` takes four times as long for columns this narrow."""
+    out = torch.empty(len(a), 3, device=a.device)
+    out[:, 0], out[:, 1], out[:, 2] = a, b, c
+    return out
+
+
+def _ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
+    """The distinct values below `limit`, ascending, and where each value lies among them; `unique` would sort."""
+    present = torch.zeros(limit, dtype=torch.bool, device=values.device).index_fill_(0, values, True)
+    distinct = present.nonzero()[:, 0]
+    rank = torch.empty(limit, dtype=torch.int64, device=values.device)
+    rank[distinct] = torch.arange(len(distinct), device=values.device)
+    return distinct, rank.index_select(0, values)
+
+
+def _at_center(plane: list[Tensor], seen: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    a, b, c = (t.index_select(0, seen) for t in plane)
+    return c.addcmul_(a, x).addcmul_(b, y)
 
 
 def _chunks(sizes: Tensor):

@@ -51,6 +51,17 @@ class Conditions:
     jpeg: np.ndarray  # quality
     print_draw: np.ndarray  # N×3 in [0, 1): print-to-print variation
     noise_seed: np.ndarray  # int64
+    point: np.ndarray  # a lamp's light on the patch's middle where it faces the lamp
+    point_azimuth_deg: np.ndarray
+    point_elevation_deg: np.ndarray
+    point_distance_mm: np.ndarray  # from the patch's middle
+    sh2: np.ndarray  # standard deviation of the ambient light over directions, share of its mean
+    sh2_coefficients: np.ndarray  # N×8 standard normal, as `channel.light` orders them: alike in all directions
+    gloss: np.ndarray
+    shininess: np.ndarray
+    motion_px: np.ndarray  # length at the photograph's full size
+    motion_deg: np.ndarray  # in [0, 180), counter-clockwise from the picture's x
+    vignetting: np.ndarray  # share of the light lost in the photograph's corners
 
     def __len__(self) -> int:
         return len(self.azimuth_deg)
@@ -60,7 +71,10 @@ class Conditions:
         return replace(self, **{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
-_DIMENSIONS = 26
+_POSES = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background")
+_DIMENSIONS = 43
+# Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
+_NORMAL_MARGIN = 1e-3
 
 
 def draw(settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0) -> Conditions:
@@ -68,6 +82,16 @@ def draw(settings: SceneSettings, stream: Stream, n: int, seed: int, start: int 
     number = _STREAMS.index(stream)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, number])))
     return _from_unit(settings, _unit(stream, rng, start + n)[start:], seed * len(_STREAMS) + number, start)
+
+
+def with_poses_of(conditions: Conditions, poses: Conditions) -> Conditions:
+    """`conditions` seen from the cameras and before the backgrounds of `poses`, row by row.
+
+    What was rasterized for `poses` serves for the result, too: light, print and camera need no rasterizing.
+    """
+    if len(conditions) != len(poses):
+        raise ValueError(f"{len(conditions)} conditions cannot take the poses of {len(poses)}")
+    return replace(conditions, **{name: getattr(poses, name) for name in _POSES})
 
 
 def _unit(stream: Stream, rng: np.random.Generator, n: int) -> np.ndarray:
@@ -101,4 +125,15 @@ def _from_unit(settings: SceneSettings, u: np.ndarray, salt: int, start: int) ->
     printed = np.stack([next(column) for _ in range(3)], 1)
     # each view's noise is its own, whatever batch it is rendered in
     noise_seed = (salt * 1_000_003 + start + np.arange(len(u))).astype(np.int64)
-    return Conditions(*pose, offset, *lights, background, exposure, gains, blur, noise, jpeg, printed, noise_seed)
+    point = [within(r) for r in (light.point, LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, light.point_distance_mm)]
+    uneven = [within(light.sh2), _normal(np.stack([next(column) for _ in range(8)], 1))]
+    gloss = [within(light.gloss), within(light.shininess)]
+    motion = [within(camera.motion_px), within((0.0, 180.0))]
+    everyday = (*pose, offset, *lights, background, exposure, gains, blur, noise, jpeg, printed, noise_seed)
+    return Conditions(*everyday, *point, *uneven, *gloss, *motion, within(camera.vignetting))
+
+
+def _normal(u: np.ndarray) -> np.ndarray:
+    from scipy.special import ndtri
+
+    return ndtri(_NORMAL_MARGIN + (1 - 2 * _NORMAL_MARGIN) * u)

@@ -1,9 +1,8 @@
 """Where the paper lies: a flat rigid card that touches the highest surface points under it.
 
-In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Card` with the piece's frame in the
-world, and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and
-shares. A card wider or higher than the object's side, or with nothing under it, is refused. Left out here on purpose:
-bent pieces.
+In: a mesh (world mm), a named side or a point, a spin and the piece's size. Out: a `Placement`: the piece in the world,
+and how well paper and surface agree: the gap below the card and the overhang beyond the object, in mm and shares. A
+card wider or higher than the object's side, or with nothing under it, is refused. Bent pieces: see `bend`.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.scene.mesh import Mesh
+from patchproof.scene.surface import Chart, heights
 from patchproof.settings import PatchSettings, Refused
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
@@ -32,24 +32,44 @@ _SIDES = {  # side: (up, normal); right is up × normal
 
 
 @dataclass(frozen=True)
-class Card:
-    """A flat piece: `world_from_piece` 4×4 (piece mm: x right, y down from its top-left corner, z into the object)."""
+class Placement:
+    """A piece on its place. Piece millimetres: from its top-left corner, x right, y down."""
 
-    world_from_piece: np.ndarray
+    family: str  # "card", "cylinder" or "exponential"
     size_mm: tuple[float, float]
-    gap_mm: float  # largest distance from card to surface where there is surface
+    vertices_mm: np.ndarray  # float64 V×3 in the world: a card's corners clockwise from top-left, else a grid by rows
+    faces: np.ndarray  # int64 F×3, counter-clockwise as one faces the printed side
+    piece_mm: np.ndarray  # V×2: where each vertex lies on the flat piece
+    normals: np.ndarray  # V×3 unit, out of the printed face
+    world_from_piece: np.ndarray  # 4×4, z into the object: the card's frame, or the bent piece's tangent at its middle
+    gap_mm: float  # largest distance from the piece to the surface where there is surface
     gap_mean_mm: float
-    overhang_share: float  # of the card's area with no object under it
+    overhang_share: float  # of the piece's area with no object under it
+    stretch: float  # largest relative change of length on the surface against the sheet
+    reason: str
     warnings: tuple[str, ...] = ()
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
-        """World millimetres N×3 of piece points N×2."""
+        """World millimetres N×3 of piece points N×2; bilinear between a bent piece's vertices."""
         frame = self.world_from_piece
-        return points_mm @ frame[:3, :2].T + frame[:3, 3]
+        if self.is_flat:
+            return points_mm @ frame[:3, :2].T + frame[:3, 3]
+        xs, ys = (np.unique(self.piece_mm[:, i]) for i in range(2))
+        grid = self.vertices_mm.reshape(len(ys), len(xs), 3)
+        column, u = _cells(xs, points_mm[:, 0])
+        row, v = _cells(ys, points_mm[:, 1])
+        upper = grid[row, column] * (1 - u) + grid[row, column + 1] * u
+        lower = grid[row + 1, column] * (1 - u) + grid[row + 1, column + 1] * u
+        return upper * (1 - v) + lower * v
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the piece is a plane, so that its picture is a homography of the sheet."""
+        return self.family == "card"
 
     @property
     def normal(self) -> np.ndarray:
-        """Unit vector out of the paper's face."""
+        """Unit vector out of the paper's face, at the piece's middle."""
         return -self.world_from_piece[:3, 2]
 
     @property
@@ -89,33 +109,68 @@ def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:
     return Frame(right, up, normal, origin, extent)
 
 
-def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Card:
+def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
     """Lay a card of `size_mm` on the surface, its middle at the frame's origin; spin turns it clockwise as one faces
-    it.
+    it. Refused where it is larger than the object's side.
+    """
+    refuse_larger_than_side(size_mm, spin_deg, frame.extent_mm)
+    return lay_card(mesh.vertices[mesh.faces], frame, size_mm, spin_deg)
+
+
+def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reach_mm: float = np.inf) -> Placement:
+    """`place_card` on triangles F×3×3, however large the card; surface farther than `reach_mm` from the frame's plane
+    does not count.
     """
     width, height = size_mm
-    c, s = np.cos(np.radians(spin_deg)), np.sin(np.radians(spin_deg))
-    right, up = c * frame.right - s * frame.up, s * frame.right + c * frame.up
-    _refuse_larger_than_side(size_mm, abs(c), abs(s), frame.extent_mm)
-    local = (mesh.vertices - frame.origin_mm) @ np.stack([right, up, frame.normal], 1)
-    heights = _heights(local, mesh.faces, size_mm)
-    seen = np.isfinite(heights)
+    right, up = spun(frame, spin_deg)
+    chart = Chart(frame.origin_mm, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
+    surface = heights(chart, triangles, size_mm, GRID, (-reach_mm, reach_mm))
+    seen = np.isfinite(surface)
     if not seen.any():
         raise Refused("a patch that lies on the object", "no surface under it", "change offset_mm or at_mm")
-    inside = (np.abs(local[:, 0]) <= width / 2) & (np.abs(local[:, 1]) <= height / 2)
-    # a surface behind the object's middle is its far side seen past an edge, not what the card rests on
-    top = max(heights[seen].max(), local[inside, 2].max(initial=-np.inf))
-    gaps = top - heights[seen]
+    # peaks are at corners, which the net may miss
+    peaks = chart.local(triangles.reshape(-1, 3))
+    inside = (np.abs(peaks) <= [width / 2, height / 2, reach_mm]).all(1)
+    top = max(surface[seen].max(), peaks[inside, 2].max(initial=-np.inf))
+    gaps = top - surface[seen]
     center = frame.origin_mm + frame.normal * (top + LIFT_MM)
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, -up, -frame.normal
     pose[:3, 3] = center - right * width / 2 + up * height / 2
-    gap, mean, overhang = float(gaps.max()), float(gaps.mean()), float(1 - seen.mean())
-    return Card(pose, (width, height), gap, mean, overhang, _warnings(gap, overhang, size_mm))
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+    gap, overhang = float(gaps.max()), float(1 - seen.mean())
+    return Placement(
+        family="card",
+        size_mm=(width, height),
+        vertices_mm=corners @ pose[:3, :2].T + pose[:3, 3],
+        faces=np.array([(0, 3, 2), (0, 2, 1)]),
+        piece_mm=corners,
+        normals=np.tile(frame.normal, (4, 1)),
+        world_from_piece=pose,
+        gap_mm=gap,
+        gap_mean_mm=float(gaps.mean()),
+        overhang_share=overhang,
+        stretch=0.0,
+        reason=f"a flat card stands at most {gap:.1f} mm off the surface",
+        warnings=placement_warnings(gap, overhang, size_mm),
+    )
 
 
-def _refuse_larger_than_side(size_mm, c: float, s: float, extent_mm) -> None:
+def spun(frame: Frame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """The piece's right and up in the world."""
+    c, s = np.cos(np.radians(spin_deg)), np.sin(np.radians(spin_deg))
+    return c * frame.right - s * frame.up, s * frame.right + c * frame.up
+
+
+def _cells(knots: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The cell of sorted knots that each value lies in (the nearest one outside), and where in it, N×1."""
+    cell = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    return cell, ((at - knots[cell]) / (knots[cell + 1] - knots[cell]))[:, None]
+
+
+def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, extent_mm) -> None:
     """A card may not reach beyond the object's outline; 0.5 % of slack for rounded figures."""
+    c, s = abs(np.cos(np.radians(spin_deg))), abs(np.sin(np.radians(spin_deg)))
     width, height = size_mm
     across, along = c * width + s * height, s * width + c * height
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
@@ -126,52 +181,16 @@ def _refuse_larger_than_side(size_mm, c: float, s: float, extent_mm) -> None:
         )
 
 
-def _warnings(gap: float, overhang: float, size_mm) -> tuple[str, ...]:
+def placement_warnings(gap: float, overhang: float, size_mm) -> tuple[str, ...]:
+    """What a user should hear about a gap in mm and an overhang as a share."""
     notes = []
     if gap > WARN_GAP_SHARE * min(size_mm):
         notes.append(
-            f"the card stands up to {gap:.0f} mm ({gap / min(size_mm):.0%} of its shorter edge) off the surface"
+            f"the piece stands up to {gap:.0f} mm ({gap / min(size_mm):.0%} of its shorter edge) off the surface"
         )
     if overhang > WARN_OVERHANG_SHARE:
-        notes.append(f"{overhang:.0%} of the card overhangs the object")
+        notes.append(f"{overhang:.0%} of the piece overhangs the object")
     return tuple(notes)
-
-
-def _heights(local: np.ndarray, faces: np.ndarray, size_mm) -> np.ndarray:
-    """The highest surface above each point of a GRID×GRID net over the card, -inf → NaN where there is none.
-
-    Each triangle visits the net points of its bounding box only, so that work follows what lies under the card.
-    """
-    width, height = size_mm
-    step = np.array([width, height]) / (GRID - 1)
-    corners = local[faces]
-    xy = (corners[..., :2] + np.array([width, height]) / 2) / step  # net units
-    low = np.maximum(np.ceil(xy.min(1)), 0).astype(np.int64)
-    high = np.minimum(np.floor(xy.max(1)), GRID - 1).astype(np.int64)
-    (a, b), (c, d) = (xy[:, 1] - xy[:, 0]).T, (xy[:, 2] - xy[:, 0]).T
-    # a triangle seen edge-on covers nothing; its neighbors have its edges
-    hit = np.flatnonzero((low <= high).all(1) & (np.abs(a * d - b * c) > 1e-9))
-    low, high, xy, z = low[hit], high[hit], xy[hit], corners[hit, :, 2]
-    across = high[:, 0] - low[:, 0] + 1
-    cells = across * (high[:, 1] - low[:, 1] + 1)
-    net = np.full(GRID * GRID, -np.inf)
-    for part in np.array_split(np.arange(len(hit)), max(1, int(cells.sum() // 2_000_000))):
-        owner = np.repeat(part, cells[part])
-        k = np.arange(len(owner)) - np.repeat(np.cumsum(cells[part]) - cells[part], cells[part])
-        x, y = low[owner, 0] + k % across[owner], low[owner, 1] + k // across[owner]
-        weights = _barycentric(xy[owner], x, y)
-        inside = (weights >= -1e-9).all(1)
-        np.maximum.at(net, (y * GRID + x)[inside], (weights * z[owner]).sum(1)[inside])
-    return np.where(np.isfinite(net), net, np.nan)
-
-
-def _barycentric(triangle: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Barycentrics P×3 of points in triangles P×3×2 that have an area."""
-    a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    wb = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (y - a[:, 1]) * (c[:, 0] - a[:, 0])) / area
-    wc = ((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0])) / area
-    return np.stack([1 - wb - wc, wb, wc], 1)
 
 
 def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

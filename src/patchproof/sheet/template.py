@@ -66,6 +66,13 @@ class PageMarkers(Strict):
     corners_mm: Annotated[tuple[Point, ...], Field(min_length=2)]
 
 
+class BlankPiece(Strict):
+    """The piece of a page that is printed without a design, before there is a scene."""
+
+    design_mm: tuple[Positive, Positive]
+    marker_mm: Annotated[Positive, Field(ge=8)]  # of the frame; smaller ones are lost in photographs
+
+
 class TextLine(Strict):
     """One line of text; {sheet_id}, {kind}, {design} and {piece} are filled in; gray 0 is black."""
 
@@ -87,6 +94,7 @@ class Template(Strict):
     card: CardOutline
     qr: QrCode
     marker: PageMarkers
+    blank: BlankPiece | None = None
     text: tuple[TextLine, ...] = ()
 
 

@@ -20,12 +20,16 @@ import torch
 from PIL import Image
 
 from patchproof import geometry
+from patchproof.channel import lens
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.optimize.run import Run
 from patchproof.output import new_folder
-from patchproof.render.photograph import PiecePicture, Stage, photograph, set_stage
+from patchproof.render.photograph import photograph
+from patchproof.render.stage import Stage, set_stage
+from patchproof.render.views import PiecePicture
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import MeshScene, build_scene
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import Scene, build_scene
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
@@ -126,7 +130,7 @@ def scan(
     return truth
 
 
-def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, MeshScene]:
+def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     """A sheet's manifest and the scene with its template's frame; refused where the sheet is not of this run."""
     manifest = attached_manifest(pdf_path)
     settings, scene = run.scene.settings, run.scene
@@ -143,24 +147,30 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, MeshScene]:
     return manifest, scene
 
 
-def printed_piece(pdf_path: str | Path, manifest: Manifest, scene: MeshScene, printer: Printer) -> PiecePicture:
+def printed_piece(pdf_path: str | Path, manifest: Manifest, scene: Scene, printer: Printer) -> PiecePicture:
     """The piece of a PDF as this printer shows it, with more pixels than the closest view can see."""
-    view = scene.settings.view
-    closest_mm = max(view.distance_mm[0] - float(np.linalg.norm(scene.card.center_mm)), view.distance_mm[0] / 4)
-    finest = scene.matrix_px(scene.settings.camera.photo_px)[0, 0] / closest_mm  # px per mm
+    finest = scene.closest_px_per_mm(scene.settings.camera.photo_px)
     dpi = float(np.clip(OVERSAMPLING * finest * 25.4, *DPI_RANGE))
     pixels = torch.tensor(piece_pixels(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
     printed = printer.apply(pixels)[0].permute(1, 2, 0)
-    return PiecePicture(printed, (0, 0, printed.shape[1], printed.shape[0]))
+    whole = (0, 0, printed.shape[1], printed.shape[0])
+    return PiecePicture(printed, whole, whole)
 
 
-def scaled_print(scene: MeshScene, print_scale: tuple[float, float]) -> MeshScene:
+def scaled_print(scene: Scene, print_scale: tuple[float, float]) -> Scene:
     """The scene with a piece printed larger or smaller, hung up at the same middle; piece mm stay the sheet's own."""
-    middle = np.array(scene.card.size_mm) / 2
+    if print_scale == (1.0, 1.0):
+        return scene
+    if not isinstance(scene, MeshScene):
+        raise Refused("a scene with a mesh for a print of another size", "one of pictures", "leave --print-scale out")
+    placement, scale = scene.placement, np.array(print_scale)
+    middle = np.array(placement.size_mm) / 2
     about = np.eye(4)
-    about[[0, 1], [0, 1]] = print_scale
-    about[:2, 3] = middle - np.array(print_scale) * middle
-    return replace(scene, card=replace(scene.card, world_from_piece=scene.card.world_from_piece @ about))
+    about[[0, 1], [0, 1]] = scale
+    about[:2, 3] = middle - scale * middle
+    vertices = placement.world(middle + (placement.piece_mm - middle) * scale)
+    frame = placement.world_from_piece @ about
+    return replace(scene, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
 
 
 def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions, path: Path) -> None:
@@ -168,32 +178,53 @@ def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions,
     photo_px = stage.scene.settings.camera.photo_px
     with torch.no_grad():
         picture = photograph(stage, piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0).cpu().numpy()
-    focal_px = stage.scene.matrix_px(photo_px)[0, 0]
     exif = Image.Exif()
-    details = exif.get_ifd(0x8769)
-    details[0xA405] = round(focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
+    if isinstance(stage.scene, MeshScene):  # of pictures nobody knows the focal length
+        focal_px = stage.scene.matrix_px(photo_px)[0, 0]
+        details = exif.get_ifd(0x8769)
+        details[0xA405] = round(focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
     Image.fromarray(_bytes(picture)).save(path, "JPEG", quality=int(conditions.jpeg[0]), exif=exif)
 
 
-def _truth(scene: MeshScene, manifest: Manifest | None, conditions: Conditions, print_scale) -> dict:
+def _truth(scene: Scene, manifest: Manifest | None, conditions: Conditions, print_scale) -> dict:
     """Where the page's millimetres fall in this photograph, and what it was taken under."""
     drawn = {field.name: np.asarray(getattr(conditions, field.name)[0]).tolist() for field in fields(conditions)}
     drawn["print_scale"] = list(print_scale)
     if manifest is None:
         return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
-    x, y, *_ = manifest.cut_mm
-    piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
-    homography = scene.piece_homographies(conditions, scene.settings.camera.photo_px)[0] @ piece_from_page
+    on_piece = [marker for marker in manifest.markers if _within(np.array(marker.corners_mm), manifest.cut_mm)]
+    homography = _homography(scene, manifest, conditions)
     corners = {
-        str(marker.id): geometry.apply_homography(homography, marker.corners_mm).tolist()
-        for marker in manifest.markers
-        if _within(np.array(marker.corners_mm), manifest.cut_mm)
+        str(marker.id): _seen_at(scene, manifest, conditions, np.array(marker.corners_mm)).tolist()
+        for marker in on_piece
     }
     return {
-        "homography_px_from_mm": geometry.normalized(homography).tolist(),
+        "homography_px_from_mm": None if homography is None else geometry.normalized(homography).tolist(),
         "marker_corners_px": corners,
         "conditions": drawn,
     }
+
+
+def _homography(scene: Scene, manifest: Manifest, conditions: Conditions) -> np.ndarray | None:
+    """3×3 from page millimetres to pixels; None where the piece or the lens bends, and there is no such thing."""
+    if isinstance(scene, MeshScene) and not (
+        scene.placement.is_flat and (scene.camera is None or not scene.camera.bends)
+    ):
+        return None
+    x, y, *_ = manifest.cut_mm
+    piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+    return scene.piece_homographies(conditions, scene.settings.camera.photo_px)[0] @ piece_from_page
+
+
+def _seen_at(scene: Scene, manifest: Manifest, conditions: Conditions, page_mm: np.ndarray) -> np.ndarray:
+    """Pixels N×2 of page points N×2, through bent paper and a bent picture, too."""
+    homography, photo_px = _homography(scene, manifest, conditions), scene.settings.camera.photo_px
+    if homography is not None:
+        return geometry.apply_homography(homography, page_mm)
+    pose, world = scene.camera_from_world(conditions)[0], scene.placement.world(page_mm - manifest.cut_mm[:2])
+    image = (world @ pose[:3, :3].T + pose[:3, 3]) @ scene.matrix_px(photo_px).T
+    points = image[:, :2] / image[:, 2:]
+    return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
 
 
 def _printer(run: Run, name: str | None) -> Printer:

@@ -13,6 +13,7 @@ from patchproof.optimize.problem import set_problem
 from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
 from patchproof.optimize.run import Run
 from patchproof.scene.scene import build_scene
+from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.piece import MODULES, control_design, lay_out_piece
 from patchproof.sheet.template import load_template
@@ -25,6 +26,10 @@ def sheet_of(run: Run, pdf_path: str | Path, *, template: str | None = None, con
     """
     scene, promise = run.scene, run.promise
     settings = scene.settings
+    if scene.piece is None:
+        raise Refused(
+            "a run of a patch", "one of the object's own texture", "take object.glb and textures from the run"
+        )
     if template is not None and template != settings.sheet.template:
         settings = settings.model_copy(update={"sheet": settings.sheet.model_copy(update={"template": template})})
         scene = build_scene(settings, scene.base, scene.seed)
@@ -34,8 +39,7 @@ def sheet_of(run: Run, pdf_path: str | Path, *, template: str | None = None, con
     kind = control or "design"
     piece = scene.piece
     if control is not None:
-        design_mm = (settings.patch.width_mm, settings.patch.height_mm)
-        piece = lay_out_piece(design_mm, scene.piece.module_mm * MODULES, scene.sheet_id, kind)
+        piece = lay_out_piece(piece.design_rect_mm[2:], scene.piece.module_mm * MODULES, scene.sheet_id, kind)
     pixels = run.design if control is None else control_design(kind, run.design, scene.sheet_id)
     return write_sheet(
         pdf_path,

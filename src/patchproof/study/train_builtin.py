@@ -26,11 +26,12 @@ from torch import Tensor
 
 from patchproof.classifier.builtin import INPUT_PX, SmallNetwork, folded
 from patchproof.classifier.view import center_square
-from patchproof.render.photograph import photograph, set_stage
+from patchproof.render.photograph import photograph
+from patchproof.render.stage import set_stage
 from patchproof.scene import primitives
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.mesh import Mesh
-from patchproof.scene.scene import bare_scene
+from patchproof.scene.mesh_scene import bare_scene
 from patchproof.settings import SceneSettings, validated
 from patchproof.study import patterns
 

@@ -1,0 +1,58 @@
+"""The object with its textures as one GLB file that other programs open.
+
+In: a mesh and one uint8 sRGB texture per material. Out: glTF 2.0, in metres as its specification wants (the mesh is in
+millimetres), y up, textures as lossless PNG inside, repeating. trimesh writes it; nothing in it depends on the time, so
+the same textures give the same bytes. Surfaces are matte, and seen from both sides as the renderer here sees them.
+Left out on purpose: the piece, lights and cameras. Material names are kept and may repeat; geometries are numbered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.scene.mesh import Mesh
+
+_M_FROM_MM = 1e-3
+
+
+def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path) -> None:
+    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file.
+
+    Textures stand for the whole color: base colors are not written; corner colors
+    other than 1 are, in 8 bits of linear light.
+    """
+    import trimesh
+
+    scene = trimesh.Scene()
+    for index, (material, texture) in enumerate(zip(mesh.materials, textures, strict=True)):
+        faces = np.flatnonzero(mesh.face_material == index)
+        if len(faces):
+            scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
+    Path(path).write_bytes(scene.export(file_type="glb", include_normals=True))
+
+
+def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
+    """Some faces as a trimesh, corners that agree in everything made one vertex."""
+    import trimesh
+    from PIL import Image
+
+    arrays = [
+        mesh.vertices[mesh.faces[faces]] * _M_FROM_MM,
+        mesh.corner_normal[faces],
+        mesh.corner_uv[faces],
+        mesh.corner_color_linear[faces],
+    ]
+    corners = np.concatenate([np.asarray(array, float).reshape(3 * len(faces), -1) for array in arrays], axis=1)
+    corners, index = np.unique(corners, axis=0, return_inverse=True)
+    position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
+    material = trimesh.visual.material.PBRMaterial(
+        name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    visual = trimesh.visual.TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    if (color != 1).any():
+        # trimesh writes bytes, whatever it is given
+        visual.vertex_attributes["color"] = np.rint(255 * np.insert(color, 3, 1.0, axis=1)).astype(np.uint8)
+    return trimesh.Trimesh(position, index.reshape(-1, 3), vertex_normals=normal, visual=visual, process=False)

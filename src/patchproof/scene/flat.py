@@ -1,0 +1,196 @@
+"""What scenes made of pictures share: photographs of an object (`photo_scene`) and folders of images (`image_scene`).
+
+Neither has a mesh. A view is a base picture carried onto the scene's photograph, and a homography that says where the
+piece lies in it. Pictures of any size become `photo_px` so that their *centered squares* agree, since the centered
+square is what classifiers see; beyond it a longer picture is cropped and a shorter one has its edge repeated. A square
+`size_px` asks for that centered square alone, any other for the whole photograph.
+Left out on purpose: what lies in front of the piece (a hand, a handle); the new piece covers it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from patchproof.geometry import local_scale
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.settings import Refused, SceneSettings
+from patchproof.sheet.piece import MODULES, Piece
+
+VIEWS_TRIED = 256  # for figures over a scene's views
+
+
+class FlatScene(Protocol):
+    """What render, optimize and study ask of a scene without a mesh; N is the number of conditions."""
+
+    settings: SceneSettings
+    base: Path
+    seed: int
+    sheet_id: str
+    piece: Piece
+    warnings: tuple[str, ...]
+    unreadable_share: float
+    photo_px: tuple[int, int]
+
+    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
+        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
+
+    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×3×3 from piece millimetres to pixels."""
+
+    def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×H×W×3 uint8 sRGB: what the views show without the new piece, before exposure and the camera's effects."""
+
+    def piece_light(self, conditions: Conditions) -> np.ndarray:
+        """N×3×6: linear light of white paper is coefficients · [1, u, v, u², uv, v²], u and v from -1 to 1 over the
+        piece, right and down.
+        """
+
+    def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
+        """N Gaussian sigmas of the base pictures' own blur, in pixels of the whole photograph."""
+
+    def piece_noise(self, conditions: Conditions) -> np.ndarray:
+        """N standard deviations of the base pictures' own noise, at white, in linear light of the whole photograph."""
+
+    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
+        """N NaN: a picture without a known camera does not say from where it was taken."""
+
+    def white_light(self, conditions: Conditions) -> np.ndarray:
+        """N: the light on white paper at the piece's middle."""
+
+    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
+        """Pixels per millimetre of the piece in the closest view."""
+
+    def design_px(self, network_px: int) -> tuple[int, int]:
+        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A base picture, uint8 H×W×3 sRGB, no larger than the photograph that it becomes."""
+
+    srgb: np.ndarray
+
+    @cached_property
+    def levels(self) -> tuple[np.ndarray, ...]:
+        """The picture and its halvings, so that a small view does not read megapixels."""
+        import cv2
+
+        levels = [self.srgb]
+        while min(levels[-1].shape[:2]) >= 256:
+            height, width = levels[-1].shape[:2]
+            levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+        return tuple(levels)
+
+
+def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[Picture, np.ndarray]:
+    """The picture, reduced where its shorter side is longer than the photograph's, and `photo_from_picture` 3×3 (from
+    pixels of `srgb`).
+    """
+    import cv2
+
+    height, width = srgb.shape[:2]
+    scale = min(photo_px) / min(width, height)
+    size = (width, height)
+    if scale < 1:
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        srgb = cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)
+    return Picture(srgb), photo_from(size, photo_px) @ np.diag([size[0] / width, size[1] / height, 1.0])
+
+
+def photo_from(picture_px: tuple[int, int], photo_px: tuple[int, int]) -> np.ndarray:
+    """3×3 from a picture's pixels to the photograph's: shorter sides and middles agree."""
+    scale = min(photo_px) / min(picture_px)
+    shift = (np.array(photo_px) - scale * np.array(picture_px)) / 2
+    return np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1.0]])
+
+
+def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
+    """3×3 from the photograph's pixels to a view's: the whole of it, or its centered square where `size_px` is
+    square.
+    """
+    if size_px[0] == size_px[1]:
+        return photo_from(photo_px, size_px)
+    return np.diag([size_px[0] / photo_px[0], size_px[1] / photo_px[1], 1.0])
+
+
+def turned(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:
+    """3×3 similarity of a picture whose camera turns clockwise by roll: what it shows turns the other way."""
+    c, s = zoom * np.cos(np.radians(roll_deg)), zoom * np.sin(np.radians(roll_deg))
+    turn = np.array([[c, s], [-s, c]])
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = turn, np.asarray(about_px) + shift_px - turn @ about_px
+    return matrix
+
+
+def show(
+    picture: Picture, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
+) -> np.ndarray:
+    """The picture as uint8 H×W×3 in a view: carried by `view_from_photo` (both in the photograph's pixels), reduced
+    by area, its edge repeated.
+    """
+    import cv2
+
+    fine = 2 if min(size_px) < min(photo_px) else 1  # two samples per pixel each way keep a reduced picture calm
+    size = (fine * size_px[0], fine * size_px[1])
+    height, width = picture.srgb.shape[:2]
+    whole = size_from_photo(photo_px, size) @ view_from_photo @ photo_from((width, height), photo_px)
+    shrunk = picture.levels[0]
+    for level in picture.levels[1:]:
+        # no finer than the samples: a level may lack none of what they can show
+        if abs(np.linalg.det(whole[:2, :2])) ** 0.5 * width / level.shape[1] > 1:
+            break
+        shrunk = level
+    to_level = np.diag([width / shrunk.shape[1], height / shrunk.shape[0], 1.0])
+    # OpenCV counts from pixel centers: its 0 is our .5
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    index_from_size = np.linalg.inv(half) @ np.linalg.inv(whole @ to_level) @ half
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    view = cv2.warpAffine(shrunk, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return view if fine == 1 else cv2.resize(view, size_px, interpolation=cv2.INTER_AREA)
+
+
+def pick(choice: np.ndarray, count: int) -> np.ndarray:
+    """Indices below `count` of numbers in [0, 1)."""
+    return np.minimum((choice * count).astype(np.int64), count - 1)
+
+
+def with_unreadable_share(scene):
+    """The scene with the share of its views in which a module of the piece's markers is under `PX_PER_MODULE` along its
+    foreshortened side, and a warning where that is more than one in twenty.
+    """
+    small = []
+    for homography in scene.piece_homographies(scene.draw("select", VIEWS_TRIED, 0), scene.photo_px):
+        mean, tilt_deg = local_scale(homography, np.array(scene.piece.size_mm) / 2)
+        small.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) * scene.piece.module_mm)
+    share = float((np.array(small) < PX_PER_MODULE * 0.999).mean())
+    warnings = scene.warnings
+    if share > 1 - READABLE_SHARE:
+        marker_mm = scene.piece.module_mm * MODULES
+        warnings += (f"markers of {marker_mm:.1f} mm will be unreadable in {share:.0%} of the views",)
+    return replace(scene, unreadable_share=share, warnings=warnings)
+
+
+def closest_px_per_mm(scene: FlatScene, size_px: tuple[int, int]) -> float:
+    """Pixels per millimetre of the piece in the closest view."""
+    homographies = scene.piece_homographies(scene.draw("select", VIEWS_TRIED, 0), size_px)
+    middle = np.array(scene.piece.size_mm) / 2
+    return max(float(local_scale(homography, middle)[0]) for homography in homographies)
+
+
+def white_light(scene: FlatScene, conditions: Conditions) -> np.ndarray:
+    """N: the light on white paper at the piece's middle, mean of the channels."""
+    return scene.piece_light(conditions)[:, :, 0].mean(1)
+
+
+def refuse_bending(settings: SceneSettings) -> None:
+    """Pictures say nothing of a surface that a piece could bend along."""
+    if settings.patch.bend:
+        raise Refused(
+            "a flat patch where the object is known from pictures alone", "bend = true", "give a mesh instead"
+        )

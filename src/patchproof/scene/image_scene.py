@@ -1,0 +1,270 @@
+"""A scene of images: a piece at a random place, size and angle in pictures of its class, the classic 2D patch.
+
+In: a folder of images and a CSV of file names and labels. Out: `ImageScene`. Only images of the target's class are
+used: an assistive patch helps them, a deceptive one hides them. The whole printed piece lies inside of the centered
+square, turned by `view.roll_deg`, its design as large as `view.patch_share` says. In training, a random box of the
+picture below it may be erased, so that the patch does not lean on one feature. White paper is sRGB white, and nothing
+else is modeled: what is promised holds for a patch pasted into such images, not for a print in the world.
+
+With `SPLIT_FROM` images or more, training and selection see one half and promise, reprint and evaluation the other.
+
+Sources: Brown et al., Adversarial Patch, 2017 (here also with the assistive goal); Zhong et al., Random Erasing Data
+Augmentation, AAAI 2020, algorithm 1.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.read import read_photo
+from patchproof.scene import flat
+from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
+from patchproof.settings import Refused, SceneSettings, expand
+from patchproof.sheet.page import largest_piece_mm
+from patchproof.sheet.piece import (
+    MODULES,
+    SMALLEST_MARKER_MM,
+    Piece,
+    frame_mm,
+    lay_out_piece,
+    marker_size_mm,
+    sheet_id,
+)
+from patchproof.sheet.template import load_template
+
+SPLIT_FROM = 20
+_OPTIMIZED_ON = {"train", "select"}
+ERASED_AREA, ERASED_ASPECT = (0.02, 0.33), (0.3, 3.3)  # shares of the centered square; height over width
+# of the design's longer side: markers that small pictures would need hide more of them than the patch
+_LARGEST_MARKER = 0.2
+_ERASED_CELLS = 224  # random values per side of the centered square: one a pixel at networks' usual size
+
+
+@dataclass(frozen=True)
+class ImageScene:
+    """A `FlatScene` whose base pictures are images of the target's class, in an order that their names decide."""
+
+    settings: SceneSettings
+    base: Path
+    seed: int
+    sheet_id: str
+    piece: Piece
+    images: tuple[flat.Picture, ...]
+    warnings: tuple[str, ...]
+    unreadable_share: float = 0.0
+
+    @property
+    def photo_px(self) -> tuple[int, int]:
+        """Size that images are brought to."""
+        return self.settings.camera.photo_px
+
+    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
+        """Draws of one of the scene's streams: `background[:, 0]` stays in that stream's half of the images, and
+        `background[:, 4]` is 1, which erases nothing, in all but training.
+        """
+        drawn = draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+        background = drawn.background.copy()
+        if len(self.images) >= SPLIT_FROM:
+            middle = (len(self.images) // 2) / len(self.images)
+            low, high = (0.0, middle) if stream in _OPTIMIZED_ON else (middle, 1.0)
+            background[:, 0] = low + (high - low) * background[:, 0]
+        if stream != "train":
+            background[:, 4] = 1.0
+        return replace(drawn, background=background)
+
+    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×3×3 from piece millimetres to pixels."""
+        to_size = flat.size_from_photo(self.photo_px, size_px)
+        side, photo = min(self.photo_px), np.array(self.photo_px)
+        piece_mm = np.array(self.piece.size_mm)
+        matrices = []
+        for scale, roll, place in zip(
+            px_per_mm(self.settings, self.piece, conditions),
+            conditions.roll_deg,
+            conditions.background[:, 2:4],
+            strict=True,
+        ):
+            room = side - _extent(piece_mm * scale, roll)
+            middle = (photo - side) / 2 + side / 2 + (place - 0.5) * room
+            matrices.append(to_size @ flat.turned(roll, scale, middle - piece_mm / 2, piece_mm / 2))
+        return np.stack(matrices)
+
+    def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×H×W×3 uint8 sRGB: the images, some with a box of random values."""
+        chosen = flat.pick(conditions.background[:, 0], len(self.images))
+        shown = [flat.show(self.images[i], np.eye(3), self.photo_px, size_px) for i in chosen]
+        for picture, chance in zip(shown, conditions.background[:, 4], strict=True):
+            if chance < self.settings.background.erasing:
+                erase(picture, int(chance * 2**53))  # its own digits: a view kept for other lights keeps its box
+        return np.stack(shown)
+
+    def piece_light(self, conditions: Conditions) -> np.ndarray:
+        """N×3×6 as in `FlatScene.piece_light`: 1 everywhere."""
+        light = np.zeros((len(conditions), 3, 6))
+        light[..., 0] = 1
+        return light
+
+    def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
+        """No blur: N zeros."""
+        return np.zeros(len(conditions))
+
+    def piece_noise(self, conditions: Conditions) -> np.ndarray:
+        """No noise: N zeros."""
+        return np.zeros(len(conditions))
+
+    def design_px(self, network_px: int) -> tuple[int, int]:
+        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
+        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
+
+    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
+        """Pixels per millimetre of the piece in the closest view."""
+        return flat.closest_px_per_mm(self, size_px)
+
+    def white_light(self, conditions: Conditions) -> np.ndarray:
+        """N: the light on white paper at the piece's middle."""
+        return flat.white_light(self, conditions)
+
+    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
+        """N NaN: nobody knows where the camera stood."""
+        return np.full(len(conditions), np.nan)
+
+
+def load_image_scene(settings: SceneSettings, base: Path, seed: int) -> ImageScene:
+    """The scene of a folder of images and their labels; images that cannot be read are warned about.
+
+    The target's label counts as an image's where it is the CSV's own text, one of its comma-separated names, or the
+    same index, whatever the case; so do the labels in `target.accept`.
+    """
+    flat.refuse_bending(settings)
+    files = _files_of_class(settings, base)
+    images, unread = _read_all(files, settings.camera.photo_px)
+    identity = sheet_id(settings.model_dump(mode="json"), seed)
+    piece = _piece(settings, identity)
+    warnings = [f"{name} is left out: it cannot be read" for name in unread]
+    if len(images) < SPLIT_FROM:
+        warnings.append(f"the promise is made on the same {len(images)} images that the patch is optimized on")
+    return flat.with_unreadable_share(ImageScene(settings, base, seed, identity, piece, images, tuple(warnings)))
+
+
+def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
+    """N scales at `photo_px`: the design's longer side takes the drawn share of the picture's shorter one."""
+    return _shares(settings, conditions) * min(settings.camera.photo_px) / max(piece.design_rect_mm[2:])
+
+
+def erase(picture: np.ndarray, seed: int) -> None:
+    """Random Erasing of a uint8 H×W×3 picture in place: a box of its centered square takes random values, the same box
+    and values at every size, and in photograph and square.
+    """
+    rng = np.random.default_rng(seed)
+    box = _erased_box(rng)
+    values = rng.integers(0, 256, (_ERASED_CELLS, _ERASED_CELLS, 3), np.uint8)
+    height, width = picture.shape[:2]
+    side = min(height, width)
+    x, y = ((np.arange(n) + 0.5 - (n - side) / 2) / side for n in (width, height))
+    columns = np.flatnonzero((x >= box[0]) & (x < box[0] + box[2]))
+    rows = np.flatnonzero((y >= box[1]) & (y < box[1] + box[3]))
+    cell_x, cell_y = ((v * _ERASED_CELLS).astype(int) for v in (x[columns], y[rows]))
+    picture[np.ix_(rows, columns)] = values[np.ix_(cell_y, cell_x)]
+
+
+def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """x, y, width, height in shares of the square; boxes that do not fit are drawn again, as in the paper."""
+    while True:
+        area, aspect = rng.uniform(*ERASED_AREA), rng.uniform(*ERASED_ASPECT)
+        height, width = np.sqrt(area * aspect), np.sqrt(area / aspect)
+        x, y = rng.random(2)
+        if x + width <= 1 and y + height <= 1:
+            return x, y, width, height
+
+
+def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
+    """The files whose label is the target's, in an order that depends on nothing but their names."""
+    folder, table = (Path(expand(text, base)) for text in (settings.object.images, settings.object.labels))
+    rows = _rows(table)
+    target = settings.target
+    wanted = {str(label).strip().casefold() for label in (target.label, *target.accept)}
+    names = [name for name, label in rows if wanted & {label, *(part.strip() for part in label.split(","))}]
+    if not names:
+        seen = ", ".join(sorted({label for _, label in rows})[:5])
+        raise Refused(
+            f'images labeled "{target.label}" in {table}',
+            f"{len(rows)} images with other labels ({seen} ...)",
+            "name the target as the file does: by the same name or index",
+        )
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        raise Refused(
+            f"the images that {table.name} names in {folder}",
+            f"{len(missing)} missing ({missing[0]})",
+            "copy them there",
+        )
+    return [folder / name for name in sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).digest())]
+
+
+def _rows(table: Path) -> list[tuple[str, str]]:
+    """(file name, label in small letters) of each line; commas after the first belong to the label."""
+    if not table.is_file():
+        raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")
+    try:
+        with table.open(encoding="utf-8-sig", newline="") as lines:
+            rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise Refused("a CSV of file names and labels", f"{table} that cannot be read ({error})", "mend it") from error
+    short = next((row for row in rows if len(row) < 2), None)
+    if short is not None:
+        raise Refused(f"a file name and a label in each line of {table}", f'"{short[0]}"', "add the label")
+    return [(row[0].strip(), ",".join(row[1:]).strip().casefold()) for row in rows]
+
+
+def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[flat.Picture, ...], list[str]]:
+    images, unread = [], []
+    for path in files:
+        try:
+            images.append(flat.picture_for(read_photo(path).srgb, photo_px)[0])
+        except CannotJudge:
+            unread.append(path.name)
+    if not images:
+        raise Refused(
+            "an image that can be read", f"none of {len(files)} in {files[0].parent}", "save them as JPEG or PNG"
+        )
+    return tuple(images), unread
+
+
+def _piece(settings: SceneSettings, identity: str) -> Piece:
+    """The printed piece; its markers are as large as the views need them, no larger than picture and page can hold."""
+    patch, (low, high) = settings.patch, settings.view.patch_share
+    if low <= 0:
+        raise Refused("view.patch_share above 0", f"{low:g}", "give a share that can be seen")
+    design_mm = (patch.width_mm, patch.height_mm)
+    # a square of this side fits into the picture at every drawn size and angle
+    fits_mm = max(design_mm) / high / max(_extent(np.ones(2), roll)[0] for roll in np.linspace(*settings.view.roll_deg))
+    least_mm = max(design_mm) + 2 * frame_mm(SMALLEST_MARKER_MM)
+    if least_mm > fits_mm:
+        raise Refused(
+            "a piece that fits into the picture's centered square at the largest view.patch_share",
+            f"{least_mm / fits_mm:.0%} of it with its frame of markers",
+            f"lower it to {int(high * fits_mm / least_mm * 100) / 100:g}",
+        )
+    smallest = low * (high / low) ** (1 - READABLE_SHARE)
+    needed_mm = MODULES * PX_PER_MODULE * max(design_mm) / (smallest * min(settings.camera.photo_px))
+    needed_mm = min(needed_mm, _LARGEST_MARKER * max(design_mm))
+    largest_mm = tuple(min(side, fits_mm) for side in largest_piece_mm(load_template(settings.sheet.template)))
+    return lay_out_piece(design_mm, marker_size_mm(needed_mm, design_mm, largest_mm), identity, "design")
+
+
+def _shares(settings: SceneSettings, conditions: Conditions) -> np.ndarray:
+    low, high = settings.view.patch_share
+    return low * (high / low) ** conditions.background[:, 1]
+
+
+def _extent(size: np.ndarray, roll_deg: float) -> np.ndarray:
+    """Width and height of what encloses a turned rectangle."""
+    c, s = abs(np.cos(np.radians(roll_deg))), abs(np.sin(np.radians(roll_deg)))
+    return np.array([c * size[0] + s * size[1], s * size[0] + c * size[1]])

@@ -1,0 +1,240 @@
+"""A scene of photographs: the object as it was seen with a blank sheet on it, no mesh, nothing modeled but light.
+
+In: a folder of photographs and the blank sheet's manifest. Out: `PhotoScene`. Markers give the homography from the
+piece to each photograph, white paper the light on it, marker borders its blur, the paper's grain its noise. The new
+piece has the blank's geometry and takes its place. Views vary around what was seen: which photograph, zoom, roll and a
+shift of the whole picture, and exposure and white balance as a camera would set them.
+
+What a promise of such a scene covers: these photographed places and lights and mild changes of them, since all streams
+draw from the same few photographs. It says nothing of other viewpoints, backgrounds or lamps: photograph them, too.
+
+The paper alone gives the light, because a printed swatch's own reflectance depends on a printer that is not known here.
+Left out on purpose: shine on the piece (paper in glare counts as an outlier), veiling glare (black ink is as dark as
+the printer makes it), and whatever stood in front of the piece. Photographs that cannot be used are named with the
+code that a judged photograph would get.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.complete import complete
+from patchproof.photo.detect import DICTIONARY, find_markers
+from patchproof.photo.quality import blur_px
+from patchproof.photo.read import SUFFIXES, read_photo
+from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.scene import flat
+from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.paper_light import PaperLight, paper_light
+from patchproof.scene.resolution import design_grid
+from patchproof.settings import Refused, SceneSettings, expand
+from patchproof.sheet.blank import blank_piece_mm
+from patchproof.sheet.manifest import Manifest, load_manifest
+from patchproof.sheet.page import largest_piece_mm
+from patchproof.sheet.piece import Piece, lay_out_piece, sheet_id
+from patchproof.sheet.template import load_template
+
+LEAST_PHOTOS = 6
+_MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small
+_MOST_RESIDUAL = 0.01  # as in verify, of the design's shorter side
+_MOST_UNCERTAIN = 0.01  # 95 % point of the worst corner, as a share of the same
+_UNEVEN = 0.05  # of the light: what the quadratic leaves; from here on a reader should know
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One usable photograph: homography to its pixels at the scene's `photo_px`, and what was measured on its paper."""
+
+    name: str
+    picture: flat.Picture
+    photo_from_piece: np.ndarray
+    light: PaperLight
+    blur_px: float
+
+
+@dataclass(frozen=True)
+class PhotoScene:
+    """A `FlatScene` whose base pictures are photographs of the object with a blank sheet on it."""
+
+    settings: SceneSettings
+    base: Path
+    seed: int
+    sheet_id: str
+    piece: Piece
+    photos: tuple[Seen, ...]
+    warnings: tuple[str, ...]
+    unreadable_share: float = 0.0
+
+    @property
+    def photo_px(self) -> tuple[int, int]:
+        """Size of the photographs that the scene makes."""
+        return self.settings.camera.photo_px
+
+    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
+        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
+        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+
+    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×3×3 from piece millimetres to pixels."""
+        to_size = flat.size_from_photo(self.photo_px, size_px)
+        matrices = self._view_from_photo(conditions)
+        return np.stack(
+            [to_size @ m @ p.photo_from_piece for m, p in zip(matrices, self._chosen(conditions), strict=True)]
+        )
+
+    def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet still on them."""
+        views = zip(self._chosen(conditions), self._view_from_photo(conditions), strict=True)
+        return np.stack([flat.show(photo.picture, matrix, self.photo_px, size_px) for photo, matrix in views])
+
+    def piece_light(self, conditions: Conditions) -> np.ndarray:
+        """N×3×6 coefficients as in `FlatScene.piece_light`, in light of the photograph: 1 is its full white."""
+        return np.stack([photo.light.coefficients for photo in self._chosen(conditions)])
+
+    def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
+        """N sigmas in pixels of the whole photograph; zoom enlarges the blur with the picture."""
+        return np.array([photo.blur_px for photo in self._chosen(conditions)]) * self._zoom(conditions)
+
+    def piece_noise(self, conditions: Conditions) -> np.ndarray:
+        """N standard deviations at white, in linear light of the whole photograph."""
+        return np.array([photo.light.noise for photo in self._chosen(conditions)])
+
+    def design_px(self, network_px: int) -> tuple[int, int]:
+        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
+        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
+
+    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
+        """Pixels per millimetre of the piece in the closest view."""
+        return flat.closest_px_per_mm(self, size_px)
+
+    def white_light(self, conditions: Conditions) -> np.ndarray:
+        """N: the light on white paper at the piece's middle."""
+        return flat.white_light(self, conditions)
+
+    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
+        """N NaN: nobody knows where the camera stood."""
+        return np.full(len(conditions), np.nan)
+
+    def _chosen(self, conditions: Conditions) -> list[Seen]:
+        return [self.photos[i] for i in flat.pick(conditions.background[:, 0], len(self.photos))]
+
+    def _zoom(self, conditions: Conditions) -> np.ndarray:
+        low, high = self.settings.view.zoom
+        return low * (high / low) ** conditions.background[:, 1]
+
+    def _view_from_photo(self, conditions: Conditions) -> list[np.ndarray]:
+        middle, side = np.array(self.photo_px) / 2, min(self.photo_px)
+        shifts = conditions.look_at_offset[:, :2] * side
+        views = zip(conditions.roll_deg, self._zoom(conditions), shifts, strict=True)
+        return [flat.turned(roll, zoom, shift, middle) for roll, zoom, shift in views]
+
+
+def load_photo_scene(settings: SceneSettings, base: Path, seed: int) -> PhotoScene:
+    """The scene of a folder of photographs; those that cannot be used are warned about, fewer than six are refused.
+
+    The scene's settings have the blank's `width_mm` and `height_mm`, also where the file gave none.
+    """
+    flat.refuse_bending(settings)
+    manifest = load_manifest(expand(settings.object.sheet, base))
+    design_mm, marker_mm = blank_piece_mm(manifest)
+    settings = _with_size(settings, design_mm)
+    identity = sheet_id(settings.model_dump(mode="json") | {"blank": manifest.sheet_id}, seed)
+    piece = lay_out_piece(design_mm, marker_mm, identity, "design")
+    _refuse_larger_than_page(settings, piece)
+    photos, skipped = _see_all(Path(expand(settings.object.photos, base)), manifest, piece, settings.camera.photo_px)
+    warnings = [f"{name} is left out: {reason}" for name, reason in skipped.items()]
+    for photo in photos:
+        if photo.light.unevenness > _UNEVEN:
+            warnings.append(
+                f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
+            )
+    return flat.with_unreadable_share(PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings)))
+
+
+def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> Seen:
+    """What one photograph of the blank sheet says; `CannotJudge` where it cannot be used."""
+    srgb = read_photo(path).srgb
+    fit, blur = _locate(srgb, manifest, min(piece.design_rect_mm[2:]))
+    x, y, *_ = manifest.cut_mm
+    picture, photo_from_srgb = flat.picture_for(srgb, photo_px)
+    px_from_piece = fit.px_from_mm @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
+    photo_from_piece = photo_from_srgb @ px_from_piece
+    scale = photo_from_srgb[0, 0]
+    # a picture enlarged brings its own pixels' width along: 1/12 px² and the interpolation's 1/6 px²
+    blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
+    height, width = picture.srgb.shape[:2]
+    picture_from_photo = np.linalg.inv(flat.photo_from((width, height), photo_px))
+    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
+    return Seen(path.name, picture, photo_from_piece, light, blur)
+
+
+def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[Seen, ...], dict[str, str]]:
+    """The usable photographs of a folder in the order of their names, and why others are not."""
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+    photos, skipped = [], {}
+    for path in files:
+        try:
+            photos.append(see(path, manifest, piece, photo_px))
+        except CannotJudge as cannot:
+            skipped[path.name] = cannot.code
+    if len(photos) < LEAST_PHOTOS:
+        reasons = f" ({'; '.join(f'{name}: {code}' for name, code in skipped.items())})" if skipped else ""
+        raise Refused(
+            f"at least {LEAST_PHOTOS} photographs of the blank sheet on the object",
+            f"{len(photos)} usable of {len(files)} in {folder}{reasons}",
+            "take more, sharp, with the whole flat sheet in view",
+        )
+    return tuple(photos), skipped
+
+
+def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageFit, float]:
+    """Where the sheet's piece lies in a photograph, and the blur of its markers' borders in px."""
+    markers = {m.id: np.array(m.corners_mm) for m in manifest.markers}
+    x, y, w, h = manifest.cut_mm
+    on_piece = {i: c for i, c in markers.items() if (c >= [x, y]).all() and (c <= [x + w, y + h]).all()}
+    found = find_markers(srgb, frozenset(on_piece), frozenset(markers), DICTIONARY)
+    if not found.markers.keys() & on_piece.keys():
+        if found.foreign:
+            raise CannotJudge("wrong_sheet", len(found.foreign), 0, "these are the markers of another sheet")
+        raise CannotJudge("too_few_markers", 0, 3, "no marker of the piece is readable")
+    found = complete(srgb, found, on_piece)
+    borders = [b for i, b in found.markers.items() if b.fitted and i in on_piece]
+    if len(borders) < 3:
+        raise CannotJudge("too_few_markers", len(borders), 3, "show more of the frame, sharp and well lit")
+    corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in on_piece}
+    fit, blur = fit_page(corners, on_piece), blur_px(borders)
+    if blur > _MOST_BLUR * (module_px := float(np.median([b.module_px for b in borders]))):
+        raise CannotJudge("blurred", blur, _MOST_BLUR * module_px, "hold still and focus on the sheet")
+    if fit.residual_mm > _MOST_RESIDUAL * side_mm:
+        raise CannotJudge("too_few_markers", len(fit.inlier_ids), len(on_piece), "press the sheet flat")
+    uncertain = corner_uncertainty_mm(fit, manifest.cut_mm)
+    if uncertain > _MOST_UNCERTAIN * side_mm:
+        raise CannotJudge("too_small", uncertain, _MOST_UNCERTAIN * side_mm, "come closer")
+    return fit, blur
+
+
+def _with_size(settings: SceneSettings, design_mm: tuple[float, float]) -> SceneSettings:
+    patch = settings.patch
+    given = (patch.width_mm, patch.height_mm)
+    if given != (None, None) and not np.allclose(given, design_mm, atol=0.01):
+        raise Refused(
+            f"a patch as large as the blank sheet's ({design_mm[0]:g} × {design_mm[1]:g} mm)",
+            f"{given[0]:g} × {given[1]:g} mm",
+            "leave out width_mm and height_mm, or print a blank of that size",
+        )
+    patch = patch.model_copy(update={"width_mm": design_mm[0], "height_mm": design_mm[1]})
+    return settings.model_copy(update={"patch": patch})
+
+
+def _refuse_larger_than_page(settings: SceneSettings, piece: Piece) -> None:
+    width, height = largest_piece_mm(load_template(settings.sheet.template))
+    if piece.size_mm[0] > width + 1e-6 or piece.size_mm[1] > height + 1e-6:
+        raise Refused(
+            f"a template that holds the blank's piece of {piece.size_mm[0]:.1f} × {piece.size_mm[1]:.1f} mm",
+            f"{settings.sheet.template} with room for {width:.1f} × {height:.1f} mm",
+            "name a larger one in [sheet] template",
+        )
