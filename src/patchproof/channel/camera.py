@@ -6,9 +6,8 @@ vignetting, blur (optics, focus, straight motion), exposure and white balance, s
 
 Blur, motion, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
 photograph gets what is left of them after averaging: they shrink with `scale`; what falls under the threshold of
-visibility is skipped, since it would cost time and show nothing. What stands for a photograph that was already reduced
-to a network's input also gets the blur of that reduction. At full size the photograph is stored as a real JPEG by
-whoever writes it.
+visibility is skipped, since it would cost time and show nothing. At full size the photograph is stored as a real JPEG
+by whoever writes it.
 """
 
 from __future__ import annotations
@@ -21,9 +20,6 @@ from patchproof.color import srgb_from_linear
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4
 SMALLEST_MOTION_PX = SMALLEST_BLUR_PX * 12**0.5  # the length of an even streak of that sigma
-# The antialiased bilinear filter that reduces photographs is a triangle of two pixels: variance 1/6 px². Without it 40
-# photographs of an optimized patch were judged 0.07 too confidently at the network's size, with it 0.04.
-REDUCTION_VARIANCE = 1 / 6
 # Noise below one 8-bit step moved no rate and no mean confidence by more than 0.001 (40 photographs).
 SMALLEST_NOISE = 1 / 255
 # Below half size a JPEG block covers less than 4 pixels and averages out.
@@ -32,17 +28,14 @@ SMALLEST_JPEG_SCALE = 0.5
 READ_SHARE = 0.25
 
 
-def develop(
-    linear: Tensor, conditions, scale: float, reduced: bool = False, jpeg: bool = True, diagonal_share: float = 1.0
-) -> Tensor:
+def develop(linear: Tensor, conditions, scale: float, jpeg: bool = True, diagonal_share: float = 1.0) -> Tensor:
     """The picture that a camera makes; `conditions` as in `scene.conditions.Conditions`, one row per picture.
 
-    `scale` is the pictures' size over the photograph's. `reduced`: they stand for photographs reduced to this size.
-    `jpeg=False` leaves JPEG to the writer of a real file. `diagonal_share` is what vignetting needs to know, from
+    `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file. `diagonal_share` is what vignetting needs to know, from
     `diagonal_share_of`.
     """
     linear = vignetted(linear, torch.as_tensor(conditions.vignetting).to(linear), diagonal_share)
-    linear = blurred(linear, torch.as_tensor(_sigma_px(conditions, scale, reduced)).to(linear))
+    linear = blurred(linear, torch.as_tensor(conditions.blur_px * scale).to(linear))
     linear = moved(linear, torch.as_tensor(conditions.motion_px * scale).to(linear), conditions.motion_deg)
     linear = linear * gains(conditions, linear)[:, :, None, None]
     linear = noisy(linear, torch.as_tensor(conditions.noise * scale).to(linear), conditions.noise_seed)
@@ -52,12 +45,12 @@ def develop(
     return picture
 
 
-def is_pointwise(conditions, scale: float, reduced: bool, jpeg: bool) -> bool:
+def is_pointwise(conditions, scale: float, jpeg: bool) -> bool:
     """Whether `develop` treats every pixel alone and alike, so that a changed part can be developed without the rest.
 
     Vignetting is not alike: it depends on the place.
     """
-    sharp = _sigma_px(conditions, scale, reduced).max() < SMALLEST_BLUR_PX
+    sharp = conditions.blur_px.max() * scale < SMALLEST_BLUR_PX
     still = (conditions.motion_px * scale).max() < SMALLEST_MOTION_PX
     even = not conditions.vignetting.any()
     clean = (conditions.noise * scale).max() < SMALLEST_NOISE
@@ -94,12 +87,6 @@ def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tens
     square = (y[:, None] ** 2 + x**2) * (4 * diagonal_share**2 / (height**2 + width**2))
     tangent_square = (1 - lost) ** -0.5 - 1
     return linear * (1 + tangent_square[:, None, None, None] * square) ** -2
-
-
-def _sigma_px(conditions, scale: float, reduced: bool):
-    """N sigmas of all that blurs a picture alike in all directions."""
-    variance = (conditions.blur_px * scale) ** 2 + (REDUCTION_VARIANCE * max(0.0, 1 - scale**2) if reduced else 0)
-    return variance**0.5
 
 
 def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from patchproof.optimize.goals import target_loss
-from patchproof.optimize.pixels import from_pixels
+from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.views import Seen, relit
@@ -85,7 +85,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
 
 def _step(problem: Problem, state: State, seen: Seen) -> Step:
     design = state.design.clone().requires_grad_()
-    pictures = expose(seen, problem.subject.shown(design), problem.reduced)
+    pictures = expose(seen, problem.subject.shown(design))
     losses, confidences, rates = _score(problem, pictures)
     loss = losses + problem.subject.penalty(design)
     (gradient,) = torch.autograd.grad(loss, design)
@@ -135,10 +135,10 @@ def _selection(problem: Problem) -> list[Seen]:
 def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
     """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
     state = step.state
-    printed = from_pixels(problem.subject.pixels(state.design), problem.device)
+    printed = from_pixels(as_pixels(state.design), problem.device)
     with torch.no_grad():
         shown = problem.subject.shown(printed)
-        scores = [_score(problem, expose(seen, shown, problem.reduced)) for seen in selection]
+        scores = [_score(problem, expose(seen, shown)) for seen in selection]
     loss = sum(float(score[0]) for score in scores) / len(scores)
     rate = sum(score[2] for score in scores) / len(scores)
     if loss < state.best_loss:

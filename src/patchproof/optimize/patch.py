@@ -18,7 +18,7 @@ from torch import Tensor
 from patchproof.channel.printer import Printer
 from patchproof.optimize.goals import total_variation
 from patchproof.optimize.pixels import as_pixels
-from patchproof.render.views import PiecePicture
+from patchproof.render.pixels import PiecePicture
 from patchproof.scene.scene import Scene
 from patchproof.sheet.piece import FrameImage, control_design, frame_image, lay_out_piece
 
@@ -66,13 +66,13 @@ class Patch:
         return control_design(kind, pixels, self.scene.sheet_id)
 
     def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
-        """The printed piece round a design on the optimized grid or as printed; differentiable."""
-        frame, printed_frame = self._frame(kind, self.printed_px)
-        x0, y0, width, height = frame.design_box_px
+        """The printed piece round a design, on the design's own grid (the optimized one, or as printed);
+        differentiable.
+        """
+        height, width = design.shape[1:]
+        frame, printed_frame = self._frame(kind, (width, height))
+        x0, y0, *_ = frame.design_box_px
         printed = self.printer.apply(design[None])[0].permute(1, 2, 0)
-        block = width // design.shape[2]
-        if block > 1:
-            printed = printed.repeat_interleave(block, 0).repeat_interleave(block, 1)
         rows = torch.cat(
             [printed_frame[y0 : y0 + height, :x0], printed, printed_frame[y0 : y0 + height, x0 + width :]], 1
         )

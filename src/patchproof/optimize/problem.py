@@ -18,8 +18,9 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimize.patch import Patch
 from patchproof.optimize.texture import Texture
 from patchproof.render.photograph import Shown
+from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import PiecePicture, Seen, see
+from patchproof.render.views import Seen, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
 from patchproof.settings import Refused
@@ -49,11 +50,6 @@ class Problem:
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
         return self._view_px(FIGURE_PX)
-
-    @property
-    def reduced(self) -> bool:
-        """Whether training views come at the networks' own size, and so stand for photographs already reduced to it."""
-        return self.training_px == max(classifier.input_px for classifier in self.classifiers)
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Seen:
         """Square views of these conditions, for what is shown now and any other design in its place."""

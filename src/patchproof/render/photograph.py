@@ -25,9 +25,10 @@ from patchproof.channel.camera import (
 from patchproof.channel.lens import distorted
 from patchproof.channel.printer import vary
 from patchproof.color import linear_from_srgb
+from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, light_texels
 from patchproof.render.texture import look_up, texel_table
-from patchproof.render.views import PiecePicture, Seen, see
+from patchproof.render.views import Seen, see
 from patchproof.scene.conditions import Conditions
 
 PAPER_BACK_LINEAR = 0.8  # plain white card seen from behind
@@ -48,17 +49,16 @@ def photograph(
     shown: Shown,
     conditions: Conditions,
     size_px: tuple[int, int],
-    reduced: bool = False,
     jpeg: bool = True,
     supersample: int = 1,
 ) -> Tensor:
     """N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
 
-    A square size shows the photograph's centered square. `reduced` and `jpeg` as in `channel.camera.develop`,
+    A square size shows the photograph's centered square. `jpeg` as in `channel.camera.develop`,
     `supersample` as in `see`.
     """
     piece = shown if isinstance(shown, PiecePicture) else None
-    return expose(see(stage, piece, conditions, size_px, supersample), shown, reduced, jpeg)
+    return expose(see(stage, piece, conditions, size_px, supersample), shown, jpeg)
 
 
 def shade(seen: Seen, shown: Shown) -> Tensor:
@@ -75,17 +75,17 @@ def shade(seen: Seen, shown: Shown) -> Tensor:
     return _as_pictures(seen, _blend(image, piece.pixel, piece.share, _piece_light(seen, shown)))
 
 
-def expose(seen: Seen, shown: Shown, reduced: bool = False, jpeg: bool = True) -> Tensor:
+def expose(seen: Seen, shown: Shown, jpeg: bool = True) -> Tensor:
     """The photographs of views already seen."""
     stage, scale = seen.stage, _scale(seen)
     bends = stage.camera is not None and stage.camera.bends
     own = shown is not None and (_own_blur(seen) or _own_noise(seen))
-    if bends or own or isinstance(shown, ObjectTextures) or not is_pointwise(seen.conditions, scale, reduced, jpeg):
+    if bends or own or isinstance(shown, ObjectTextures) or not is_pointwise(seen.conditions, scale, jpeg):
         light = shade(seen, shown)
         if bends:
             light = distorted(light, stage.camera, seen.size_px)
         share = diagonal_share_of(seen.size_px, stage.scene.settings.camera.photo_px)
-        return develop(light, seen.conditions, scale, reduced, jpeg, share)
+        return develop(light, seen.conditions, scale, jpeg, share)
     image = seen.bare_exposed
     if shown is not None:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
@@ -99,6 +99,8 @@ def expose(seen: Seen, shown: Shown, reduced: bool = False, jpeg: bool = True) -
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor) -> Tensor:
     """`image` with the share of each pixel replaced by `value`."""
+    if not len(pixel):
+        return image
     return image.index_copy(0, pixel, torch.lerp(image.index_select(0, pixel), value.expand(len(pixel), 3), share))
 
 

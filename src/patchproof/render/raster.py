@@ -17,85 +17,21 @@ dropped. Where depths are equal to 24 bits the lower face index wins. Left out o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from patchproof.render.clip import GUARD_PX, clipped
+from patchproof.render.fragments import Cameras, Fragments, columns
 from patchproof.settings import Refused
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
-GUARD_PX = 1 << 16  # faces are cut here, so that products of coordinates stay below 2^53 and float64 holds them exactly
 CHUNK = 1 << 20  # faces, rows, pixels or fragments held at a time; bounds what is held beside the result to some 300 MB
 _FACE_BITS = 29  # a key is a float64 of 1/z whose lower bits give way to the face; 23 of the mantissa are left
 _FACE_MASK = (1 << _FACE_BITS) - 1
 _X_BITS = 26  # a snapped corner is one integer, y above x, both from -2^25 up
 _X_MASK, _OFFSET = (1 << _X_BITS) - 1, 1 << (_X_BITS - 1)
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """N pinhole cameras: `camera_from_world` N×4×4 and `matrix_px` N×3×3, float64, for pictures of `size_px` (width,
-    height).
-    """
-
-    camera_from_world: Tensor
-    matrix_px: Tensor
-    size_px: tuple[int, int]
-
-    def __len__(self) -> int:
-        return len(self.camera_from_world)
-
-
-@dataclass(frozen=True)
-class Fragments:
-    """What P covered pixels see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
-
-    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells whether the face shows its outside.
-    `seen` P (into Q) and `slopes` 6×Q are what the derivatives of the barycentrics are computed from when asked for.
-    """
-
-    pixel: Tensor
-    face: Tensor
-    barycentric: Tensor
-    depth: Tensor
-    front: Tensor
-    seen: Tensor
-    slopes: Tensor
-    shape: tuple[int, int, int]  # views, height, width
-
-    def __len__(self) -> int:
-        return len(self.pixel)
-
-    @cached_property
-    def view(self) -> Tensor:
-        """P: the view of each fragment."""
-        return self.pixel // (self.shape[1] * self.shape[2])
-
-    @cached_property
-    def barycentric_dx(self) -> Tensor:
-        """P×3 float32: change of the barycentrics per pixel to the right."""
-        return self._derivative(0)
-
-    @cached_property
-    def barycentric_dy(self) -> Tensor:
-        """P×3 float32: change of the barycentrics per pixel down."""
-        return self._derivative(1)
-
-    def _derivative(self, axis: int) -> Tensor:
-        # d(e_i / t) = (de_i - e_i/t · dt) / t
-        first, second, total = (self.slopes[2 * i + axis].index_select(0, self.seen) for i in range(3))
-        b, z = self.barycentric, self.depth
-        first.addcmul_(b[:, 1], total, value=-1).mul_(z)
-        second.addcmul_(b[:, 2], total, value=-1).mul_(z)
-        return _columns(-(first + second), first, second)
-
-    def where(self, keep: Tensor) -> Fragments:
-        """The fragments where `keep` (P, bool) is true."""
-        index = keep.nonzero()[:, 0]
-        fields = (self.pixel, self.face, self.barycentric, self.depth, self.front, self.seen)
-        return Fragments(*(field.index_select(0, index) for field in fields), self.slopes, self.shape)
 
 
 @torch.no_grad()
@@ -205,7 +141,7 @@ def _triangles(points: Tensor, snapped: Tensor, index: list[Tensor], size_px: tu
     torn = torn.nonzero()[:, 0]
     if len(torn):
         whole = torch.stack([points.index_select(1, i.index_select(0, torn)).T for i in index], 1)
-        triangles, of = _clipped(whole, near)
+        triangles, of = clipped(whole, near)
         cut = _packed(*triangles.unbind(-1)).unbind(1)
         owner = torch.cat([owner, torn[of]])
         corners = [torch.cat(pair) for pair in zip(corners, cut, strict=True)]
@@ -214,39 +150,6 @@ def _triangles(points: Tensor, snapped: Tensor, index: list[Tensor], size_px: tu
 
 def _extent(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
     return torch.minimum(torch.minimum(a, b), c), torch.maximum(torch.maximum(a, b), c)
-
-
-def _clipped(corners: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """The parts before the near plane and within the guard band of T×3×3 faces: triangles in pixels, and whose."""
-    owner = corners.isfinite().all(-1).all(-1).nonzero()[:, 0]
-    corners = corners[owner]
-    bands = ([0.0, 0, 1], [1.0, 0, GUARD_PX], [-1.0, 0, GUARD_PX], [0.0, 1, GUARD_PX], [0.0, -1, GUARD_PX])
-    for normal, offset in zip(corners.new_tensor(bands), [near, 0, 0, 0, 0], strict=True):
-        corners, owner = _cut(corners, owner, corners @ normal - offset)
-    return corners[..., :2] / corners[..., 2:], owner
-
-
-def _cut(triangles: Tensor, owner: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """The parts of T×3×3 triangles where `distance` T×3 is positive: none, one or two triangles each."""
-    inside = distance > 0
-    count = inside.sum(-1)
-    # turn each triangle so that its odd corner out (the only one inside, or the only one outside) comes first
-    odd = torch.where((count == 1)[:, None], inside, ~inside).to(torch.uint8).argmax(-1)
-    order = (odd[:, None] + torch.arange(3, device=odd.device)) % 3
-    turned = triangles.gather(1, order[..., None].expand(-1, -1, 3))
-    d = distance.gather(1, order)
-    one, two = count == 1, count == 2
-    tip = torch.stack([turned[one, 0], _crossing(turned, d, one, 0, 1), _crossing(turned, d, one, 0, 2)], 1)
-    p, q = _crossing(turned, d, two, 1, 0), _crossing(turned, d, two, 2, 0)
-    quad = [torch.stack([p, turned[two, 1], turned[two, 2]], 1), torch.stack([p, turned[two, 2], q], 1)]
-    whole = count == 3
-    return torch.cat([triangles[whole], tip, *quad]), torch.cat([owner[whole], owner[one], owner[two], owner[two]])
-
-
-def _crossing(turned: Tensor, d: Tensor, which: Tensor, inside: int, outside: int) -> Tensor:
-    """Where edges meet the plane, always reckoned from the inside corner: faces with a common edge agree."""
-    share = d[which, inside] / (d[which, inside] - d[which, outside])
-    return turned[which, inside] + share[:, None] * (turned[which, outside] - turned[which, inside])
 
 
 def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]], Tensor]:
@@ -359,18 +262,11 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     deepest = max(float(corner[2].max()) for corner in corners)
     z = inverse.clamp_(0.5 / deepest, 1 / near).reciprocal_()
     second, third = second.mul_(z), third.mul_(z)
-    fragments.barycentric[part] = _columns(1 - second - third, second, third)
+    fragments.barycentric[part] = columns(1 - second - third, second, third)
     fragments.depth[part] = z
     fragments.front[part] = (volume < 0).index_select(0, seen)
     fragments.seen[part] = seen
     return torch.stack([t for plane in planes for t in plane[:2]]).float()
-
-
-def _columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """P×3 float32; `torch.stack` takes four times as long for columns this narrow."""
-    out = torch.empty(len(a), 3, device=a.device)
-    out[:, 0], out[:, 1], out[:, 2] = a, b, c
-    return out
 
 
 def _ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:

@@ -40,16 +40,21 @@ class PieceSurface:
 
 @dataclass(frozen=True)
 class ObjectSurface:
-    """The object: faces over `vertices`, and per face corner F×3 what is interpolated on it."""
+    """The object: faces over `vertices`, and per face corner F×3×8 what is interpolated on it: uv, color (vertex color
+    times base color, linear) and normal.
+    """
 
     vertices: Tensor
     faces: Tensor
-    corner_uv: Tensor
-    corner_normal: Tensor
-    corner_color: Tensor  # vertex color times base color, linear
+    corners: Tensor
     material: Tensor
     textures_srgb: tuple[Tensor, ...]  # H×W×3 in [0, 1], one per material
     layout: Layout
+
+    @cached_property
+    def corner_uv(self) -> Tensor:
+        """Texture coordinates alone, F×3×2."""
+        return self.corners[..., :2].contiguous()
 
     def texels(self, reduced: bool) -> Tensor:
         """The linear light of all textures' mip levels, averaged as light or, `reduced`, as code values."""
@@ -107,9 +112,11 @@ def _object_surface(scene: MeshScene, device: torch.device) -> ObjectSurface:
     return ObjectSurface(
         on(mesh.vertices),
         on(mesh.faces),
-        on(mesh.corner_uv),
-        on(mesh.corner_normal),
-        on(mesh.corner_color_linear * base[mesh.face_material][:, None]),
+        on(
+            np.concatenate(
+                [mesh.corner_uv, mesh.corner_color_linear * base[mesh.face_material][:, None], mesh.corner_normal], 2
+            )
+        ),
         on(mesh.face_material),
         textures,
         layout([(t.shape[1], t.shape[0]) for t in textures], wrap=True, device=device),

@@ -22,24 +22,29 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the mip levels of K textures lie in one T×3 table of texels: sizes and offsets K×L, number of levels K.
+    """Where the mip levels of K textures lie in one T×3 table of texels.
+
+    `places` (K·L)×3 has each level's width, height and first texel, `levels` K how many of the L a texture has.
 
     Each level has one more row and column than its size, for bilinear taps to read beyond the last texel: the first
     ones again where textures repeat (`wrap`), else the last ones.
     """
 
-    width: Tensor
-    height: Tensor
-    offset: Tensor
+    places: Tensor
     levels: Tensor
     wrap: bool
+
+    def place(self, texture: Tensor, level: Tensor | int) -> tuple[Tensor, Tensor]:
+        """(width and height P×2 float, first texel P) of levels of textures."""
+        place = self.places.index_select(0, texture * (len(self.places) // len(self.levels)) + level)
+        return place[:, :2].float(), place[:, 2]
 
 
 @dataclass(frozen=True)
 class Group:
     """Fragments G with as many taps each: the `texel` and `weight` G×J they see; gradients pass where `learned`."""
 
-    fragment: Tensor
+    fragment: Tensor | None  # None: all of them, in order
     texel: Tensor
     weight: Tensor
     learned: bool
@@ -65,8 +70,8 @@ def layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str 
             if level < max(width, height).bit_length():
                 offset += (w + 1) * (h + 1)
         table.append(levels)
-    w, h, o = torch.tensor(table, device=device).unbind(-1)
-    return Layout(w, h, o, torch.tensor([max(size).bit_length() for size in sizes], device=device), wrap)
+    levels = torch.tensor([max(size).bit_length() for size in sizes], device=device)
+    return Layout(torch.tensor(table, device=device).flatten(0, 1), levels, wrap)
 
 
 def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
@@ -99,28 +104,38 @@ def _halved(level: Tensor) -> Tensor:
 
 
 def footprint(
-    where: Layout, texture: Tensor | int, uv: Tensor, uv_dx: Tensor, uv_dy: Tensor, taps: int, learned: bool = True
+    where: Layout,
+    texture: Tensor,
+    uv: Tensor,
+    uv_dx: Tensor,
+    uv_dy: Tensor,
+    taps: int,
+    blocks: bool = False,
+    learned: bool = True,
 ) -> Footprint:
-    """What P fragments of `texture` (P, or one for all: index into the layout) see; `uv_dx`, `uv_dy` P×2: uv change per
-    pixel.
+    """What P fragments of `texture` (P, index into the layout) see; `uv_dx`, `uv_dy` P×2: uv change per pixel.
 
-    At most `taps` along the footprint's shorter side and twice as many along the longer one. Gradients pass to what is
-    `learned` only.
+    At most `taps` along the footprint's shorter side and twice as many along the longer one; one in all where `taps` is
+    1. Texels are points to interpolate between, or `blocks` of one color, as printed pixels are. Gradients pass to what
+    is `learned` only.
     """
-    size = torch.stack([where.width[texture, 0], where.height[texture, 0]], -1).float()
+    most = 2 * taps if taps > 1 else 1
+    size, _ = where.place(texture, 0)
     across, down = _length(uv_dx * size), _length(uv_dy * size)  # level-0 texels
-    level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, where.levels[texture])
+    level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, most)
+    level = level.minimum(where.levels.index_select(0, texture) - 1)
+    size, offset = where.place(texture, level)
+    seen = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
+    if most == 1:
+        return Footprint((Group(None, *_taps(*seen, 1, 1, where.wrap, blocks), learned),), len(uv))
     texel_span = torch.exp2(-level.float())
-    columns, rows = ((side * texel_span).ceil().clamp(1, 2 * taps).long() for side in (across, down))
-    width, height, offset = (table[texture, level] for table in (where.width, where.height, where.offset))
-    size = torch.stack([width, height], -1).float()
-    center, step_x, step_y = uv * size - 0.5, uv_dx * size, uv_dy * size
-    count = columns * (2 * taps + 1) + rows
+    columns, rows = ((side * texel_span).ceil().clamp(1, most).long() for side in (across, down))
+    count = columns * (most + 1) + rows
     groups = []
     for key in count.bincount().nonzero()[:, 0].tolist():
         fragment = (count == key).nonzero()[:, 0]
-        one = (values.index_select(0, fragment) for values in (center, step_x, step_y, size, offset))
-        texel, weight = _taps(*one, *divmod(key, 2 * taps + 1), where.wrap)
+        one = (values.index_select(0, fragment) for values in seen)
+        texel, weight = _taps(*one, *divmod(key, most + 1), where.wrap, blocks)
         groups.append(Group(fragment, texel, weight, learned))
     return Footprint(tuple(groups), len(uv))
 
@@ -140,37 +155,58 @@ def _length(vectors: Tensor) -> Tensor:
     return (x * x + y * y).sqrt()
 
 
-def _levels(shorter: Tensor, longer: Tensor, taps: int, levels: Tensor) -> Tensor:
-    """The finest level on which the taps are no more than a texel apart.
-
-    Level 0 is left where half the taps would do, too: level 1 is hardly worse there and four times as cheap.
-    """
-    coarse = torch.maximum((shorter / taps).log2(), (longer / (2 * taps)).log2()).ceil()
-    coarse = torch.maximum(coarse, (shorter > taps / 2).float())
-    return coarse.clamp_min(0).long().minimum(levels - 1)
+def _levels(shorter: Tensor, longer: Tensor, taps: int, most: int) -> Tensor:
+    """The finest level on which the taps are no more than a texel apart."""
+    coarse = torch.maximum((shorter / taps).log2(), (longer / most).log2()).ceil()
+    return coarse.clamp_min(0).long()
 
 
 def _taps(
-    center: Tensor, step_x: Tensor, step_y: Tensor, size: Tensor, offset: Tensor, columns: int, rows: int, wrap: bool
+    center: Tensor,
+    step_x: Tensor,
+    step_y: Tensor,
+    size: Tensor,
+    offset: Tensor,
+    columns: int,
+    rows: int,
+    wrap: bool,
+    blocks: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Texels and weights G×(4·rows·columns) of a grid of bilinear taps round `center` G×2, in texels of one level."""
-    i = torch.arange(columns, device=center.device) - (columns - 1) / 2
-    j = torch.arange(rows, device=center.device) - (rows - 1) / 2
-    at = center[:, :, None, None] + (step_x / columns)[:, :, None, None] * i
-    at = at + (step_y / rows)[:, :, None, None] * j[:, None]
+    """Texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level.
+
+    Between points, a tap is bilinear. Of blocks it takes the mean over its own cell of the grid: exactly, where cell
+    and blocks are parallel, else over the upright box of the same extent (root of summed squares).
+    """
+    step_x, step_y = step_x / columns, step_y / rows
+    at = center[:, :, None, None] + step_x[:, :, None, None] * _centered(columns, center)
+    at = at + step_y[:, :, None, None] * _centered(rows, center)[:, None]
     size = size[:, :, None, None]
-    at = at - (at / size).floor() * size if wrap else torch.minimum(at.clamp_min_(0), size - 1)
-    # rounding may leave a wrapped place at the size itself
-    low = torch.minimum(at.floor(), size - 1)
-    x1, y1 = (at - low).unbind(1)
+    if wrap:
+        at = at - (at / size).floor() * size
+        low = torch.minimum(at.floor(), size - 1)  # rounding may leave a wrapped place at the size itself
+    else:
+        at = torch.clamp(at, torch.zeros_like(size), size - 1)
+        low = at.floor()
+    share = at.sub_(low)
+    if blocks:
+        per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
+        share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
+    x, y = share.unbind(1)
     stride = size[:, 0].long() + 1
-    first = (low[:, 1].long() * stride).add_(low[:, 0].long()).add_(offset[:, None, None])
-    below = first + stride
-    y1 = y1 / (rows * columns)
-    y0 = 1 / (rows * columns) - y1
-    bottom, top = y1 * x1, y0 * x1
-    texel = torch.stack([first, first + 1, below, below + 1], 1)
-    return texel.flatten(1), torch.stack([y0 - top, top, y1 - bottom, bottom], 1).flatten(1)
+    texel = torch.empty(len(center), 4, rows, columns, dtype=torch.long, device=center.device)
+    first = torch.add(low[:, 1].long() * stride, low[:, 0].long() + offset[:, None, None], out=texel[:, 0])
+    torch.add(first, 1, out=texel[:, 1])
+    torch.add(texel[:, :2], stride[:, None], out=texel[:, 2:])
+    weight = torch.empty(len(center), 4, rows, columns, device=center.device)
+    below = y / (rows * columns)
+    above = 1 / (rows * columns) - below
+    torch.sub(above, torch.mul(above, x, out=weight[:, 1]), out=weight[:, 0])
+    torch.sub(below, torch.mul(below, x, out=weight[:, 3]), out=weight[:, 2])
+    return texel.flatten(1), weight.flatten(1)
+
+
+def _centered(count: int, like: Tensor) -> Tensor:
+    return torch.arange(count, device=like.device) - (count - 1) / 2
 
 
 def look_up(seen: Footprint, texels: Tensor) -> Tensor:
@@ -189,7 +225,10 @@ class _LookUp(torch.autograd.Function):
         out = texels.new_zeros(seen.fragments, 3)
         for group in seen.groups:
             weight = group.weight.to(texels.dtype)
-            out[group.fragment] = F.embedding_bag(group.texel, texels, per_sample_weights=weight, mode="sum")
+            sums = F.embedding_bag(group.texel, texels, per_sample_weights=weight, mode="sum")
+            if group.fragment is None:
+                return sums
+            out[group.fragment] = sums
         return out
 
     @staticmethod
@@ -199,6 +238,7 @@ class _LookUp(torch.autograd.Function):
             if not group.learned:
                 continue
             weight, texel = group.weight.to(gradient.dtype), group.texel.flatten()
-            for channel, part in zip(out, gradient[group.fragment].unbind(1), strict=True):
+            one = gradient if group.fragment is None else gradient[group.fragment]
+            for channel, part in zip(out, one.unbind(1), strict=True):
                 channel.scatter_add_(0, texel, (weight * part[:, None]).flatten())
         return out.T, None

@@ -5,8 +5,8 @@ of the piece how much of it the piece covers, which texels it looks at and what 
 here and nowhere else: views that were seen can be lit, printed and photographed anew (`relit`) at a fraction of the
 cost, and shaded with any number of designs.
 
-Edges of the piece are antialiased from its own millimetres: a pixel cut by the edge shows its share. The object's edges
-take one sample per pixel, or `supersample`² on demand. Left out on purpose: transparency.
+The object's edges take one sample per pixel, or `supersample`² on demand; those of the piece are antialiased always
+(see `pixels`). Left out on purpose: transparency.
 """
 
 from __future__ import annotations
@@ -21,59 +21,23 @@ from torch import Tensor
 from patchproof.channel.camera import encoded, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Light, highlight, irradiance, light_of
-from patchproof.color import linear_from_srgb
-from patchproof.render.raster import Cameras, Fragments, rasterize
-from patchproof.render.stage import ObjectSurface, PieceSurface, Stage
-from patchproof.render.texture import Footprint, footprint, joined, layout, look_up
+from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.render.fragments import Cameras, Fragments
+from patchproof.render.pixels import (
+    OBJECT_LEARNED_TAPS,
+    OBJECT_TAPS,
+    ObjectPixels,
+    PiecePicture,
+    PiecePixels,
+    object_pixels,
+    piece_pixels,
+)
+from patchproof.render.raster import rasterize
+from patchproof.render.stage import Stage
+from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions, with_poses_of
 
 NEAR_SHARE = 1e-3  # of the object's length: nearer things are cut
-# Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
-# optimized designs 20 to 200 px wide, four 30. The object's own texture has one unless it is what is optimized.
-# What frames the design is seen with 4, and nothing is learned there.
-DESIGN_TAPS, FRAME_TAPS, OBJECT_TAPS, OBJECT_LEARNED_TAPS = 8, 4, 1, 4
-_LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
-
-
-@dataclass(frozen=True)
-class PiecePicture:
-    """The whole piece as it looks on paper, H×W×3 sRGB; `box_px` (x0, y0, x1, y1) is where the cut line falls, and
-    `design_px` where the design does.
-    """
-
-    srgb: Tensor
-    box_px: tuple[float, float, float, float]
-    design_px: tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class ObjectPixels:
-    """The object's fragments: in which pixel (of `samples`² each), what texels they look at, and how they are lit."""
-
-    pixel: Tensor
-    view: Tensor
-    texels: Footprint
-    color: Tensor  # P×3: what the texture is multiplied by
-    normal: Tensor
-    position_mm: Tensor | None  # where light needs it
-    samples: int
-
-
-@dataclass(frozen=True)
-class PiecePixels:
-    """Pixels that the piece covers, each its `share`; `white` is the light P×3 of the base picture's paper where a
-    scene is made of pictures, else None.
-    """
-
-    pixel: Tensor
-    view: Tensor
-    share: Tensor
-    texels: Footprint
-    normal: Tensor
-    position_mm: Tensor | None
-    white: Tensor | None
-    back_pixel: Tensor  # where its back is seen
-    back_share: Tensor
 
 
 @dataclass(frozen=True)
@@ -86,7 +50,7 @@ class Seen:
     frame_px: tuple[int, int]
     light: Light | None
     eye_mm: Tensor | None  # N×3
-    background: Tensor  # N·H·W × 3 linear
+    background: np.ndarray  # uint8 N×H×W×3 sRGB
     object: ObjectPixels | None
     piece: PiecePixels | None
 
@@ -104,21 +68,49 @@ class Seen:
     def bare(self) -> Tensor:
         """The lit object without the piece, N·H·W × 3."""
         if self.object is None:
-            return self.background
+            return self._behind
         return self.object_light(self.stage.object.texels(self.reduced))
 
     def object_light(self, texels: Tensor) -> Tensor:
-        """The lit object with these texels before its background; differentiable."""
+        """The lit object with these texels before its background, N·H·W × 3; differentiable."""
+        seen, color = self.object, self._object_color(texels)
+        if seen.samples == 1:
+            return self._behind.index_copy(0, seen.pixel, color)
+        share = torch.full_like(color[:, :1], 1 / seen.samples**2)
+        covered = torch.zeros_like(self._behind[:, :1]).index_add_(0, seen.pixel, share)
+        return (self._behind * (1 - covered)).index_add(0, seen.pixel, color * share)
+
+    def _object_color(self, texels: Tensor) -> Tensor:
+        """The light P×3 of the object's fragments."""
         seen = self.object
         light = irradiance(seen.normal, seen.view, self.light, seen.position_mm)[:, None]
-        color = look_up(seen.texels, texels) * (seen.color * light)
-        if seen.samples == 1:
-            return self.background.index_copy(0, seen.pixel, color)
-        share = 1 / seen.samples**2
-        covered = torch.zeros_like(self.background[:, :1]).index_add_(
-            0, seen.pixel, torch.full_like(color[:, :1], share)
-        )
-        return (self.background * (1 - covered)).index_add(0, seen.pixel, color * share)
+        return look_up(seen.texels, texels) * (seen.color * light)
+
+    @cached_property
+    def _behind(self) -> Tensor:
+        """The background's light before exposure, N·H·W × 3."""
+        codes = np.arange(256) / 255
+        tables = np.broadcast_to(linear_from_srgb(codes)[:, None], (len(self.background), 256, 3))
+        return _looked_up(self.background, tables, self.stage.device)
+
+    @cached_property
+    def bare_exposed(self) -> Tensor:
+        """The bare object as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
+        if self.object is not None and self.object.samples > 1:
+            return encoded((self.bare.view(len(self.conditions), -1, 3) * self.gains[:, None]).view(-1, 3))
+        # the background has 256 codes per view and channel, which are exposed as a table
+        light = linear_from_srgb(np.arange(256) / 255)[:, None] * self.gains[:, None].cpu().double().numpy()
+        image = _looked_up(self.background, srgb_from_linear(light.clip(0, 1)), self.stage.device)
+        if self.object is None:
+            return image
+        color = self._object_color(self.stage.object.texels(self.reduced))
+        color = color * self.gains.index_select(0, self.object.view)
+        return image.index_copy(0, self.object.pixel, encoded(color))
+
+    @cached_property
+    def gains(self) -> Tensor:
+        """The camera's factors, N×3."""
+        return gains(self.conditions, torch.zeros(0, device=self.stage.device))
 
     @cached_property
     def piece_white(self) -> Tensor:
@@ -135,17 +127,6 @@ class Seen:
             return None
         seen = self.piece
         return highlight(seen.normal, seen.position_mm, self.eye_mm, seen.view, self.light)[:, None]
-
-    @cached_property
-    def gains(self) -> Tensor:
-        """The camera's factors, N×3."""
-        return gains(self.conditions, self.background)
-
-    @cached_property
-    def bare_exposed(self) -> Tensor:
-        """The bare object as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
-        light = self.bare.view(len(self.conditions), -1, 3) * self.gains[:, None]
-        return encoded(light).view(-1, 3)
 
 
 def see(
@@ -176,7 +157,7 @@ def see(
     if piece is not None:
         surface = rasterize(stage.piece.vertices, stage.piece.faces, _cameras(stage, poses, matrix, frame_px), near_mm)
         hidden = _hidden_share(surface, fine.depth, pixel, supersample)
-        parts = _piece_pixels(stage.piece, piece, surface, hidden, needs_position=_local(light))
+        parts = piece_pixels(stage.piece, piece, surface, hidden, needs_position=_local(light))
     return Seen(
         stage,
         conditions,
@@ -185,7 +166,7 @@ def see(
         light,
         eye.to(stage.device),
         _background(stage, conditions, size_px, frame),
-        _object_pixels(stage.object, fine, pixel, supersample, light.lamp is not None, taps),
+        object_pixels(stage.object, fine, pixel, supersample, light.lamp is not None, taps),
         parts,
     )
 
@@ -231,95 +212,6 @@ def _hidden_share(piece: Fragments, depth: Tensor, pixel: Tensor, samples: int) 
     return torch.zeros_like(nearest).index_add_(0, pixel, in_front).index_select(0, piece.pixel)
 
 
-def _piece_pixels(
-    surface: PieceSurface,
-    piece: PiecePicture,
-    fragments: Fragments,
-    hidden: Tensor | None,
-    needs_position: bool = False,
-    white_coefficients: Tensor | None = None,
-) -> PiecePixels:
-    """What the piece's own fragments look at, and their share of each pixel."""
-    size = torch.tensor(surface.size_mm, dtype=torch.float32, device=fragments.face.device)
-    mm, mm_dx, mm_dy = _interpolated(surface.corner_mm, fragments)
-    # along each of its sides, how much of the pixel's own extent lies inside the cut line
-    half = (mm_dx.abs() + mm_dy.abs()).clamp_min(1e-9) / 2
-    low, high = (torch.minimum((mm + k * half).clamp_min(0), size) for k in (-1, 1))
-    share = ((high - low) / (2 * half)).prod(1)
-    if hidden is not None:
-        share = share * (1 - hidden)
-    shown = share > _LEAST_SHARE
-    kept = fragments.where(shown & fragments.front)
-    front, back = ((shown & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
-    mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
-    position = _weighted(surface.vertices.float()[surface.faces], kept) if needs_position else None
-    return PiecePixels(
-        kept.pixel,
-        kept.view,
-        share.index_select(0, front)[:, None],
-        _piece_footprint(piece, mm / size, mm_dx / size, mm_dy / size),
-        torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
-        position,
-        None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
-        fragments.pixel.index_select(0, back),
-        share.index_select(0, back)[:, None],
-    )
-
-
-def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor) -> Footprint:
-    """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
-    height, width, _ = piece.srgb.shape
-    x0, y0, x1, y1 = piece.box_px
-    scale, size = at.new_tensor([(x1 - x0) / width, (y1 - y0) / height]), at.new_tensor([width, height])
-    uv, uv_dx, uv_dy = at * scale + at.new_tensor([x0, y0]) / size, at_dx * scale, at_dy * scale
-    # whose pixel reaches into the design, or whose taps may read it: half a pixel and two texels
-    low, high = at.new_tensor(piece.design_px).view(2, 2) / size
-    reach = (uv_dx.abs() + uv_dy.abs()) * 0.75 + 2 / size
-    inside = ((uv + reach > low) & (uv - reach < high)).all(1)
-    where, parts = layout([(width, height)], wrap=False, device=at.device), []
-    for which, taps, learned in ((inside, DESIGN_TAPS, True), (~inside, FRAME_TAPS, False)):
-        index = which.nonzero()[:, 0]
-        one = (values.index_select(0, index) for values in (uv, uv_dx, uv_dy))
-        parts.append((index, footprint(where, at.new_zeros(len(index), dtype=torch.long), *one, taps, learned)))
-    return joined(parts, len(at))
-
-
-def _object_pixels(
-    surface: ObjectSurface, fragments: Fragments, pixel: Tensor, samples: int, needs_position: bool, taps: int
-) -> ObjectPixels:
-    """The object's fragments; faces seen from behind turn their normal round."""
-    uv, uv_dx, uv_dy = _interpolated(surface.corner_uv, fragments)
-    material = surface.material.index_select(0, fragments.face)
-    normal = torch.nn.functional.normalize(_weighted(surface.corner_normal, fragments), dim=-1)
-    return ObjectPixels(
-        pixel,
-        fragments.view,
-        footprint(surface.layout, material, uv, uv_dx, uv_dy, taps),
-        _weighted(surface.corner_color, fragments),
-        normal * torch.where(fragments.front, 1.0, -1.0)[:, None],
-        _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,
-        samples,
-    )
-
-
-def _weighted(corner_values: Tensor, fragments: Fragments) -> Tensor:
-    """Values F×3×C at the faces' corners, interpolated at the fragments."""
-    return _sum(corner_values, fragments.face, fragments.barycentric)
-
-
-def _interpolated(corner_values: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor, Tensor]:
-    """The same, and how it changes from pixel to pixel to the right and down."""
-    weights = (fragments.barycentric, fragments.barycentric_dx, fragments.barycentric_dy)
-    return tuple(_sum(corner_values, fragments.face, weight) for weight in weights)
-
-
-def _sum(corner_values: Tensor, face: Tensor, weight: Tensor) -> Tensor:
-    """P×C: a weighted gather, for which the library has a kernel that is ten times as fast as its parts."""
-    corner = face[:, None] * 3 + torch.arange(3, device=face.device)
-    table = corner_values.flatten(0, 1)
-    return torch.nn.functional.embedding_bag(corner, table, per_sample_weights=weight, mode="sum")
-
-
 def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Seen:
     """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
     scene, device, parts = stage.scene, stage.device, None
@@ -328,27 +220,22 @@ def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditio
         poses = torch.eye(4, dtype=torch.float64, device=device).expand(len(homographies), 4, 4)
         fragments = rasterize(stage.piece.vertices, stage.piece.faces, Cameras(poses, homographies, size_px), 1e-9)
         coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=device)
-        parts = _piece_pixels(stage.piece, piece, fragments, None, white_coefficients=coefficients)
-    background = _decoded(scene.pictures(conditions, size_px), device)
-    return Seen(stage, conditions, size_px, size_px, None, None, background, None, parts)
+        parts = piece_pixels(stage.piece, piece, fragments, None, white_coefficients=coefficients)
+    return Seen(stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts)
 
 
-def _white(coefficients: Tensor, uv: Tensor) -> Tensor:
-    """Quadratics P×3×6 of [1, u, v, u², uv, v²] at `uv` P×2."""
-    u, v = uv.unbind(1)
-    terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], 1)
-    return (coefficients * terms[:, None]).sum(-1).clamp_min(0)
-
-
-def _background(stage: Stage, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> Tensor:
-    """What lies behind N views, N·H·W × 3 linear light before exposure; its edge goes on in a lens's margin."""
+def _background(stage: Stage, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
+    """What lies behind N views, uint8 N×H×W×3 before exposure; its edge goes on in a lens's margin."""
     photo_px = stage.scene.settings.camera.photo_px
     pictures = [stage.scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.background]
     margin = ((0, 0), (frame.top, frame.bottom), (frame.left, frame.right), (0, 0))
-    return _decoded(np.pad(np.stack(pictures), margin, mode="edge"), stage.device)
+    return np.pad(np.stack(pictures), margin, mode="edge")
 
 
-def _decoded(pictures: np.ndarray, device: torch.device) -> Tensor:
-    """uint8 pictures as linear light, pixels by rows."""
-    table = linear_from_srgb(torch.arange(256, device=device) / 255)
-    return table[torch.as_tensor(pictures, device=device).int()].view(-1, 3)
+def _looked_up(codes: np.ndarray, tables: np.ndarray, device: torch.device) -> Tensor:
+    """uint8 pictures N×H×W×3 through tables N×256×3, pixels by rows."""
+    import cv2
+
+    pairs = zip(codes, tables.astype(np.float32), strict=True)
+    pictures = [cv2.LUT(np.ascontiguousarray(code), table[None]) for code, table in pairs]
+    return torch.as_tensor(np.stack(pictures), device=device).view(-1, 3)

@@ -179,16 +179,17 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
     under = _under(surface.chart, near, size_mm, GRID)
     faces = _grid_faces(_PIECE_NET)
     surface = surface.lifted(_top(surface, near, under, size_mm) + LIFT_MM)
-    for _ in range(2):  # flat cells dip below a round surface: they are laid once to see how far
-        pose = _pose(surface, frame, size_mm, spin_deg)
-        st = _mapped(surface, pose, size_mm)
-        vertices, normals = surface.points_and_normals(*st.T)
-        paper = heights(surface.chart, vertices[faces], size_mm, GRID)
-        at = net(size_mm, GRID) @ surface.chart.turn
-        surface = surface.lifted(max(0.0, float(np.nanmax(surface.height(*at.T) - paper))))
+    _, st = _spread(surface, frame, size_mm, spin_deg)
+    paper = heights(surface.chart, surface.points_and_normals(*st.T)[0][faces], size_mm, GRID)
+    at = net(size_mm, GRID) @ surface.chart.turn
+    # flat cells dip below a round surface
+    surface = surface.lifted(max(0.0, float(np.nanmax(surface.height(*at.T) - paper))))
+    pose, st = _spread(surface, frame, size_mm, spin_deg)
+    vertices, normals = surface.points_and_normals(*st.T)
+    paper = heights(surface.chart, vertices[faces], size_mm, GRID)
     clear = paper - under
     gaps = clear[np.isfinite(clear)] - LIFT_MM
-    gap, overhang = float(gaps.max()), 1 - len(gaps) / np.count_nonzero(np.isfinite(paper))
+    gap, overhang = float(gaps.max()), 1 - len(gaps) / int(np.isfinite(paper).sum())
     return Placement(
         family="exponential",
         size_mm=tuple(size_mm),
@@ -207,7 +208,7 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
 
 
 def _top(surface: Smooth, near: np.ndarray, under: np.ndarray, size_mm) -> float:
-    """How far the highest point under the piece stands over the surface; nets may miss ridges, which lie along edges."""
+    """How far the highest point under the piece stands over the surface; ridges lie along edges, and nets miss them."""
     ridges = surface.chart.local(edge_points(near, float(np.hypot(*size_mm)) / GRID))
     inside = (np.abs(ridges[:, :2] @ surface.chart.turn.T) <= np.array(size_mm) / 2).all(1)
     inside &= np.abs(ridges[:, 2]) <= np.hypot(*size_mm) / 2
@@ -216,23 +217,20 @@ def _top(surface: Smooth, near: np.ndarray, under: np.ndarray, size_mm) -> float
     return float(max(np.nanmax(sampled), peaks.max(initial=-np.inf)))
 
 
-def _pose(surface: Smooth, frame: Frame, size_mm, spin_deg: float) -> np.ndarray:
-    """4×4 world from piece of the plane that touches the surface at the piece's middle."""
+def _spread(surface: Smooth, frame: Frame, size_mm, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """4×4 world from piece of the plane that touches the surface at the piece's middle, and (s, t) of the piece's net;
+    refused where geodesics leave the neighborhood of the piece.
+    """
     middle, normal = (a[0] for a in surface.points_and_normals(np.zeros(1), np.zeros(1)))
     right, up = spun(_facing(frame, normal, middle), spin_deg)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, -up, -normal], 1)
     pose[:3, 3] = middle - right * size_mm[0] / 2 + up * size_mm[1] / 2
-    return pose
-
-
-def _mapped(surface: Smooth, pose: np.ndarray, size_mm) -> np.ndarray:
-    """(s, t) of the piece's net; refused where geodesics leave the neighborhood of the piece."""
     with np.errstate(all="ignore"):
-        st = exponential_map(surface, net(size_mm, _PIECE_NET), pose[:3, 0], -pose[:3, 1])
+        st = exponential_map(surface, net(size_mm, _PIECE_NET), right, up)
     if not (np.abs(st) < 2 * np.hypot(*size_mm)).all():
         raise Refused("a surface that paper can follow", "one that folds under the piece", _DO)
-    return st
+    return pose, st
 
 
 def _grid_faces(n: int) -> np.ndarray:

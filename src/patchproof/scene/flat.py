@@ -2,8 +2,8 @@
 
 Neither has a mesh. A view is a base picture carried onto the scene's photograph, and a homography that says where the
 piece lies in it. Pictures of any size become `photo_px` so that their *centered squares* agree, since the centered
-square is what classifiers see; beyond it a longer picture is cropped and a shorter one has its edge repeated. A square
-`size_px` asks for that centered square alone, any other for the whole photograph.
+square is what classifiers see; beyond it a longer picture is cropped and a shorter one is mirrored at its edge. A
+square `size_px` asks for that centered square alone, any other for the whole photograph.
 Left out on purpose: what lies in front of the piece (a hand, a handle); the new piece covers it.
 """
 
@@ -132,7 +132,7 @@ def show(
     picture: Picture, view_from_photo: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]
 ) -> np.ndarray:
     """The picture as uint8 H×W×3 in a view: carried by `view_from_photo` (both in the photograph's pixels), reduced
-    by area, its edge repeated.
+    by area, mirrored at its edge.
     """
     import cv2
 
@@ -151,7 +151,7 @@ def show(
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     index_from_size = np.linalg.inv(half) @ np.linalg.inv(whole @ to_level) @ half
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    view = cv2.warpAffine(shrunk, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    view = cv2.warpAffine(shrunk, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REFLECT)
     return view if fine == 1 else cv2.resize(view, size_px, interpolation=cv2.INTER_AREA)
 
 

@@ -121,7 +121,7 @@ def _hang(
     """The piece with markers as large as the views need, and where it lies."""
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
     design_mm = (patch.width_mm, patch.height_mm)
-    scales = _smallest_scales(settings, mesh, frame, place_card(mesh, frame, design_mm, patch.spin_deg), camera)
+    scales = _smallest_scales(settings, mesh, frame, place(mesh, frame, design_mm, patch.spin_deg), camera)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)

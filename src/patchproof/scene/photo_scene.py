@@ -236,5 +236,5 @@ def _refuse_larger_than_page(settings: SceneSettings, piece: Piece) -> None:
         raise Refused(
             f"a template that holds the blank's piece of {piece.size_mm[0]:.1f} × {piece.size_mm[1]:.1f} mm",
             f"{settings.sheet.template} with room for {width:.1f} × {height:.1f} mm",
-            "name a larger one in [sheet] template",
+            "name a larger template",
         )

@@ -142,7 +142,9 @@ def _visits(chart: Chart, triangles: np.ndarray, size_mm, n: int):
 
 
 def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far along its direction each line meets its triangle, and whether it does; edges belong to both sides."""
+    """How far along its direction each line meets its triangle, and whether it does; edges belong to both sides,
+    with 1e-6 of a triangle to spare, which closes the cracks of float32 files.
+    """
     a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(directions, edge_c)
     det = (edge_b * p).sum(-1)
@@ -151,4 +153,4 @@ def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tu
     det = np.where(flat, 1.0, det)
     q = np.cross(points - a, edge_b)
     b, c = ((points - a) * p).sum(-1) / det, (directions * q).sum(-1) / det
-    return (edge_c * q).sum(-1) / det, ~flat & (b >= -1e-9) & (c >= -1e-9) & (b + c <= 1 + 1e-9)
+    return (edge_c * q).sum(-1) / det, ~flat & (b >= -1e-6) & (c >= -1e-6) & (b + c <= 1 + 1e-6)

@@ -1,0 +1,80 @@
+"""What goes into rasterizing and what comes out: `Cameras`, `Fragments`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """N pinhole cameras: `camera_from_world` N×4×4 and `matrix_px` N×3×3, float64, for pictures of `size_px` (width,
+    height).
+    """
+
+    camera_from_world: Tensor
+    matrix_px: Tensor
+    size_px: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.camera_from_world)
+
+
+@dataclass(frozen=True)
+class Fragments:
+    """What P covered pixels see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
+
+    `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells whether the face shows its outside.
+    `seen` P (into Q) and `slopes` 6×Q are what the derivatives of the barycentrics are computed from when asked for.
+    """
+
+    pixel: Tensor
+    face: Tensor
+    barycentric: Tensor
+    depth: Tensor
+    front: Tensor
+    seen: Tensor
+    slopes: Tensor
+    shape: tuple[int, int, int]  # views, height, width
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+    @cached_property
+    def view(self) -> Tensor:
+        """P: the view of each fragment."""
+        return self.pixel // (self.shape[1] * self.shape[2])
+
+    @cached_property
+    def barycentric_dx(self) -> Tensor:
+        """P×3 float32: change of the barycentrics per pixel to the right."""
+        return self._derivative(0)
+
+    @cached_property
+    def barycentric_dy(self) -> Tensor:
+        """P×3 float32: change of the barycentrics per pixel down."""
+        return self._derivative(1)
+
+    def _derivative(self, axis: int) -> Tensor:
+        # d(e_i / t) = (de_i - e_i/t · dt) / t
+        first, second, total = (self.slopes[2 * i + axis].index_select(0, self.seen) for i in range(3))
+        b, z = self.barycentric, self.depth
+        first.addcmul_(b[:, 1], total, value=-1).mul_(z)
+        second.addcmul_(b[:, 2], total, value=-1).mul_(z)
+        return columns(-(first + second), first, second)
+
+    def where(self, keep: Tensor) -> Fragments:
+        """The fragments where `keep` (P, bool) is true."""
+        index = keep.nonzero()[:, 0]
+        fields = (self.pixel, self.face, self.barycentric, self.depth, self.front, self.seen)
+        return Fragments(*(field.index_select(0, index) for field in fields), self.slopes, self.shape)
+
+
+def columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """P×3 float32; `torch.stack` takes four times as long for columns this narrow."""
+    out = torch.empty(len(a), 3, device=a.device)
+    out[:, 0], out[:, 1], out[:, 2] = a, b, c
+    return out

@@ -1,0 +1,163 @@
+"""What a view's pixels look at: the object's fragments, and the piece's with their antialiased share of each pixel.
+
+In: fragments and the surfaces they lie on. Out: `ObjectPixels` and `PiecePixels`: texels with weights, normals, and
+positions where light needs them. The piece's edge is antialiased from its own millimetres: the share of a pixel's
+extent, along each of the piece's sides, that lies within the cut line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from patchproof.render.fragments import Fragments
+from patchproof.render.stage import ObjectSurface, PieceSurface
+from patchproof.render.texture import Footprint, footprint, joined, layout
+
+# Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
+# optimized designs 20 to 200 px wide, four 30. The object's own texture has one unless it is what is optimized.
+# What frames the design is seen with 4, and nothing is learned there.
+DESIGN_TAPS, FRAME_TAPS, OBJECT_TAPS, OBJECT_LEARNED_TAPS = 8, 4, 1, 4
+_LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
+
+
+@dataclass(frozen=True)
+class PiecePicture:
+    """The whole piece as it looks on paper, H×W×3 sRGB; `box_px` (x0, y0, x1, y1) is where the cut line falls, and
+    `design_px` where the design does.
+    """
+
+    srgb: Tensor
+    box_px: tuple[float, float, float, float]
+    design_px: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ObjectPixels:
+    """The object's fragments: in which pixel (of `samples`² each), what texels they look at, and how they are lit."""
+
+    pixel: Tensor
+    view: Tensor
+    texels: Footprint
+    color: Tensor  # P×3: what the texture is multiplied by
+    normal: Tensor
+    position_mm: Tensor | None  # where light needs it
+    samples: int
+
+
+@dataclass(frozen=True)
+class PiecePixels:
+    """Pixels that the piece covers, each its `share`; `white` is the light P×3 of the base picture's paper where a
+    scene is made of pictures, else None.
+    """
+
+    pixel: Tensor
+    view: Tensor
+    share: Tensor
+    texels: Footprint
+    normal: Tensor
+    position_mm: Tensor | None
+    white: Tensor | None
+    back_pixel: Tensor  # where its back is seen
+    back_share: Tensor
+
+
+def piece_pixels(
+    surface: PieceSurface,
+    piece: PiecePicture,
+    fragments: Fragments,
+    hidden: Tensor | None,
+    needs_position: bool = False,
+    white_coefficients: Tensor | None = None,
+) -> PiecePixels:
+    """What the piece's own fragments look at, and their share of each pixel."""
+    size = torch.tensor(surface.size_mm, dtype=torch.float32, device=fragments.face.device)
+    mm, mm_dx, mm_dy = _interpolated(surface.corner_mm, fragments)
+    # along each of its sides, how much of the pixel's own extent lies inside the cut line
+    half = (mm_dx.abs() + mm_dy.abs()).clamp_min(1e-9) / 2
+    low, high = (torch.minimum((mm + k * half).clamp_min(0), size) for k in (-1, 1))
+    share = ((high - low) / (2 * half)).prod(1)
+    if hidden is not None:
+        share = share * (1 - hidden)
+    shown = share > _LEAST_SHARE
+    kept = fragments.where(shown & fragments.front)
+    front, back = ((shown & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
+    mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
+    position = _weighted(surface.vertices.float()[surface.faces], kept) if needs_position else None
+    return PiecePixels(
+        kept.pixel,
+        kept.view,
+        share.index_select(0, front)[:, None],
+        _piece_footprint(piece, mm / size, mm_dx / size, mm_dy / size),
+        torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
+        position,
+        None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
+        fragments.pixel.index_select(0, back),
+        share.index_select(0, back)[:, None],
+    )
+
+
+def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor) -> Footprint:
+    """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
+    height, width, _ = piece.srgb.shape
+    x0, y0, x1, y1 = piece.box_px
+    scale, size = at.new_tensor([(x1 - x0) / width, (y1 - y0) / height]), at.new_tensor([width, height])
+    uv, uv_dx, uv_dy = at * scale + at.new_tensor([x0, y0]) / size, at_dx * scale, at_dy * scale
+    # whose pixel reaches into the design, or whose taps may read it: half a pixel and two texels
+    low, high = at.new_tensor(piece.design_px).view(2, 2) / size
+    reach = (uv_dx.abs() + uv_dy.abs()) * 0.75 + 2 / size
+    inside = ((uv + reach > low) & (uv - reach < high)).all(1)
+    where, parts = layout([(width, height)], wrap=False, device=at.device), []
+    for which, taps, learned in ((inside, DESIGN_TAPS, True), (~inside, FRAME_TAPS, False)):
+        index = which.nonzero()[:, 0]
+        one = (values.index_select(0, index) for values in (uv, uv_dx, uv_dy))
+        parts.append((index, footprint(where, at.new_zeros(len(index), dtype=torch.long), *one, taps, True, learned)))
+    return joined(parts, len(at))
+
+
+def object_pixels(
+    surface: ObjectSurface, fragments: Fragments, pixel: Tensor, samples: int, needs_position: bool, taps: int
+) -> ObjectPixels:
+    """The object's fragments; faces seen from behind turn their normal round."""
+    at = _weighted(surface.corners, fragments)
+    uv_dx, uv_dy = (
+        _sum(surface.corner_uv, fragments.face, slope) for slope in (fragments.barycentric_dx, fragments.barycentric_dy)
+    )
+    material = surface.material.index_select(0, fragments.face)
+    turned = torch.nn.functional.normalize(at[:, 5:8], dim=-1) * torch.where(fragments.front, 1.0, -1.0)[:, None]
+    return ObjectPixels(
+        pixel,
+        fragments.view,
+        footprint(surface.layout, material, at[:, :2], uv_dx, uv_dy, taps),
+        at[:, 2:5],
+        turned,
+        _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,
+        samples,
+    )
+
+
+def _weighted(corner_values: Tensor, fragments: Fragments) -> Tensor:
+    """Values F×3×C at the faces' corners, interpolated at the fragments."""
+    return _sum(corner_values, fragments.face, fragments.barycentric)
+
+
+def _interpolated(corner_values: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor, Tensor]:
+    """The same, and how it changes from pixel to pixel to the right and down."""
+    weights = (fragments.barycentric, fragments.barycentric_dx, fragments.barycentric_dy)
+    return tuple(_sum(corner_values, fragments.face, weight) for weight in weights)
+
+
+def _sum(corner_values: Tensor, face: Tensor, weight: Tensor) -> Tensor:
+    """P×C: a weighted gather, for which the library has a kernel that is ten times as fast as its parts."""
+    corner = face[:, None] * 3 + torch.arange(3, device=face.device)
+    table = corner_values.flatten(0, 1)
+    return torch.nn.functional.embedding_bag(corner, table, per_sample_weights=weight, mode="sum")
+
+
+def _white(coefficients: Tensor, uv: Tensor) -> Tensor:
+    """Quadratics P×3×6 of [1, u, v, u², uv, v²] at `uv` P×2."""
+    u, v = uv.unbind(1)
+    terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], 1)
+    return (coefficients * terms[:, None]).sum(-1).clamp_min(0)
