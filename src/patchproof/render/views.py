@@ -33,7 +33,7 @@ from patchproof.render.pixels import (
     piece_pixels,
 )
 from patchproof.render.raster import rasterize
-from patchproof.render.stage import Stage
+from patchproof.render.stage import ObjectSurface, PieceSurface, Stage
 from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions, with_poses_of
 
@@ -78,7 +78,10 @@ class Seen:
             return self._behind.index_copy(0, seen.pixel, color)
         share = torch.full_like(color[:, :1], 1 / seen.samples**2)
         covered = torch.zeros_like(self._behind[:, :1]).index_add_(0, seen.pixel, share)
-        return (self._behind * (1 - covered)).index_add(0, seen.pixel, color * share)
+        if not self.reduced:
+            return (self._behind * (1 - covered)).index_add(0, seen.pixel, color * share)
+        codes = srgb_from_linear(self._behind) * (1 - covered)
+        return linear_from_srgb(codes.index_add(0, seen.pixel, srgb_from_linear(color) * share))
 
     def _object_color(self, texels: Tensor) -> Tensor:
         """The light P×3 of the object's fragments."""
@@ -146,17 +149,18 @@ def see(
     near_mm = NEAR_SHARE * scene.settings.object.length_mm
     light = _light(stage, conditions)
     eye = torch.as_tensor(-(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], dtype=torch.float32)
-    fine = rasterize(
-        stage.object.vertices,
-        stage.object.faces,
-        _cameras(stage, poses, np.diag([supersample, supersample, 1]) @ matrix, frame_px, supersample),
-        near_mm,
-    )
-    pixel = _coarse_pixel(fine, frame_px, supersample)
+
+    def drawn(surface: ObjectSurface | PieceSurface, samples: int) -> Fragments:
+        fine = np.diag([samples, samples, 1]) @ matrix
+        cameras = _cameras(stage, poses, fine, (frame_px[0] * samples, frame_px[1] * samples))
+        return rasterize(surface.vertices, surface.faces, cameras, near_mm)
+
+    fine = drawn(stage.object, supersample)
     parts, taps = None, OBJECT_TAPS if scene.canvas is None else OBJECT_LEARNED_TAPS
     if piece is not None:
-        surface = rasterize(stage.piece.vertices, stage.piece.faces, _cameras(stage, poses, matrix, frame_px), near_mm)
-        hidden = _hidden_share(surface, fine.depth, pixel, supersample)
+        surface = drawn(stage.piece, 1)
+        covering = surface if supersample == 1 else drawn(stage.piece, supersample)
+        hidden = _hidden_share(surface, covering, fine, supersample)
         parts = piece_pixels(stage.piece, piece, surface, hidden, needs_position=_local(light))
     return Seen(
         stage,
@@ -166,7 +170,7 @@ def see(
         light,
         eye.to(stage.device),
         _background(stage, conditions, size_px, frame),
-        object_pixels(stage.object, fine, pixel, supersample, light.lamp is not None, taps),
+        object_pixels(stage.object, fine, _coarse_pixel(fine, supersample), supersample, light.lamp is not None, taps),
         parts,
     )
 
@@ -178,9 +182,9 @@ def relit(seen: Seen, conditions: Conditions) -> Seen:
     return replace(seen, conditions=conditions, light=light)
 
 
-def _cameras(stage: Stage, poses: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], fine: int = 1) -> Cameras:
+def _cameras(stage: Stage, poses: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -> Cameras:
     matrix = torch.as_tensor(matrix, device=stage.device).expand(len(poses), 3, 3)
-    return Cameras(torch.as_tensor(poses, device=stage.device), matrix, (size_px[0] * fine, size_px[1] * fine))
+    return Cameras(torch.as_tensor(poses, device=stage.device), matrix, size_px)
 
 
 def _light(stage: Stage, conditions: Conditions) -> Light:
@@ -193,23 +197,30 @@ def _local(light: Light) -> bool:
     return light.lamp is not None or light.gloss is not None
 
 
-def _coarse_pixel(fragments: Fragments, size_px: tuple[int, int], samples: int) -> Tensor:
-    """The pixel of `size_px` that each fragment of a picture `samples` times as fine lies in."""
+def _coarse_pixel(fine: Fragments, samples: int) -> Tensor:
+    """The pixel that each fragment lies in of a picture with `samples`² of them to the pixel."""
     if samples == 1:
-        return fragments.pixel
-    width, height = size_px
-    x, row = fragments.pixel % (width * samples), fragments.pixel // (width * samples)
-    y = row % (height * samples)
-    return (fragments.view * height + y // samples) * width + x // samples
+        return fine.pixel
+    _, height, width = fine.shape
+    x, row = fine.pixel % width, fine.pixel // width
+    y = row % height
+    return (fine.view * (height // samples) + y // samples) * (width // samples) + x // samples
 
 
-def _hidden_share(piece: Fragments, depth: Tensor, pixel: Tensor, samples: int) -> Tensor:
-    """Per fragment of the piece, the share of its pixel in which the object lies in front."""
-    views, height, width = piece.shape
-    nearest = torch.zeros(views * height * width, device=depth.device)
-    nearest[piece.pixel] = piece.depth
-    in_front = (depth < nearest.index_select(0, pixel)).float() / samples**2
-    return torch.zeros_like(nearest).index_add_(0, pixel, in_front).index_select(0, piece.pixel)
+def _hidden_share(piece: Fragments, covering: Fragments, front: Fragments, samples: int) -> Tensor:
+    """Per fragment of the piece, the share of the piece's samples in its pixel that the object lies in front of."""
+    nearest = torch.full(
+        (covering.shape[0] * covering.shape[1] * covering.shape[2],), torch.inf, device=piece.depth.device
+    )
+    nearest[front.pixel] = front.depth
+    hidden = (nearest.index_select(0, covering.pixel) < covering.depth).float()
+    if samples == 1:
+        return hidden
+    pixel, count = _coarse_pixel(covering, samples), piece.shape[0] * piece.shape[1] * piece.shape[2]
+    sums = torch.zeros(2, count, device=hidden.device)
+    sums[0].index_add_(0, pixel, hidden)
+    sums[1].index_add_(0, pixel, torch.ones_like(hidden))
+    return (sums[0] / sums[1].clamp_min(1)).index_select(0, piece.pixel)
 
 
 def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Seen:
