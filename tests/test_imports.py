@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "sheet": GROUND,
     "photo": GROUND | {"sheet"},
     "channel": GROUND,
-    "scene": GROUND | {"sheet", "photo"},
+    "scene": GROUND | {"sheet", "photo", "channel"},
     "render": GROUND | {"sheet", "photo", "channel", "scene"},
     "classifier": GROUND,
     "optimize": GROUND | {"sheet", "photo", "channel", "scene", "render", "classifier"},

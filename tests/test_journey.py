@@ -109,8 +109,8 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
             continue
         drawn = truth[photo["file"]]["conditions"]
         conditions = Conditions(**{k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
-        pose = scene.camera_from_world(conditions)[0] @ scene.card.world_from_piece
-        azimuth, _, distance = geometry.view_angles(pose, np.array(scene.card.size_mm) / 2)
+        pose = scene.camera_from_world(conditions)[0] @ scene.placement.world_from_piece
+        azimuth, _, distance = geometry.view_angles(pose, np.array(scene.placement.size_mm) / 2)
         assert photo["distance_mm"] == pytest.approx(distance, rel=0.04)
         assert photo["azimuth_deg"] == pytest.approx(azimuth, abs=2)
 

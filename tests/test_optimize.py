@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from patchproof.claims import wilson
-from patchproof.optimize import run
+from patchproof.optimize import loop, run
 from patchproof.optimize.goals import target_loss, total_variation
-from patchproof.optimize.loop import start, steps
-from patchproof.optimize.problem import as_pixels, from_pixels, set_problem
+from patchproof.optimize.loop import _step, start, steps
+from patchproof.optimize.pixels import as_pixels, from_pixels
+from patchproof.optimize.problem import set_problem
 from patchproof.optimize.promise import CONTROLS, promise_from, try_out
 from patchproof.optimize.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
@@ -76,7 +77,7 @@ def test_the_gradient_through_printer_scene_and_camera_is_a_difference_of_losses
     conditions = problem.scene.draw("train", 4)
 
     def loss(design):
-        pictures = photograph(problem.stage, problem.piece_picture(design), conditions, (32, 32))
+        pictures = photograph(problem.stage, problem.subject.shown(design), conditions, (32, 32))
         return target_loss(problem.classifiers[0].logits(pictures), (0,), "assist").mean()
 
     torch.manual_seed(0)
@@ -105,6 +106,19 @@ def test_a_signed_step_moves_each_pixel_by_the_step_size(tmp_path):
     assert step.gradient > 0
 
 
+def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
+    """All cameras behind the object: a gradient of zero, not an error."""
+    scene = scene_with(tmp_path, view__azimuth_deg=[-90, 90], optimize__steps=2)
+    problem = set_problem(scene)
+    behind = scene.draw("train", 4)
+    behind = replace(behind, azimuth_deg=np.full(4, 180.0))
+    shown = problem.subject.shown(start(problem).design.requires_grad_())
+    seen = problem.see(shown, behind, problem.training_px)
+    assert len(seen.piece.pixel) == 0
+    step = _step(problem, start(problem), seen)
+    assert step.gradient == 0 and torch.equal(step.state.design, start(problem).design)
+
+
 def test_the_design_kept_is_the_best_on_the_selection_set(tmp_path):
     problem = set_problem(scene_with(tmp_path, optimize__steps=30))
     tried = [step for step in steps(problem) if step.select_loss is not None]
@@ -122,7 +136,11 @@ def test_variation_and_gamut_terms_do_what_they_say(tmp_path):
 
     problem, plain = after()
     assert float(total_variation(after(optimize__tv=20.0)[1])) < 0.8 * float(total_variation(plain))
-    assert float(problem.gamut_excess(after(optimize__gamut=50.0)[1])) < 0.8 * float(problem.gamut_excess(plain))
+
+    def excess(design):
+        return float(problem.subject.printer.gamut_distance(design[None]).mean())
+
+    assert excess(after(optimize__gamut=50.0)[1]) < 0.8 * excess(plain)
 
 
 def test_a_design_survives_its_own_pixels():
@@ -132,7 +150,7 @@ def test_a_design_survives_its_own_pixels():
 
 def test_the_promise_counts_what_was_recognized(tmp_path):
     problem = set_problem(scene_with(tmp_path, target__label="blue"))
-    blue = np.zeros((*problem.printed_px[::-1], 3), np.uint8)
+    blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
     outcomes = try_out(problem, blue, problem.scene.draw("promise", 40))
     promise = promise_from(problem, outcomes)
@@ -149,8 +167,9 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
 
 @pytest.fixture
 def few_views(monkeypatch):
-    """A promise of fewer views, where its rate does not matter."""
-    monkeypatch.setattr(run, "PROMISE_VIEWS", 32)
+    """Fewer views to select by and to promise from, where rates do not matter."""
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 16)
 
 
 def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png")):

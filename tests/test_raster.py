@@ -10,7 +10,8 @@ import torch
 
 from patchproof import geometry
 from patchproof.render import raster
-from patchproof.render.raster import Cameras, rasterize
+from patchproof.render.fragments import Cameras
+from patchproof.render.raster import rasterize
 
 SIZE = (40, 32)
 
@@ -122,6 +123,7 @@ def drawn(monkeypatch):
         fill(nearest, length, pixel, *rest)
 
     monkeypatch.setattr(raster, "_fill", spy)
+    monkeypatch.setattr(raster, "CHUNK", 1 << 24)  # all views at once, so that pixels count from the first
     return pixels
 
 

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from patchproof.render import raster
-from patchproof.render.raster import Cameras, rasterize
+from patchproof.render.fragments import Cameras
+from patchproof.render.raster import rasterize
 from patchproof.settings import Refused
 from test_raster import SIZE, assert_same, cameras, sphere
 
@@ -178,7 +179,8 @@ def test_fifteen_full_pictures_of_a_megapixel_stay_below_1500_megabytes():
         pytest.skip("peak memory is read in Linux's unit")
     code = """
 import resource, torch
-from patchproof.render.raster import Cameras, rasterize
+from patchproof.render.fragments import Cameras
+from patchproof.render.raster import rasterize
 corners = torch.tensor([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=torch.float64)
 pose, matrix = torch.eye(4, dtype=torch.float64), torch.tensor([[512.0, 0, 512], [0, 512, 512], [0, 0, 1]])
 views = Cameras(pose.expand(15, 4, 4), matrix.double().expand(15, 3, 3), (1024, 1024))

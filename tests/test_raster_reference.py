@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from patchproof import geometry
-from patchproof.render.raster import Cameras, rasterize
+from patchproof.render.fragments import Cameras
+from patchproof.render.raster import rasterize
 from patchproof.scene.mesh import load_mesh
 from test_raster import cameras, picture, slow_twin
 

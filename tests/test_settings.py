@@ -1,6 +1,7 @@
 """Settings are strict: each mistake in a scene file is refused in one sentence that names it."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -73,9 +74,37 @@ def test_an_unknown_key_inside_lists_and_optional_tables_is_refused_too():
 
 
 def test_a_missing_key_is_named(tmp_path):
-    text = refusal(scene(tmp_path, ("length_mm = 100", "")))
-    assert '"object.length_mm"' in text and "add object.length_mm" in text
+    text = refusal(scene(tmp_path, ('label = "jeep"\n', "")))
+    assert '"target.label"' in text and "add target.label" in text
     assert '"target"' in refusal(scene(tmp_path, ('[target]\nlabel = "jeep"\nmodels = ["builtin"]\n', "")))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("length_mm = 100", "", 'usable "object".*object takes length_mm together with mesh'),
+        ('mesh = "primitive:mug"\n', "", 'usable "object".*object takes one of mesh, photos or images'),
+        ("length_mm = 100", 'length_mm = 100\nphotos = "p"\nsheet = "s"', "object takes one of mesh, photos or images"),
+        ('mesh = "primitive:mug"\nlength_mm = 100', 'photos = "p"', "object takes sheet together with photos"),
+        ('mesh = "primitive:mug"\nlength_mm = 100', 'images = "p"', "object takes labels together with images"),
+        ("height_mm = 30\n", "", "patch takes width_mm and height_mm together"),
+        ("width_mm = 40\nheight_mm = 30\n", "", r"got others: add patch\.width_mm and patch\.height_mm\.$"),
+        ("height_mm = 30", "height_mm = 30\nepsilon = 0.1", "epsilon with textures only"),
+        ("height_mm = 30", 'height_mm = 30\nkind = "masked"', "one of mask, materials or faces"),
+        ("height_mm = 30", 'height_mm = 30\nmask = "m.png"', 'mask with kind = "masked" only'),
+        ("height_mm = 30", 'height_mm = 30\nkind = "texture"\nbend = true', "bend with patches only"),
+    ],
+)
+def test_keys_that_go_together_are_named(tmp_path, old, new, sentence):
+    assert re.search(sentence, refusal(scene(tmp_path, (old, new))))
+
+
+def test_a_texture_needs_a_mesh(tmp_path):
+    changes = (
+        ('mesh = "primitive:mug"\nlength_mm = 100', 'images = "p"\nlabels = "l"'),
+        ("[patch]", '[patch]\nkind = "texture"'),
+    )
+    assert 'name object.mesh, or leave out patch.kind = "texture"' in refusal(scene(tmp_path, *changes))
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "0", "-5", '"wide"'])
@@ -102,6 +131,14 @@ def test_lengths_are_finite_positive_numbers(tmp_path, value):
         "[camera]\nwhite_balance = 0.6",
         "[background]\ncolor = [0.5, 0.5, 1.1]",
         "[background]\nimages = 'x'\ncolor = [0.5, 0.5, 0.5]",
+        "[light]\npoint = [1, 0.5]",
+        "[light]\npoint_distance_mm = [0, 100]",
+        "[light]\nsh2 = [0, 1.1]",
+        "[light]\nshininess = [0, 20]",
+        "[camera]\nvignetting = [0, 0.99]",
+        "[camera]\nmotion_px = [-1, 2]",
+        "[optimize]\nrefresh = 0",
+        "[view]\npatch_share = [0.1, 1.2]",
         "[optimize]\nsteps = 0",
         "[optimize]\nsteps = 1.5",
         "[optimize]\noptimizer = 'sgd'",

@@ -67,6 +67,27 @@ def demo(
 
 
 @app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
+    out: Annotated[Path | None, typer.Option(help="Write the plan as JSON, too.")] = None,
+    no_timing: Annotated[bool, typer.Option("--no-timing", help="Leave out the cost of a step.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """What is modeled, what is not, and why."""
+    from patchproof.output import check_file, write_whole
+    from patchproof.study.plan import plan_lines, plan_scene
+
+    if out is not None:
+        check_file(out, overwrite)
+    with _progress() as bar:
+        found = plan_scene(scene, timing=not no_timing, on_stage=bar)
+    _warn(found.warnings)
+    _say(*plan_lines(found))
+    if out is not None:
+        write_whole(out, lambda path: path.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8"))
+
+
+@app.command()
 def optimize(
     scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
     out: Annotated[Path, typer.Option(help="Folder for the run.")],
@@ -131,11 +152,15 @@ def sheet(
     from patchproof.optimize.run import load_run
     from patchproof.output import check_file
     from patchproof.sheet.write import check_sheet
-    from patchproof.study.sheet import sheet_of
+    from patchproof.study.sheet import blank_page, sheet_of
 
     for path in (out, out.with_suffix(".json")):
         check_file(path, overwrite)
-    manifest = sheet_of(load_run(run), out, template=template, control=control.value if control else None)
+    kind = control.value if control else None
+    if run is None:
+        manifest = blank_page(out, template=template, control=kind)
+    else:
+        manifest = sheet_of(load_run(run), out, template=template, control=kind)
     _say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {out.with_suffix('.json').name}")
     if check:
         _say(*check_sheet(manifest))
@@ -223,6 +248,21 @@ def verify(
             file=sys.stderr,
         )
     raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)
+
+
+@app.command()
+def bench(
+    name: Annotated[str, typer.Argument(help="A benchmark: render, or all.")] = "all",
+    quick: Annotated[bool, typer.Option("--quick", help="A minute: fewer views, rounds and sizes.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for charts, table and JSON.")] = Path("patchproof-bench"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Speed against accuracy of each knob on this machine: charts, a table and JSON."""
+    from patchproof.study.bench import run_bench
+
+    with _progress() as bar:
+        lines = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)
+    _say(*lines)
 
 
 def main() -> None:

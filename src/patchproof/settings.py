@@ -231,9 +231,11 @@ class SceneSettings(Strict):
     @model_validator(mode="after")
     def _has_its_parts(self):
         if self.patch.kind != "patch" and self.object.mesh is None:
-            raise ValueError("takes a texture with a mesh only")
+            raise ValueError(
+                f'name object.mesh, or leave out patch.kind = "{self.patch.kind}": only a mesh has a texture'
+            )
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
-            raise ValueError("takes patch.width_mm and patch.height_mm")
+            raise ValueError("add patch.width_mm and patch.height_mm")
         return self
 
 
@@ -312,6 +314,8 @@ def _explain(model: type[BaseModel], error: dict, where: str) -> Refused:
     value = value if len(value) < 80 else value[:77] + "..."
     reason = error["msg"].removeprefix("Value error, ").rstrip(".")
     reason = reason[0].lower() + reason[1:]
+    if not key:  # tables that do not go together
+        return Refused(f"settings in {where} that go together", "others", reason)
     return Refused(
         f'a usable "{key}" in {where}', value, f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
     )

@@ -31,8 +31,8 @@ READ_SHARE = 0.25
 def develop(linear: Tensor, conditions, scale: float, jpeg: bool = True, diagonal_share: float = 1.0) -> Tensor:
     """The picture that a camera makes; `conditions` as in `scene.conditions.Conditions`, one row per picture.
 
-    `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file. `diagonal_share` is what vignetting needs to know, from
-    `diagonal_share_of`.
+    `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
+    `diagonal_share` is what vignetting needs to know, from `diagonal_share_of`.
     """
     linear = vignetted(linear, torch.as_tensor(conditions.vignetting).to(linear), diagonal_share)
     linear = blurred(linear, torch.as_tensor(conditions.blur_px * scale).to(linear))

@@ -118,7 +118,14 @@ def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionCl
     scene, conditions, recognized = problem.scene, outcomes.conditions, outcomes.recognized["design"][0]
     if scene.piece is None:
         return tuple(
-            ConditionClaim(blur_px=_rounded(blur), recognized=bool(seen))
+            ConditionClaim(
+                px_per_mm=None,
+                tilt_deg=None,
+                azimuth_deg=None,
+                contrast=None,
+                blur_px=_rounded(blur),
+                recognized=bool(seen),
+            )
             for blur, seen in zip(conditions.blur_px, recognized, strict=True)
         )
     x, y, width, height = scene.piece.design_rect_mm

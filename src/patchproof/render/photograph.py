@@ -99,7 +99,7 @@ def expose(seen: Seen, shown: Shown, jpeg: bool = True) -> Tensor:
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor) -> Tensor:
     """`image` with the share of each pixel replaced by `value`."""
-    if not len(pixel):
+    if not len(pixel) and not value.requires_grad:  # a design that no view shows has a gradient, too: zero
         return image
     return image.index_copy(0, pixel, torch.lerp(image.index_select(0, pixel), value.expand(len(pixel), 3), share))
 

@@ -2,7 +2,9 @@
 others.
 
 In: a finished run. Out: SHEET.pdf and SHEET.json. The promise belongs to the design in the piece it was optimized with:
-another template, and with it another frame, would be another promise, which is then made anew.
+another template, and with it another frame, would be another promise, which is then made anew. A piece whose blank was
+photographed keeps its size on every template, or the template is refused. Before there is a run, `blank_page` writes
+the page that such photographs need.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
 from patchproof.optimize.run import Run
 from patchproof.scene.scene import build_scene
 from patchproof.settings import Refused
+from patchproof.sheet.blank import blank_sheet
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.piece import MODULES, control_design, lay_out_piece
 from patchproof.sheet.template import load_template
@@ -51,3 +54,12 @@ def sheet_of(run: Run, pdf_path: str | Path, *, template: str | None = None, con
         promise=promise if control is None else None,
         settings=settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]},
     )
+
+
+def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:
+    """Write the blank page of a template with a [blank] table, which needs no run; all else does."""
+    if control is not None:
+        raise Refused(f"the run whose {control} control belongs on the page", "none", "name the run")
+    if template is None:
+        raise Refused("a run, or the template of a blank page", "neither", "name a run, or --template blank_a4")
+    return blank_sheet(template, pdf_path)
