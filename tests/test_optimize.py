@@ -41,8 +41,10 @@ def scene_with(tmp_path, **changes):
 
 
 def toml(path, **changes):
+    """A scene file of small photographs: for tests of files, not of figures."""
     lines = []
     data = {key: dict(value) for key, value in SCENE.items()}
+    data["camera"] = {"photo_px": [96, 96]}
     for key, value in changes.items():
         table, name = key.split("__")
         data.setdefault(table, {})[name] = value

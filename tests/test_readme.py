@@ -8,7 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from patchproof.settings import SceneSettings, validated
 from test_journey import command
+
+try:
+    import tomllib
+except ModuleNotFoundError:
+    import tomli as tomllib
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 
@@ -20,19 +26,28 @@ def blocks(language: str) -> list[str]:
 @pytest.fixture(scope="module")
 def here(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
-    (toml,) = blocks("toml")
+    toml = blocks("toml")[0]
     # fewer steps than a user would take
     (folder / "scene.toml").write_text(toml + "\n[optimize]\nsteps = 3\nviews = 4\n", encoding="utf-8")
     return folder
 
 
 def test_commands(here, monkeypatch, capsys):
-    (shell,) = blocks("console")
     monkeypatch.chdir(here)
-    for line in shell.splitlines():
+    for line in blocks("console")[0].splitlines():
         program, *arguments = shlex.split(line)
         assert program == "patchproof"
         assert command(*arguments) == 0, capsys.readouterr().err
+
+
+def test_every_scene_is_one_and_every_option_exists(capsys):
+    for toml in blocks("toml"):
+        validated(SceneSettings, tomllib.loads(toml), "README.md")
+    for line in "".join(blocks("console")).splitlines():
+        _, verb, *arguments = shlex.split(line)
+        command(verb, "--help")
+        listed = capsys.readouterr().out
+        assert all(option in listed for option in arguments if option.startswith("--")), line
 
 
 def test_python(tmp_path, here, monkeypatch, capsys):

@@ -16,6 +16,7 @@ code that a judged photograph would get.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -142,10 +143,12 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int) -> PhotoSce
     manifest = load_manifest(expand(settings.object.sheet, base))
     design_mm, marker_mm = blank_piece_mm(manifest)
     settings = _with_size(settings, design_mm)
-    identity = sheet_id(settings.model_dump(mode="json") | {"blank": manifest.sheet_id}, seed)
+    folder = Path(expand(settings.object.photos, base))
+    known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
+    identity = sheet_id(settings.model_dump(mode="json") | known, seed)
     piece = lay_out_piece(design_mm, marker_mm, identity, "design")
     _refuse_larger_than_page(settings, piece)
-    photos, skipped = _see_all(Path(expand(settings.object.photos, base)), manifest, piece, settings.camera.photo_px)
+    photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)
     warnings = [f"{name} is left out: {reason}" for name, reason in skipped.items()]
     for photo in photos:
         if photo.light.unevenness > _UNEVEN:
@@ -172,10 +175,21 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
     return Seen(path.name, picture, photo_from_piece, light, blur)
 
 
+def _files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+
+
+def _digest(folder: Path) -> str:
+    """What the photographs are, so that a run does not go on with others."""
+    whole = hashlib.sha256()
+    for path in _files(folder):
+        whole.update(hashlib.sha256(path.read_bytes()).digest())
+    return whole.hexdigest()
+
+
 def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[Seen, ...], dict[str, str]]:
     """The usable photographs of a folder in the order of their names, and why others are not."""
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
-    photos, skipped = [], {}
+    files, photos, skipped = _files(folder), [], {}
     for path in files:
         try:
             photos.append(see(path, manifest, piece, photo_px))
