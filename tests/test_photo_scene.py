@@ -14,7 +14,7 @@ from patchproof.geometry import apply_homography, intrinsics, look_at, plane_hom
 from patchproof.photo.cannot import CannotJudge
 from patchproof.scene import flat
 from patchproof.scene.paper_light import paper_light, quadratic_terms
-from patchproof.scene.photo_scene import load_photo_scene, see
+from patchproof.scene.photo_scene import _digest, load_photo_scene, see
 from patchproof.settings import Refused, SceneSettings, shipped
 from patchproof.sheet.blank import blank_sheet
 from patchproof.sheet.manifest import Manifest, dump_manifest
@@ -147,8 +147,9 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert {m.id for m in scene.piece.markers} != {m.id for m in blank.markers}
     assert (scene.settings.patch.width_mm, scene.settings.patch.height_mm) == (110.0, 110.0)
     assert all("unreadable" in warning for warning in scene.warnings)
-    # the id follows from the settings with the blank's size filled in, as a run keeps them
-    known = scene.settings.model_dump(mode="json") | {"blank": world.manifest.sheet_id}
+    # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
+    digest = _digest(scene.base / scene.settings.object.photos)
+    known = scene.settings.model_dump(mode="json") | {"blank": world.manifest.sheet_id, "photos": digest}
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 

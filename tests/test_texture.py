@@ -262,7 +262,7 @@ def test_a_repeated_texture_has_no_seam(scale):
 
 
 def test_tables_of_large_textures_take_seconds():
-    """2048² in 0.2 s and 0.4 GB; 4096² 0.6 s, 1.3 GB; 8192², the largest that was tried, 5 s and 4.1 GB (one core)."""
+    """2048² in 0.2 s and 0.4 GB; 4096², the largest that meshes keep, 0.6 s and 1.3 GB (one core)."""
     texture = torch.zeros(2048, 2048, 3)
     start = time.perf_counter()
     table = texel_table([texture], wrap=True)

@@ -24,7 +24,7 @@ from patchproof.channel.camera import (
 )
 from patchproof.channel.lens import distorted
 from patchproof.channel.printer import vary
-from patchproof.color import linear_from_srgb
+from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, light_texels
 from patchproof.render.texture import look_up, texel_table
@@ -69,10 +69,10 @@ def shade(seen: Seen, shown: Shown) -> Tensor:
     if shown is None:
         return _as_pictures(seen, image)
     piece = seen.piece
-    image = _blend(image, piece.back_pixel, piece.back_share, image.new_full((1, 3), PAPER_BACK_LINEAR))
+    image = _blend(image, piece.back_pixel, piece.back_share, image.new_full((1, 3), PAPER_BACK_LINEAR), seen.reduced)
     if _own_blur(seen) or _own_noise(seen):
         return _pasted(seen, image, _piece_light(seen, shown))
-    return _as_pictures(seen, _blend(image, piece.pixel, piece.share, _piece_light(seen, shown)))
+    return _as_pictures(seen, _blend(image, piece.pixel, piece.share, _piece_light(seen, shown), seen.reduced))
 
 
 def expose(seen: Seen, shown: Shown, jpeg: bool = True) -> Tensor:
@@ -80,7 +80,8 @@ def expose(seen: Seen, shown: Shown, jpeg: bool = True) -> Tensor:
     stage, scale = seen.stage, _scale(seen)
     bends = stage.camera is not None and stage.camera.bends
     own = shown is not None and (_own_blur(seen) or _own_noise(seen))
-    if bends or own or isinstance(shown, ObjectTextures) or not is_pointwise(seen.conditions, scale, jpeg):
+    alone = seen.reduced and is_pointwise(seen.conditions, scale, jpeg)
+    if bends or own or isinstance(shown, ObjectTextures) or not alone:
         light = shade(seen, shown)
         if bends:
             light = distorted(light, stage.camera, seen.size_px)
@@ -91,17 +92,22 @@ def expose(seen: Seen, shown: Shown, jpeg: bool = True) -> Tensor:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
         piece, pixels = seen.piece, seen.frame_px[0] * seen.frame_px[1]
         back = encoded(PAPER_BACK_LINEAR * seen.gains.index_select(0, piece.back_pixel // pixels))
-        image = _blend(image, piece.back_pixel, piece.back_share, back)
+        image = _blend(image, piece.back_pixel, piece.back_share, back, False)
         light = _piece_light(seen, shown) * seen.gains.index_select(0, piece.view)
-        image = _blend(image, piece.pixel, piece.share, encoded(light))
+        image = _blend(image, piece.pixel, piece.share, encoded(light), False)
     return _as_pictures(seen, image)
 
 
-def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor) -> Tensor:
-    """`image` with the share of each pixel replaced by `value`."""
+def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:
+    """`image` with the share of each pixel replaced by `value`; of light `by_code`, averaged as code values."""
     if not len(pixel) and not value.requires_grad:  # a design that no view shows has a gradient, too: zero
         return image
-    return image.index_copy(0, pixel, torch.lerp(image.index_select(0, pixel), value.expand(len(pixel), 3), share))
+    before, value = image.index_select(0, pixel), value.expand(len(pixel), 3)
+    if by_code:
+        mixed = linear_from_srgb(torch.lerp(srgb_from_linear(before), srgb_from_linear(value), share))
+    else:
+        mixed = torch.lerp(before, value, share)
+    return image.index_copy(0, pixel, mixed)
 
 
 def _piece_light(seen: Seen, picture: PiecePicture) -> Tensor:

@@ -17,6 +17,8 @@ import numpy as np
 
 from patchproof.settings import Refused
 
+# Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, and no photograph of an object shows as much.
+LARGEST_TEXTURE_PX = 4096
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
@@ -71,7 +73,28 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z") -
     from patchproof.scene.mesh_file import read_parts
 
     parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
-    return from_parts(parts, length_mm, warnings)
+    parts, reduced = _within_limit(parts)
+    return from_parts(parts, length_mm, (*warnings, *reduced))
+
+
+def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
+    """The parts with textures of at most LARGEST_TEXTURE_PX a side, and warnings about those that were larger."""
+    import cv2
+
+    known: dict[int, Material] = {}
+    warnings = []
+    for material in (part.material for part in parts):
+        texture = material.texture_srgb
+        if id(material) in known or texture is None or max(texture.shape[:2]) <= LARGEST_TEXTURE_PX:
+            known.setdefault(id(material), material)
+            continue
+        height, width = texture.shape[:2]
+        scale = LARGEST_TEXTURE_PX / max(width, height)
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        reduced = cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
+        known[id(material)] = replace(material, texture_srgb=reduced)
+        warnings.append(f"the texture of {width} × {height} of {material.name} is reduced to {size[0]} × {size[1]}")
+    return [replace(part, material=known[id(part.material)]) for part in parts], warnings
 
 
 def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
