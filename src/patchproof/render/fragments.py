@@ -49,6 +49,11 @@ class Fragments:
         return self.pixel // (self.shape[1] * self.shape[2])
 
     @cached_property
+    def corner(self) -> Tensor:
+        """P×3: where the corners of each fragment's face lie in a list of all faces' corners."""
+        return torch.add(self.face[:, None] * 3, torch.arange(3, device=self.face.device))
+
+    @cached_property
     def barycentric_dx(self) -> Tensor:
         """P×3 float32: change of the barycentrics per pixel to the right."""
         return self._derivative(0)

@@ -74,7 +74,7 @@ def piece_pixels(
 ) -> PiecePixels:
     """What the piece's own fragments look at, and their share of each pixel."""
     size = torch.tensor(surface.size_mm, dtype=torch.float32, device=fragments.face.device)
-    mm, mm_dx, mm_dy = _interpolated(surface.corner_mm, fragments)
+    mm, (mm_dx, mm_dy) = _weighted(surface.corner_mm, fragments), _slopes(surface.corner_mm, fragments)
     # along each of its sides, how much of the pixel's own extent lies inside the cut line
     half = (mm_dx.abs() + mm_dy.abs()).clamp_min(1e-9) / 2
     low, high = (torch.minimum((mm + k * half).clamp_min(0), size) for k in (-1, 1))
@@ -121,10 +121,7 @@ def object_pixels(
     surface: ObjectSurface, fragments: Fragments, pixel: Tensor, samples: int, needs_position: bool, taps: int
 ) -> ObjectPixels:
     """The object's fragments; faces seen from behind turn their normal round."""
-    at = _weighted(surface.corners, fragments)
-    uv_dx, uv_dy = (
-        _sum(surface.corner_uv, fragments.face, slope) for slope in (fragments.barycentric_dx, fragments.barycentric_dy)
-    )
+    at, (uv_dx, uv_dy) = _weighted(surface.corners, fragments), _slopes(surface.corner_uv, fragments)
     material = surface.material.index_select(0, fragments.face)
     turned = torch.nn.functional.normalize(at[:, 5:8], dim=-1) * torch.where(fragments.front, 1.0, -1.0)[:, None]
     return ObjectPixels(
@@ -140,18 +137,17 @@ def object_pixels(
 
 def _weighted(corner_values: Tensor, fragments: Fragments) -> Tensor:
     """Values F×3×C at the faces' corners, interpolated at the fragments."""
-    return _sum(corner_values, fragments.face, fragments.barycentric)
+    return _sum(corner_values, fragments.corner, fragments.barycentric)
 
 
-def _interpolated(corner_values: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor, Tensor]:
-    """The same, and how it changes from pixel to pixel to the right and down."""
-    weights = (fragments.barycentric, fragments.barycentric_dx, fragments.barycentric_dy)
-    return tuple(_sum(corner_values, fragments.face, weight) for weight in weights)
+def _slopes(corner_values: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor]:
+    """How the same change from pixel to pixel, to the right and down."""
+    weights = (fragments.barycentric_dx, fragments.barycentric_dy)
+    return tuple(_sum(corner_values, fragments.corner, weight) for weight in weights)
 
 
-def _sum(corner_values: Tensor, face: Tensor, weight: Tensor) -> Tensor:
+def _sum(corner_values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
     """P×C: a weighted gather, for which the library has a kernel that is ten times as fast as its parts."""
-    corner = face[:, None] * 3 + torch.arange(3, device=face.device)
     table = corner_values.flatten(0, 1)
     return torch.nn.functional.embedding_bag(corner, table, per_sample_weights=weight, mode="sum")
 
