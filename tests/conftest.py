@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", min(2, os.cpu_count() or 1))))
+torch.set_num_threads(1)  # the tests run side by side, a process per core
 
 
 @pytest.fixture(scope="session")
