@@ -60,6 +60,7 @@ noise = [0, 0.02]
 [optimize]
 steps = 120
 views = 16
+seed = 1
 """
 
 
