@@ -163,7 +163,8 @@ def test_markers_that_a_smaller_photograph_cannot_show_are_counted(scene):
 def test_a_square_is_the_middle_of_the_photograph(scene):
     conditions = scene.draw("promise", 4)
     whole, square = scene.pictures(conditions, SIZE), scene.pictures(conditions, (600, 600))
-    assert np.abs(whole[:, :, 100:700].astype(int) - square).max() <= 1
+    apart = np.abs(whole[:, :, 100:700].astype(int) - square)
+    assert apart.max() <= 4 and apart.mean() < 0.05  # OpenCV before 5 places samples in 32nds of a pixel
     point = np.array([[30.0, 70.0]])
     for a, b in zip(
         scene.piece_homographies(conditions, SIZE), scene.piece_homographies(conditions, (224, 224)), strict=True
