@@ -12,9 +12,9 @@ import pytest
 import patchproof
 
 ROOT = Path(patchproof.__file__).parent
-GROUND = {"claims", "color", "geometry", "output", "settings"}
+GROUND = {"claims", "color", "geometry", "output", "settings", "workers"}
 MAY_IMPORT = {
-    **{module: {"settings"} if module == "output" else set() for module in GROUND},
+    **{module: {"settings"} if module in {"output", "workers"} else set() for module in GROUND},
     "sheet": GROUND,
     "photo": GROUND | {"sheet"},
     "channel": GROUND,

@@ -48,6 +48,9 @@ class Shown(str, Enum):
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, typer.Option(help="cpu or cuda.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on where a run that was stopped left off.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Local processes that share the work.")]
+Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, in place of local processes.")]
 Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
 
@@ -218,7 +221,8 @@ def verify(
     ] = None,
     ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that measure photographs.")] = 1,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure photographs of the print and judge them against the promise."""
@@ -237,6 +241,7 @@ def verify(
             scan_dpi=scan_dpi,
             ruler_mm=None if ruler_mm is None else _pair(ruler_mm, "--ruler-mm"),
             jobs=jobs,
+            cluster=cluster,
             overwrite=overwrite,
             on_photo=lambda done, total: bar("verify", done, total),
         )
@@ -248,6 +253,35 @@ def verify(
             file=sys.stderr,
         )
     raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)
+
+
+@app.command()
+def study(
+    name: Annotated[str, typer.Argument(help="A study's name.")],
+    config: Annotated[Path, typer.Option(help="What to vary: a TOML file.")],
+    out: Annotated[Path, typer.Option(help="Folder for tables, figures and the page.")],
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """One of the paper's experiments: many cells, tables with intervals, figures and one page."""
+    from patchproof.study.study import run_study
+
+    with _progress() as bar:
+        finished = run_study(
+            name,
+            config,
+            out,
+            resume=resume,
+            overwrite=overwrite,
+            jobs=jobs,
+            cluster=cluster,
+            on_cell=lambda done, total: bar("cells", done, total),
+        )
+    _say_study(finished)
+    _say(f"page: {out / name}.html")
+    raise typer.Exit(0 if finished.results else 1)
 
 
 @app.command()
@@ -315,6 +349,16 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
 def _say(*lines: str) -> None:
     for line in lines:
         print(line)
+
+
+def _say_study(finished) -> None:
+    """A study's tables, and on standard error what failed."""
+    from patchproof.report.tables import text_lines
+
+    for table in finished.tables:
+        _say(table.title, *(f"  {line}" for line in text_lines(table)))
+    for cell, sentence in finished.failed.items():
+        print(f"failed: {cell}: {sentence}", file=sys.stderr)
 
 
 def _warn(lines: tuple[str, ...]) -> None:

@@ -23,6 +23,11 @@ class Refused(ValueError):
 
     def __init__(self, expected: str, got: str, do: str):
         super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
+        self._parts = expected, got, do
+
+    def __reduce__(self):
+        # exceptions are rebuilt from their message when they come back from another process; this one has three parts
+        return Refused, self._parts
 
 
 def shipped(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:

@@ -33,6 +33,7 @@ def verify_photos(
     scan_dpi: float | None = None,
     ruler_mm: tuple[float, float] | None = None,
     jobs: int = 1,
+    cluster: str | None = None,
     overwrite: bool = False,
     on_photo: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
@@ -53,6 +54,7 @@ def verify_photos(
             scan_dpi=scan_dpi,
             controls=controls,
             jobs=jobs,
+            cluster=cluster,
             progress=on_photo,
         )
         if ruler_mm is not None:

@@ -8,8 +8,7 @@ behind, which the networks then see in batches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from patchproof.verify.ranges import PromisedRanges, matched_rate, promised_rang
 from patchproof.verify.results import Control, Evidence, ModelRate, PhotoEntry, Report, Summary
 from patchproof.verify.surface import Promised, Surface, promised_of, surface_of
 from patchproof.verify.verdict import Verdict, compare, effect_of, judge
+from patchproof.workers import open_workers
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
@@ -47,14 +47,14 @@ def gather_evidence(
     controls: str | Path | None = None,
     camera_focal_px: float | None = None,
     jobs: int = 1,
-    executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    cluster: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Evidence:
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
     `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
-    `camera_focal_px` replaces the EXIF focal length. `progress` is called with (done, all). An `executor` is used
-    instead of `jobs` local processes.
+    `camera_focal_px` replaces the EXIF focal length. `progress` is called with (done, all). Photographs
+    are measured by `jobs` local processes or by a Dask cluster's workers.
     """
     paths = list_photos(photos)
     control_paths = _list_controls(controls) if controls is not None else {}
@@ -62,11 +62,13 @@ def gather_evidence(
         check_primary(models, manifest.promise)
     task = _task(manifest, models, printer, scan_dpi, camera_focal_px)
     total = len(paths) + sum(map(len, control_paths.values()))
-    with _looking(jobs, executor) as run:
-        looks = list(_counted(run(partial(_look, task), enumerate(paths)), progress, 0, total))
+    with open_workers(jobs, cluster) as workers:
+        looks = workers.map(partial(_look, task), enumerate(paths), lambda done, _: progress(done, total))
         control_looks, done = {}, len(paths)
         for name, files in control_paths.items():
-            control_looks[name] = list(_counted(run(partial(_glance, task), files), progress, done, total))
+            control_looks[name] = workers.map(
+                partial(_glance, task), files, lambda more, _, done=done: progress(done + more, total)
+            )
             done += len(files)
     indices = {m.name: target_indices(m, manifest) for m in models} if manifest.promise else {}
     entries = _with_predictions(looks, models, indices)
@@ -170,42 +172,6 @@ def _glance(task: _Task, path: Path) -> tuple[str, dict[int, np.ndarray] | None]
         return path.name, squares_of(read_photo(path).srgb, task.sizes_px)
     except CannotJudge:
         return path.name, None
-
-
-class _looking:
-    """`map` in this process, in local processes, or on a given executor; closes what it opened."""
-
-    def __init__(self, jobs: int, executor: Executor | None):
-        self._own = None
-        if executor is None and jobs > 1:
-            import multiprocessing
-
-            # spawn: forking a process that has run torch threads can hang
-            self._own = executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _one_thread)
-        self._executor = executor
-
-    def __enter__(self):
-        return map if self._executor is None else self._executor.map
-
-    def __exit__(self, *_):
-        if self._own is not None:
-            self._own.shutdown(cancel_futures=True)
-
-
-def _one_thread() -> None:
-    """Processes share the machine; threads inside of each would only fight over it."""
-    import cv2
-    import torch
-
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-
-
-def _counted(results: Iterator, progress, done: int, total: int) -> Iterator:
-    for number, result in enumerate(results, done + 1):
-        if progress is not None:
-            progress(number, total)
-        yield result
 
 
 def _with_predictions(looks: Sequence[_Looked], models, indices) -> list[PhotoEntry]:

@@ -1,0 +1,291 @@
+"""Studies: many independent cells, each finished one kept, so that a study that was killed goes on where it was.
+
+In: a study's name and one strict TOML file. Out: a folder with `NAME.json` (settings, every cell's values, failures,
+tables), a CSV per table, a PNG per figure, `NAME.html`, and `cells/`, one JSON per finished cell, written whole. A cell
+that fails is reported with its sentence and the rest goes on; `resume` does again what failed or is missing. Cells
+compute on one thread each, so the tables are the same for any number of jobs, on a cluster, and after a kill.
+
+A study is a module with a `STUDY`; its parts get plain values and know nothing of files, processes or resuming.
+Left out on purpose: cells that depend on one another (one cell trains and tests), and times (they would differ).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from patchproof.output import check_folder, make_folder, write_whole
+from patchproof.report.study_page import study_page
+from patchproof.report.tables import Drawing, Table, csv_text, png
+from patchproof.settings import Refused, Strict, nearest, read_toml, validated
+from patchproof.workers import Workers, one_thread, open_workers, result_of
+
+# by name the module whose STUDY it is, imported when asked for
+STUDIES: dict[str, str] = {}
+_LIBRARIES = ("patchproof", "torch", "numpy")
+_NAME = re.compile(r"[\w=+.,-]{1,120}")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One piece of work. `name` is unique and becomes a file's; `values` are JSON values and all that it depends on
+    besides the settings: a finished cell whose values have changed since is done again.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished cell and what `run` returned for it, after a way through JSON: tuples are lists, keys are text.
+
+    What `run` gave as `bytes` lies in the file that stands in its place, relative to the study's folder `out`.
+    """
+
+    cell: Cell
+    found: Mapping[str, Any]
+    out: Path
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study's parts: functions of a module's top level, so that they reach other processes.
+
+    `cells(settings, base)` lists the work; paths in settings are relative to the config's folder `base`.
+    `run(settings, base, cell)` does one cell: JSON values and, under keys that are file names, bytes to be kept.
+    `tables(settings, results)` and `figures(settings, results)` get the finished cells in the order of `cells`; some
+    may be missing. Whatever `run` needs at random follows from the settings' seed and the cell's values.
+    """
+
+    name: str
+    about: str
+    settings: type[Strict]
+    cells: Callable[[Any, Path], Sequence[Cell]]
+    run: Callable[[Any, Path, Cell], dict[str, Any]]
+    tables: Callable[[Any, Sequence[Result]], Sequence[Table]]
+    figures: Callable[[Any, Sequence[Result]], Sequence[Drawing]]
+    files: str = "files"  # folder for what cells gave as bytes; "." is the study's own
+    own_files: tuple[str, ...] = ("files",)  # patterns of names that --overwrite may replace besides
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A study's tables and what failed, cell by cell."""
+
+    tables: tuple[Table, ...]
+    results: tuple[Result, ...]
+    failed: dict[str, str]
+
+
+def load_study(name: str) -> Study:
+    """The study of that name; refused with the nearest one where there is none."""
+    if name not in STUDIES:
+        raise Refused("the name of a study", f'"{name}"', nearest(name, STUDIES))
+    return import_module(STUDIES[name]).STUDY
+
+
+def run_study(
+    name: str,
+    config: str | Path,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    jobs: int = 1,
+    cluster: str | None = None,
+    on_cell: Callable[[int, int], None] = lambda done, total: None,
+) -> Finished:
+    """Run the study that the TOML file describes into the folder `out`."""
+    study = load_study(name)
+    settings = validated(study.settings, read_toml(config), str(config))
+    base = Path(config).resolve().parent
+    return carry_out(
+        study,
+        settings,
+        base,
+        out,
+        resume=resume,
+        overwrite=overwrite,
+        jobs=jobs,
+        cluster=cluster,
+        on_cell=on_cell,
+    )
+
+
+def carry_out(
+    study: Study,
+    settings: Strict,
+    base: Path,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    jobs: int = 1,
+    cluster: str | None = None,
+    on_cell: Callable[[int, int], None] = lambda done, total: None,
+) -> Finished:
+    """Run a study with settings at hand; `on_cell` is called with (done, all)."""
+    out = Path(out)
+    if not resume:
+        check_folder(out, _own(study), overwrite)
+    cells = tuple(study.cells(settings, base))
+    _check_cells(study, cells)
+    with open_workers(jobs, cluster) as workers:
+        _begin(study, settings, out, resume)
+        found = {cell.name: values for cell in cells if (values := _kept(out, cell)) is not None}
+        failed = _do_cells(study, settings, base, cells, out, workers, found, on_cell)
+    results = tuple(Result(cell, found[cell.name], out) for cell in cells if cell.name in found)
+    tables = tuple(study.tables(settings, results)) if results else ()
+    figures = tuple(study.figures(settings, results)) if results else ()
+    _write(study, settings, out, tables, figures, results, failed)
+    return Finished(tables, results, failed)
+
+
+def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
+    names = [cell.name for cell in cells]
+    bad = [name for name in names if not _NAME.fullmatch(name) or names.count(name) > 1]
+    if bad:
+        raise ValueError(f"cells of {study.name} need unique names that files can have, got {bad[0]!r}")
+    if not cells:
+        raise Refused(f"settings that leave the study {study.name} something to do", "no cells", "ask for more")
+
+
+def _own(study: Study) -> tuple[str, ...]:
+    return (f"{study.name}.json", f"{study.name}.html", f"{study.name}_*", "cells", ".*.part", *study.own_files)
+
+
+def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
+    """The study's settings in `out`, which must be the same where one goes on."""
+    path, said = out / f"{study.name}.json", settings.model_dump(mode="json")
+    if resume and path.is_file():
+        if _read(path).get("settings") != said:
+            do = "give it the same settings, or another --out"
+            raise Refused(f"the settings that {out} was begun with, to resume it", "others", do)
+        return
+    if resume:  # nothing was begun: as without it, so that no stranger's files are mistaken for the study's
+        check_folder(out, ())
+    else:
+        for pattern in _own(study):
+            for old in out.glob(pattern):
+                shutil.rmtree(old) if old.is_dir() else old.unlink()
+    make_folder(out / "cells")
+    _write_json(path, {"study": study.name, "settings": said})
+
+
+def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
+    """What an earlier run found for this very cell, with its files in place."""
+    path = out / "cells" / f"{cell.name}.json"
+    if not path.is_file():
+        return None
+    try:
+        kept = _read(path)
+    except Refused:  # cut short when the machine went down
+        return None
+    if kept.get("cell") != _through_json(cell.values) or not all((out / name).is_file() for name in kept["files"]):
+        return None
+    return kept["found"]
+
+
+def _do_cells(study, settings, base, cells, out, workers: Workers, found, on_cell) -> dict[str, str]:
+    """Do what is not in `found` and put it there; the sentences of those that failed, in the order of cells."""
+    todo, failed = [cell for cell in cells if cell.name not in found], {}
+    done = len(cells) - len(todo)
+    on_cell(done, len(cells))
+    for number, future in workers.completed(partial(_run_cell, study.run, settings, base), todo):
+        cell, done = todo[number], done + 1
+        try:
+            values, files, sentence = result_of(future)
+        except Exception as error:  # a worker that died
+            values, files, sentence = {}, {}, _sentence(error)
+        if sentence is None:
+            found[cell.name] = _keep(study, out, cell, values, files)
+        else:
+            failed[cell.name] = sentence
+        on_cell(done, len(cells))
+    return {cell.name: failed[cell.name] for cell in cells if cell.name in failed}
+
+
+def _run_cell(run, settings: Strict, base: Path, cell: Cell) -> tuple[dict, dict[str, bytes], str | None]:
+    """(JSON values, bytes, None), or why not: errors do not travel, since not every one survives it."""
+    try:
+        with one_thread():
+            found = run(settings, base, cell)
+        files = {key: value for key, value in found.items() if isinstance(value, bytes)}
+        return _through_json({key: value for key, value in found.items() if key not in files}), files, None
+    except Exception as error:  # also what a user's own network raises
+        return {}, {}, _sentence(error)
+
+
+def _sentence(error: Exception) -> str:
+    text = " ".join(str(error).split())[:500]
+    return text if isinstance(error, Refused) else f"{type(error).__name__}: {text}"
+
+
+def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, bytes]) -> dict[str, Any]:
+    """Write the cell's files, then its JSON, each whole: the JSON says that all of it is there."""
+    names = {key: (Path(study.files) / key).as_posix() for key in files}
+    for key, name in names.items():
+        make_folder((out / name).parent)
+        write_whole(out / name, lambda path, key=key: path.write_bytes(files[key]))
+    found = values | names
+    _write_json(
+        out / "cells" / f"{cell.name}.json", {"cell": dict(cell.values), "found": found, "files": list(names.values())}
+    )
+    return found
+
+
+def _write(study, settings, out: Path, tables, figures, results, failed) -> None:
+    drawn = [(drawing, png(drawing)) for drawing in figures]
+    for table in tables:
+        text = csv_text(table)
+        write_whole(out / f"{study.name}_{table.name}.csv", lambda path, text=text: path.write_text(text, "utf-8"))
+    for drawing, content in drawn:
+        write_whole(out / f"{study.name}_{drawing.name}.png", lambda path, content=content: path.write_bytes(content))
+    said, versions, total = settings.model_dump(mode="json"), _versions(), len(results) + len(failed)
+    page = study_page(study.name, study.about, tables, drawn, failed, total, said, versions)
+    write_whole(out / f"{study.name}.html", lambda path: path.write_text(page, "utf-8"))
+    data = {
+        "study": study.name,
+        "settings": said,
+        "versions": versions,
+        "tables": {table.name: asdict(table) for table in tables},
+        "cells": {one.cell.name: {"cell": dict(one.cell.values), "found": one.found} for one in results},
+        "failed": failed,
+    }
+    _write_json(out / f"{study.name}.json", data)
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # run from a checkout
+            continue
+    return found
+
+
+def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a reader of the JSON will find, also now: a resumed study must not see other types than one in one go."""
+    return json.loads(json.dumps(dict(values), allow_nan=False))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise Refused("a study's JSON", f"{path} that cannot be read ({error})", "remove it") from error
+
+
+def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+    text = json.dumps(data, indent=1, allow_nan=False) + "\n"
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))

@@ -1,0 +1,218 @@
+"""Independent work in this process, in local processes, or on a Dask cluster: one `concurrent.futures.Executor`.
+
+In: a function and items that can be pickled. Out: results, as they finish or in order. A worker that dies costs a
+retry, not a result: what was in flight is done again by others, and what was in flight when local processes died goes
+alone, so that only the item that kills its worker is given up.
+
+Other processes work on one thread each, which keeps them from fighting over the machine; with one thread here, too,
+the results are the same wherever they were made. A cluster's machines need this package and see the same files at the
+same paths. Left out on purpose: sharing data between items. Each names files, and workers keep what they load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+from patchproof.settings import Refused
+
+Numbered = tuple[int, Any]
+TRIES = 3  # of an item whose worker dies each time
+QUEUED = 1000  # items that a cluster is given at a time: enough to keep it busy, and for it to see what is to come
+_ANSWER_S = 10  # that a cluster's scheduler may take to answer
+
+
+class Workers:
+    """An open executor with what it needs to start anew; `open_workers` makes and closes it."""
+
+    def __init__(self, start: Callable[[], Executor], in_flight: int):
+        self._start, self._in_flight = start, in_flight
+        self._executor = start()
+
+    def completed(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[int, Future]]:
+        """(number of the item, its finished future), as they finish; few items more than are in work are taken."""
+        suspects: list[Numbered] = []
+        yield from self._flow(function, enumerate(items), self._in_flight, suspects)
+        for suspect in suspects:
+            yield from self._alone(function, suspect)
+
+    def map(
+        self,
+        function: Callable[[Any], Any],
+        items: Iterable[Any],
+        on_done: Callable[[int, int], None] = lambda done, total: None,
+    ) -> list[Any]:
+        """The results in the order of the items; the first exception of one is raised. `on_done` gets (done, all)."""
+        items = list(items)
+        results = [None] * len(items)
+        for done, (number, future) in enumerate(self.completed(function, items), 1):
+            results[number] = result_of(future)
+            on_done(done, len(items))
+        return results
+
+    def close(self) -> None:
+        """Stop the workers; what has not begun is dropped."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def _flow(
+        self, function, numbered: Iterable[Numbered], in_flight: int, lost: list[Numbered]
+    ) -> Iterator[tuple[int, Future]]:
+        """Keep `in_flight` items in work; those whose workers died are left in `lost`."""
+        todo, running = iter(numbered), {}
+        while True:
+            while len(running) < in_flight and (one := next(todo, None)) is not None:
+                running[self._submit(function, one[1])] = one
+            if not running:
+                return
+            finished = wait(running, return_when=FIRST_COMPLETED).done
+            broken = any(map(_broke, finished))
+            if broken:
+                finished = wait(running).done  # one dead process breaks the pool, and with it all that was in flight
+            for future in finished:
+                one = running.pop(future)
+                if _broke(future):
+                    lost.append(one)
+                else:
+                    yield one[0], future
+            if broken:
+                self._executor.shutdown(wait=True)
+                self._executor = self._start()
+
+    def _alone(self, function, suspect: Numbered) -> Iterator[tuple[int, Future]]:
+        for _ in range(TRIES):
+            lost: list[Numbered] = []
+            yield from self._flow(function, [suspect], 1, lost)
+            if not lost:
+                return
+        future: Future = Future()
+        future.set_exception(
+            Refused("a worker that lives through its work", f"one that died {TRIES} times", "give it more memory")
+        )
+        yield suspect[0], future
+
+    def _submit(self, function, item) -> Future:
+        try:
+            return self._executor.submit(function, item)
+        except BrokenExecutor as error:  # a process died while nobody waited
+            future: Future = Future()
+            future.set_exception(error)
+            return future
+
+
+@contextmanager
+def open_workers(jobs: int = 1, cluster: str | None = None) -> Iterator[Workers]:
+    """`jobs` local processes (1: this one, with its own threads), or the Dask cluster whose scheduler is at `cluster`.
+
+    Local processes are spawned: a script that calls this with jobs > 1 needs the `if __name__ == "__main__"` guard.
+    """
+    if cluster is None:
+        workers = Workers(partial(_processes, jobs), 2 * jobs) if jobs > 1 else Workers(_Here, 1)
+        try:
+            yield workers
+        finally:
+            workers.close()
+        return
+    if jobs > 1:
+        raise Refused("--jobs or --cluster", "both", "leave one out: a cluster knows how many workers it has")
+    with _client(cluster) as client:
+        yield Workers(lambda: _OneThreadEach(client.get_executor(pure=False)), QUEUED)
+
+
+def result_of(future: Future) -> Any:
+    """A finished future's result or its exception; refused in a sentence where the cluster itself was lost."""
+    try:
+        return future.result()
+    except CancelledError:
+        raise Refused("a cluster that stays", "one whose scheduler is gone", "start it again") from None
+    except Exception as error:
+        if type(error).__name__ == "KilledWorker":  # of distributed, which need not be installed here
+            do = "give workers more memory"
+            raise Refused("a worker that lives through its work", "several that died of it", do) from error
+        raise
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """torch and OpenCV compute on one thread inside, and as before afterwards."""
+    import cv2
+    import torch
+
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+
+
+class _Here(Executor):
+    """Work done at once, in this process."""
+
+    def submit(self, function, /, *args) -> Future:
+        future: Future = Future()
+        try:
+            future.set_result(function(*args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class _OneThreadEach(Executor):
+    """Another executor, each of whose tasks sets its thread's thread count: a cluster's workers are not ours."""
+
+    def __init__(self, executor: Executor):
+        self._executor = executor
+
+    def submit(self, function, /, *args) -> Future:
+        return self._executor.submit(_on_one_thread, function, *args)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._executor.shutdown(wait=wait)
+
+
+def _on_one_thread(function, *args):
+    with one_thread():
+        return function(*args)
+
+
+def _processes(jobs: int) -> Executor:
+    import multiprocessing
+
+    # spawn: forking a process that has run torch threads can hang
+    return _OneThreadEach(ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")))
+
+
+@contextmanager
+def _client(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError:
+        do = 'pip install "patchproof[cluster]"'
+        raise Refused("dask.distributed for --cluster", "none", do) from None
+    try:
+        client = Client(address, timeout=_ANSWER_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        do = "start dask scheduler there, or mend the address"
+        raise Refused("a Dask scheduler, such as tcp://host:8786", f"{address} ({reason})", do) from error
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _broke(future: Future) -> bool:
+    return not future.cancelled() and isinstance(future.exception(), BrokenExecutor)

@@ -1,0 +1,84 @@
+"""A small study, and functions for workers to run: they live here so that other processes can import them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from patchproof.report.tables import Drawing, Table, rate
+from patchproof.settings import Refused, Strict
+from patchproof.study.study import Cell, Study
+
+
+class ToySettings(Strict):
+    numbers: tuple[int, ...]
+    pause_s: float = 0.0
+    die_in: str | None = None  # a folder; a cell's worker dies while the file named after the cell is there
+
+
+def cells(settings, base):
+    return [Cell(f"n{number}", {"number": number}) for number in settings.numbers]
+
+
+def run(settings, base, cell):
+    number = cell.values["number"]
+    time.sleep(settings.pause_s)
+    if settings.die_in is not None:
+        die_once(Path(settings.die_in) / cell.name)
+    if number == 13:
+        raise Refused("a number that brings luck", "13", "use another")
+    if number == 14:
+        raise ArithmeticError("over\nflow")
+    if number == 15:
+        return {"square": float("nan")}
+    return {"square": number**2, "parts": (1, 2), f"n{number}.txt": str(number).encode()}
+
+
+def tables(settings, results):
+    rows = tuple((one.cell.name, one.found["square"], rate([one.found["square"] > 3] * 4)) for one in results)
+    return (Table("squares", "Squares", ("cell", "square", "large"), rows, "of whole numbers"),)
+
+
+def figures(settings, results):
+    def draw(figure):
+        figure.add_subplot().plot([one.found["square"] for one in results])
+
+    return (Drawing("squares", "Squares", draw, (3.0, 2.0)),)
+
+
+STUDY = Study("toy", "Squares of numbers.", ToySettings, cells, run, tables, figures)
+
+
+def double(number):
+    return 2 * number
+
+
+def refuse(number):
+    raise Refused("a", f"{number}", "c")
+
+
+def threads(_):
+    import torch
+
+    return torch.get_num_threads()
+
+
+def die_once(path: Path) -> None:
+    """Kill this process, the first time."""
+    if path.exists():
+        path.unlink()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def double_or_die(task):
+    folder, number = task
+    die_once(Path(folder) / str(number))
+    return 2 * number
+
+
+def double_unless_three(number):
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 2 * number
