@@ -26,6 +26,17 @@ app = typer.Typer(
 )
 
 
+calibrate = typer.Typer(no_args_is_help=True, help="Measure a printer or a camera from photographs or a profile.")
+app.add_typer(calibrate, name="calibrate")
+
+
+class Intent(str, Enum):
+    """How a driver brings colors into its printer's gamut."""
+
+    relative = "relative"
+    perceptual = "perceptual"
+
+
 class Control(str, Enum):
     """Controls that can be printed."""
 
@@ -255,6 +266,39 @@ def verify(
     raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)
 
 
+@calibrate.command("printer")
+def calibrate_printer(
+    out: Annotated[Path, typer.Option(help="NAME.npz; NAME.json is written beside it.")],
+    more: Annotated[list[Path] | None, typer.Argument(metavar="[PHOTO]...", help="More photographs.")] = None,
+    icc: Annotated[Path | None, typer.Option(help="An RGB or CMYK output profile.")] = None,
+    intent: Annotated[Intent, typer.Option(help="The profile's intent that the driver is set to.")] = Intent.relative,
+    licence: Annotated[str, typer.Option(help="Of the profile, for the record.")] = "unknown",
+    source: Annotated[str, typer.Option(help="Where the profile is from, for the record.")] = "unknown",
+    chart: Annotated[
+        list[Path] | None, typer.Option(help="Photographs of the printed chart; a folder holds those of one print.")
+    ] = None,
+    sheet: Annotated[Path | None, typer.Option(help="The manifest of the chart's page.")] = None,
+    camera: Annotated[str | None, typer.Option(help="A camera file with a tone curve.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """A printer from its ICC profile, or from photographs of its printed chart."""
+    from patchproof.calibrate.printer import printer_from_chart, printer_from_icc
+
+    photos = [*(chart or []), *(more or [])]
+    if (icc is None) == (chart is None) or (more and chart is None):
+        raise typer.BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
+    if icc is not None:
+        lines, warned = printer_from_icc(icc, out, intent.value == "perceptual", licence, source, overwrite), ()
+    elif sheet is None:
+        raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
+    else:
+        with _progress() as bar:
+            on_photo = lambda done, total: bar("chart", done, total)  # noqa: E731
+            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, on_photo)
+    _warn(warned)
+    _say(*lines)
+
+
 @app.command()
 def study(
     name: Annotated[str, typer.Argument(help="A study's name.")],
@@ -286,7 +330,7 @@ def study(
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="A benchmark: render, or all.")] = "all",
+    name: Annotated[str, typer.Argument(help="A benchmark: render, printer, or all.")] = "all",
     quick: Annotated[bool, typer.Option("--quick", help="A minute: fewer views, rounds and sizes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for charts, table and JSON.")] = Path("patchproof-bench"),
     overwrite: Overwrite = False,

@@ -1,10 +1,11 @@
 """A printer from an ICC output profile.
 
-In: an RGB or CMYK profile of class `prtr`. Out: a `Printer` whose table follows the chain sRGB → printer → sRGB, both
-legs relative colorimetric: bare paper is 1, and an eye's or camera's adaptation to the paper is not applied twice.
+In: an RGB or CMYK profile of class `prtr`. Out: a `Printer` whose table follows the chain sRGB → printer → sRGB. The
+way to the printer takes the intent that the driver is set to, relative colorimetric or perceptual; the way back is
+always relative colorimetric: bare paper is 1, and an eye's or camera's adaptation to it is not applied twice.
 LittleCMS (through Pillow) works in 8 bits here; without NOOPTIMIZE it replaces the chain by a coarse one (ΔE00 up to 5
 on coated, 14 on uncoated paper). A bake measures its table against the exact chain and keeps the figures.
-Left out on purpose: black point compensation and perceptual intents; printer drivers differ in both.
+Left out on purpose: black point compensation, in which drivers differ.
 
     python -m patchproof.calibrate.icc FOGRA39L_coated.icc --name coated --licence CC0 --source "colord project" --out .
 """
@@ -28,12 +29,19 @@ from patchproof.settings import Refused
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
 _D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1
 _CHECKED_COLORS = 10_000
+_INTENTS = {
+    False: "relative colorimetric both ways, no black point compensation",
+    True: "perceptual to the printer, relative colorimetric back, no black point compensation",
+}
 
 
-def bake(profile_path: Path, name: str, licence: str, source: str) -> Printer:
-    """The printer of a profile; `licence` and `source` are what the caller knows of it and go into provenance."""
+def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: bool = False) -> Printer:
+    """The printer of a profile; `licence` and `source` are what the caller knows of it and go into provenance.
+
+    `perceptual` is the intent on the way to the printer, else relative colorimetric.
+    """
     data = _profile_bytes(Path(profile_path))
-    show, profile = _chain(data, Path(profile_path).name)
+    show, profile = _chain(data, Path(profile_path).name, perceptual)
     nodes = np.round(node_colors() * 255).astype(np.uint8)
     lut = show(nodes)
     white = lut[-1, -1, -1]
@@ -49,7 +57,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str) -> Printer:
             "profile": (profile.profile_description or "").strip(),
             "profile_sha256": hashlib.sha256(data).hexdigest(),
             "profile_colors": profile.xcolor_space.strip(),
-            "intents": "relative colorimetric both ways, no black point compensation",
+            "intents": _INTENTS[perceptual],
             "relative_to": f"paper: sRGB white is seen as {white.tolist()} of 255",
             "table": f"{len(NODES_8BIT)} nodes per channel at 0, 8, ..., 248, 255; trilinear",
             "delta_e00_to_exact_chain": _table_error(printer, show),
@@ -94,7 +102,7 @@ def _profile_bytes(path: Path) -> bytes:
     return data
 
 
-def _chain(data: bytes, file_name: str):
+def _chain(data: bytes, file_name: str, perceptual: bool = False):
     """(uint8 ... × 3 sRGB sent → uint8 sRGB seen, the profile's description) by LittleCMS."""
     from PIL import Image, ImageCms
 
@@ -107,10 +115,11 @@ def _chain(data: bytes, file_name: str):
         got = f"class {kind} with {colors} in {file_name}"
         raise Refused("a printer's profile (class prtr, RGB or CMYK)", got, "use the profile of your printer and paper")
     relative, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags
+    there = ImageCms.Intent.PERCEPTUAL if perceptual else relative
     srgb = ImageCms.createProfile("sRGB")
     exact = flags.SOFTPROOFING | flags.NOOPTIMIZE | flags.NOCACHE
     try:
-        chain = ImageCms.buildProofTransform(srgb, srgb, profile, "RGB", "RGB", relative, relative, flags=exact)
+        chain = ImageCms.buildProofTransform(srgb, srgb, profile, "RGB", "RGB", there, relative, flags=exact)
     except (ImageCms.PyCMSError, ValueError) as error:
         got = f"{file_name} without them ({error})"
         raise Refused("a profile with tables to and from the printer", got, "use another one") from error

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from patchproof.settings import Finite, Positive, Refused, Strict, nearest, shipped, validated
+from patchproof.settings import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,6 +52,7 @@ class Camera(Strict):
     p1: Finite = 0.0
     p2: Finite = 0.0
     k3: Finite = 0.0
+    tone_light: Annotated[tuple[Share, ...], Field(min_length=5, max_length=4096)] | None = None  # see `tone`
 
     @property
     def bends(self) -> bool:
@@ -82,6 +83,7 @@ def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int
         raise Refused("a camera file (JSON)", f"{path} that cannot be read", "calibrate again") from error
     camera = validated(Camera, data, str(path))
     _refuse_outside(camera, path)
+    _refuse_tone(camera, path)
     _refuse_folded(camera, path)
     if photo_px is not None:
         _refuse_aspect(camera, photo_px, path)
@@ -217,6 +219,16 @@ def _refuse_outside(camera: Camera, path: Path) -> None:
             f"a principal point inside the picture of {width} × {height} px in {path}",
             f"({camera.cx:g}, {camera.cy:g})",
             "give cx, cy and image_px in the same pixels",
+        )
+
+
+def _refuse_tone(camera: Camera, path: Path) -> None:
+    light = camera.tone_light
+    if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
+        raise Refused(
+            f"a tone_light in {path} that grows from 0 to 1 at every step",
+            f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not",
+            "give the light at evenly spaced code values, or leave it out for sRGB's curve",
         )
 
 

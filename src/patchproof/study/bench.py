@@ -133,9 +133,10 @@ def run_bench(
 
 
 def _benches() -> dict[str, Callable[[bool, OnStage], Iterator[Chart]]]:
+    from patchproof.study.bench_printer import printer_charts
     from patchproof.study.bench_render import render_charts
 
-    return {"render": render_charts}
+    return {"render": render_charts, "printer": printer_charts}
 
 
 def machine() -> dict[str, Any]:

@@ -1,0 +1,284 @@
+"""A printer from photographs of its printed chart.
+
+In: photographs of one or several prints of a page with a chart, its manifest, the camera if it is known. Out: a
+`Printer` whose provenance holds every rung of the ladder, every photograph and what they disagree by. Light relative to
+paper is averaged over the photographs of a print (their median from three on), then over prints; what prints differ by
+is told in the terms of `channel.printer.vary`.
+
+Without the camera's tone curve the table is an *appearance* model: what this camera showed of this printer, decoded as
+sRGB. Both curves are one product in a photograph, and nothing on the page tells them apart. With it, light is the
+page's own, and the table is the printer's. Either is what the paper shows under the light it was photographed in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from patchproof.calibrate.chart_photo import ChartPhoto, read_chart
+from patchproof.calibrate.ladder import Choice, Map, choose, difference, rungs
+from patchproof.channel.lens import Camera
+from patchproof.channel.printer import (
+    BLACK_LIFT,
+    DENSITY,
+    DOT_GAIN,
+    Printer,
+    load_printer,
+    node_colors,
+    printer_from_table,
+    vary,
+)
+from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.read import SUFFIXES, read_photo
+from patchproof.settings import Refused
+from patchproof.sheet.manifest import Manifest
+
+PRIORS = ("coated", "uncoated")
+LEAST_SWATCHES = 4  # paper, black and two more
+STRANGE_PHOTO = 5.0  # ΔE00 from its print's other photographs: more than any light or camera explains
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One photograph that could be read: its file, which print it shows (from 0), and the chart in it."""
+
+    path: Path
+    of_print: int
+    chart: ChartPhoto
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The printer, how its model was chosen, and what one should know of the photographs."""
+
+    printer: Printer
+    choice: Choice
+    readings: tuple[Reading, ...]
+    warnings: tuple[str, ...]
+
+
+def calibrate_chart(
+    prints: Sequence[Sequence[Path]],
+    manifest: Manifest,
+    name: str,
+    camera: Camera | None = None,
+    on_photo: Callable[[int, int], None] = lambda done, total: None,
+) -> Calibration:
+    """The printer that these photographs show; each inner list holds those of one print."""
+    readings, warnings = _read_all(prints, manifest, camera, on_photo)
+    by_print = [
+        combine([one.chart.light for one in readings if one.of_print == i])
+        for i in sorted({one.of_print for one in readings})
+    ]
+    light = combine(by_print, robust=False)
+    sent = np.array([swatch.srgb for swatch in manifest.chart])
+    known = np.isfinite(light).all(1)
+    if known.sum() < LEAST_SWATCHES:
+        do = "photograph the whole chart from closer, sharp and not too light"
+        raise Refused(f"at least {LEAST_SWATCHES} readable swatches", f"{known.sum()}", do)
+    choice = choose(rungs(known_printers()), sent[known], srgb_from_linear(light[known]))
+    agreement = _agreement(readings, by_print)
+    warnings += [
+        f"{one.path.name} differs from the other photographs of its print by ΔE00 {error:.1f}: glare, or another print?"
+        for one, error in zip(readings, agreement, strict=True)
+        if error is not None and error > STRANGE_PHOTO
+    ]
+    provenance = {
+        "source": f"{len(readings)} photographs of {len(by_print)} print{'s' if len(by_print) > 1 else ''} of a chart",
+        "model_of": model_of(camera),
+        "camera": None if camera is None else camera.name,
+        "sheet_id": manifest.sheet_id,
+        "relative_to": "paper: sRGB white is seen as bare paper",
+        "chosen": choice.name,
+        "ladder": ladder_table(choice),
+        "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": int((~known).sum())},
+        "delta_e00_of_duplicates": _duplicates(sent[known], light[known]),
+        "print_to_print": print_variation(by_print),
+        "photographs": [_row(one, error) for one, error in zip(readings, agreement, strict=True)],
+        "uncertainty": f"mean ΔE00 {choice.figure.delta_e00:.2f} of {choice.held_out} held-out colors of the chart",
+    }
+    return Calibration(printer_of(name, choice.predict, provenance), choice, tuple(readings), tuple(warnings))
+
+
+def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
+    """Photographs by print: each folder holds those of one print; single files are all of one."""
+    singles, prints = [path for path in paths if not path.is_dir()], []
+    for folder in (path for path in paths if path.is_dir()):
+        inside = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not inside:
+            raise Refused("a folder with photographs of one print", f"none in {folder}", "name the photographs")
+        prints.append(inside)
+    for path in singles:
+        if not path.is_file():
+            raise Refused("a photograph of the chart", f"no file at {path}", "check the path")
+    return ([singles] if singles else []) + prints
+
+
+def model_of(camera: Camera | None) -> str:
+    """What a table from this camera's photographs describes."""
+    if camera is not None and camera.tone_light is not None:
+        return "printer: the camera's tone curve is taken out"
+    why = "no camera file" if camera is None else f"no tone_light in the camera file {camera.name}"
+    return f"appearance: printer and camera tone together, as this camera shows the print ({why})"
+
+
+def known_printers() -> dict[str, Map]:
+    """The shipped printers as maps of N×3 sRGB."""
+    return {name: map_of(load_printer(name)) for name in PRIORS}
+
+
+def map_of(printer: Printer) -> Map:
+    """A printer as a map of N×3 sRGB sent to sRGB seen."""
+
+    def show(colors: np.ndarray) -> np.ndarray:
+        sent = torch.tensor(np.asarray(colors, float).T[None, :, :, None])
+        return printer.apply(sent)[0, :, :, 0].T.numpy()
+
+    return show
+
+
+def printer_of(name: str, predict: Map, provenance: Mapping[str, Any]) -> Printer:
+    """The table of a fitted map, scaled per channel so that white is bare paper."""
+    nodes = node_colors()
+    light = linear_from_srgb(np.clip(predict(nodes.reshape(-1, 3)), 0, 1.2))
+    white = np.maximum(light[-1], 0.1)
+    lut = srgb_from_linear(np.clip(light / white, 0, 1)).reshape(nodes.shape)
+    gamut = difference(nodes.reshape(-1, 3), lut.reshape(-1, 3)).reshape(nodes.shape[:3])
+    return printer_from_table(name, "measured", lut, gamut, None, dict(provenance))
+
+
+def combine(readings: Sequence[np.ndarray], robust: bool = True) -> np.ndarray:
+    """The N×3 light of several readings, NaN where none could be read; from three on their median, if robust."""
+    stack = np.stack(readings)
+    missing = np.isnan(stack).all(0)
+    stack = np.where(missing, 0.0, stack)
+    middle = np.nanmedian(stack, 0) if robust and len(readings) > 2 else np.nanmean(stack, 0)
+    return np.where(missing, np.nan, middle)
+
+
+def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
+    """What N×3 light of several prints differs by, as standard deviations; None of a single print.
+
+    Each print is explained by `vary`'s three numbers from the mean of all; the swatches' ΔE00 from that mean stands
+    beside them. Two prints give a rough figure, and it holds what photographs differ by, too.
+    """
+    if len(prints) < 2:
+        return None
+    from scipy.optimize import least_squares
+
+    mean = combine(prints, robust=False)
+    known = np.isfinite(np.stack(prints)).all((0, 2))
+    middle, found, away = torch.tensor(mean[known].clip(0, 1)), [], []
+    for one in prints:
+        target = srgb_from_linear(one[known])
+
+        def rest(draw: np.ndarray, target: np.ndarray = target) -> np.ndarray:
+            return (srgb_from_linear(vary(middle, torch.tensor(draw)).numpy()) - target).ravel()
+
+        found.append(2 * least_squares(rest, np.full(3, 0.5)).x - 1)
+        away.append(difference(target, srgb_from_linear(mean[known])).mean())
+    gain, density, lift = np.std(found, axis=0, ddof=1) * [DOT_GAIN, DENSITY, BLACK_LIFT]
+    figures = {"delta_e00": np.mean(away), "dot_gain_sd": gain, "density_sd": density, "black_lift_sd": lift}
+    return {"prints": len(prints), **{key: round(float(value), 4) for key, value in figures.items()}}
+
+
+def ladder_table(choice: Choice) -> list[dict[str, Any]]:
+    """Each rung's figures as stored; those that had too few colors have none."""
+    rows = [
+        {
+            "rung": figure.name,
+            "delta_e00": round(figure.delta_e00, 3),
+            "worse_by": round(figure.worse_by, 3),
+            "standard_error": round(figure.standard_error, 3),
+        }
+        for figure in choice.figures
+    ]
+    return rows + [{"rung": name, "delta_e00": None, "reason": "too few swatches"} for name in choice.left_out]
+
+
+def summary_lines(calibration: Calibration) -> list[str]:
+    """The choice with every rung's figure, for the terminal."""
+    choice, told = calibration.choice, calibration.printer.provenance
+    lines = [f"{told['source']}; {told['model_of']}"]
+    for row in told["ladder"]:
+        mark = "  <- chosen: the simplest within one standard error of the best" if row["rung"] == choice.name else ""
+        figure = "too few swatches"
+        if row["delta_e00"] is not None:
+            figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
+        lines.append(f"  {row['rung']:20s} {figure}{mark}")
+    lines.append(f"held out: {choice.held_out} of {choice.colors} colors in turn")
+    varied = told["print_to_print"]
+    if varied is not None:
+        lines.append(f"prints differ from their mean by ΔE00 {varied['delta_e00']:.2f} ({varied['prints']} prints)")
+    return lines
+
+
+def _read_all(prints, manifest: Manifest, camera: Camera | None, on_photo) -> tuple[list[Reading], list[str]]:
+    """All photographs that can be read, and what is wrong with the others; refused where none is left."""
+    if not manifest.chart:
+        raise Refused("a sheet with a chart", f"sheet {manifest.sheet_id} without", "name the page's own JSON")
+    readings, warnings, total = [], [], sum(map(len, prints))
+    for number, paths in enumerate(prints):
+        for path in paths:
+            try:
+                readings.append(Reading(path, number, read_chart(read_photo(path), manifest, camera)))
+            except CannotJudge as cannot:
+                warnings.append(f"{path.name} is left out ({cannot})")
+            on_photo(len(readings) + len(warnings), total)
+    if not readings:
+        first = warnings[0] if warnings else "none given"
+        raise Refused("photographs in which the chart can be read", f"none of {total}", f"see the first: {first}")
+    return readings, warnings
+
+
+def _agreement(readings: Sequence[Reading], by_print: Sequence[np.ndarray]) -> list[float | None]:
+    """Mean ΔE00 of each photograph from its print; None where it is the only one."""
+    numbers = [one.of_print for one in readings]
+    means = dict(zip(sorted(set(numbers)), by_print, strict=True))
+    errors = []
+    for one in readings:
+        both = np.isfinite(one.chart.light).all(1)
+        alone = numbers.count(one.of_print) == 1 or not both.any()
+        seen, mean = (srgb_from_linear(light[both]) for light in (one.chart.light, means[one.of_print]))
+        errors.append(None if alone else float(difference(seen, mean).mean()))
+    return errors
+
+
+def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:
+    """Mean ΔE00 between swatches of the same color at different places: what reading is worth."""
+    colors, index = np.unique(sent, axis=0, return_inverse=True)
+    pairs = [np.flatnonzero(index.reshape(-1) == i)[:2] for i in range(len(colors))]
+    pairs = np.array([pair for pair in pairs if len(pair) == 2])
+    if not len(pairs):
+        return None
+    return round(float(difference(*(srgb_from_linear(light[pairs[:, i]]) for i in (0, 1))).mean()), 3)
+
+
+def _row(one: Reading, error: float | None) -> dict[str, Any]:
+    return {
+        "file": one.path.name,
+        "sha256": hashlib.sha256(one.path.read_bytes()).hexdigest(),
+        "print": one.of_print + 1,
+        "when": _day(one.path),
+        "paper": [round(value, 3) for value in one.chart.paper],
+        "unevenness": round(one.chart.unevenness, 2),
+        "paper_misfit": round(one.chart.misfit, 4),
+        "px_per_mm": round(one.chart.px_per_mm, 2),
+        "delta_e00_from_print": None if error is None else round(error, 2),
+    }
+
+
+def _day(path: Path) -> str | None:
+    """The day on which the camera says that it took the picture."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        taken = image.getexif().get_ifd(0x8769).get(0x9003)  # DateTimeOriginal, "2026:11:21 10:00:00"
+    return str(taken)[:10].replace(":", "-") if taken else None

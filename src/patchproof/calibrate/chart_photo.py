@@ -1,0 +1,223 @@
+"""The printed chart in one photograph: the light of each swatch relative to the bare paper at the same place.
+
+In: a photograph, the sheet's manifest, the camera if it is known. Out: `ChartPhoto`. The page is found by its markers;
+swatches are read in their unblurred cores, in linear light. What falls on the page differs from place to place, so
+white paper around the chart and the chart's own white swatches are read, too, and a smooth surface through them says
+how light the paper would be under each swatch: dividing by it takes out gradients, vignetting, exposure and white
+balance at once. Text and lines on the paper are outliers of that surface and are left out by themselves.
+Left out on purpose: lens distortion (a swatch's core is far from its border), and gloss: photograph it without shine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.channel.lens import Camera
+from patchproof.channel.tone import light_of_codes
+from patchproof.geometry import apply_homography, local_scale, rect_corners
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.complete import complete
+from patchproof.photo.detect import Found, find_markers, is_mirrored
+from patchproof.photo.quality import CLIPPED_CODE, blur_px
+from patchproof.photo.read import Photo
+from patchproof.photo.rectify import fit_page
+from patchproof.sheet.manifest import Manifest
+
+LEAST_CORE_PX = 4.0  # a swatch's side between blurred borders
+MOST_CLIPPED = 0.05  # share of the white paper at full white: beyond it nobody knows how light it was
+_CORE = 0.2  # of a swatch's side that is left out on each side, at least
+_SAMPLES = 15  # along each side of a core
+_REACH_MM = 60.0  # how far around the chart paper is looked at
+_PITCH_MM, _PLACE_MM = 2.5, 2.0  # between places of bare paper, and the side of each
+_CLEAR_MM = 1.0  # between such a place and anything printed, and as much again as the blur
+_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y in the logarithm of the paper's light
+_PLACES_PER_TERM = 5
+
+Rect = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ChartPhoto:
+    """`light` N×3 relative to paper, one row per swatch of the manifest's chart, NaN where it could not be read.
+
+    `paper` is the light of bare paper under the chart (1 = the camera's full white), `unevenness` how much lighter its
+    lightest swatch lay than its darkest, `misfit` what bare paper still differs from the smooth surface, as a share.
+    """
+
+    light: np.ndarray
+    paper: tuple[float, float, float]
+    unevenness: float
+    misfit: float
+    px_per_mm: float
+
+
+@dataclass(frozen=True)
+class _Page:
+    """A photographed page: its number, the homography to pixels, blur, and pixels per mm at the chart."""
+
+    number: int
+    px_from_mm: np.ndarray
+    blur_px: float
+    px_per_mm: float
+
+
+def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -> ChartPhoto:
+    """The chart's swatches; `CannotJudge` where there is none, or none that can be trusted."""
+    page = _find_page(photo.srgb, manifest)
+    rows = chart_rows(manifest, page.number)
+    cores, readable = [], []
+    for row in rows:
+        core = _core(manifest.chart[row].rect_mm, page, photo.srgb.shape)
+        if core is not None:
+            cores.append(core)
+            readable.append(row)
+    if not readable:
+        advice = "come closer to the chart, hold still and show all of it"
+        raise CannotJudge("too_small", page.px_per_mm, None, advice)
+    places = _bare_places(manifest, page, photo.srgb.shape)
+    whites = [core for core, row in zip(cores, readable, strict=True) if min(manifest.chart[row].srgb) == 1]
+    places = np.concatenate([places, np.reshape(whites, (-1, 4))])
+    paper_at, misfit = _paper(photo.srgb, page, places, camera)
+    light = np.full((len(manifest.chart), 3), np.nan)
+    under = paper_at(np.array([[x + w / 2, y + h / 2] for x, y, w, h in cores]))
+    for row, core, paper in zip(readable, cores, under, strict=True):
+        codes = _codes(photo.srgb, page, core)
+        if (codes >= CLIPPED_CODE).any(-1).mean() <= MOST_CLIPPED:
+            light[row] = light_of_codes(codes / 255, camera).mean(0) / paper
+    level = under.mean(1)
+    middle = tuple(float(value) for value in np.median(under, 0))
+    return ChartPhoto(light, middle, float(level.max() / level.min()), misfit, page.px_per_mm)
+
+
+def chart_rows(manifest: Manifest, page: int) -> list[int]:
+    """Which swatches make up a page's chart: those outside of the piece, which may hang elsewhere by now."""
+    here = [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
+    return [i for i in here if not _within(manifest.chart[i].rect_mm, manifest.cut_mm)] or here
+
+
+def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
+    """The page that is in view, from the markers beside the chart; those of the piece help where it is uncut."""
+    dictionary = manifest.markers[0].dictionary
+    markers = [marker for marker in manifest.markers if marker.dictionary == dictionary]
+    found = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
+    if not found.markers:
+        raise _no_sheet(srgb, found, markers, dictionary)
+    seen = [marker for marker in markers if marker.id in found.markers]
+    numbers = [marker.page for marker in seen if chart_rows(manifest, marker.page)] or [seen[0].page]
+    number = max(sorted(set(numbers)), key=numbers.count)
+    corners_mm = {marker.id: np.array(marker.corners_mm) for marker in markers if marker.page == number}
+    found = complete(srgb, found, corners_mm, dictionary)
+    corners_px = {i: borders.corners_px for i, borders in found.markers.items() if i in corners_mm}
+    beside = {i: px for i, px in corners_px.items() if not _inside(corners_mm[i], manifest.cut_mm)}
+    fit = fit_page(beside if len(beside) > 1 else corners_px, corners_mm)
+    together = fit_page(corners_px, corners_mm)
+    if set(beside) <= set(together.inlier_ids):
+        fit = together
+    rects = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, number)]).reshape(-1, 4)
+    if not len(rects):
+        raise CannotJudge("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")
+    scale, _ = local_scale(fit.px_from_mm, tuple((rects[:, :2] + rects[:, 2:] / 2).mean(0)))
+    return _Page(number, fit.px_from_mm, blur_px(found.markers.values()), float(scale))
+
+
+def _no_sheet(srgb, found: Found, markers, dictionary: str) -> CannotJudge:
+    if is_mirrored(srgb, {marker.id for marker in markers}, dictionary):
+        return CannotJudge("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
+    if found.foreign:
+        advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
+        return CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
+    return CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
+
+
+def _core(rect: Rect, page: _Page, shape) -> Rect | None:
+    """The part of a swatch that blur leaves alone; None where there is none or it lies out of the picture."""
+    x, y, w, h = rect
+    quad = apply_homography(page.px_from_mm, rect_corners(rect))
+    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
+    sides = np.array([min(sides[0], sides[2]), min(sides[1], sides[3])])
+    edge = np.maximum(_CORE, (0.75 + 1.5 * page.blur_px) / sides)
+    if (sides * (1 - 2 * edge) < LEAST_CORE_PX).any() or not _in_picture(quad, shape):
+        return None
+    return x + w * edge[0], y + h * edge[1], w * (1 - 2 * edge[0]), h * (1 - 2 * edge[1])
+
+
+def _bare_places(manifest: Manifest, page: _Page, shape) -> np.ndarray:
+    """Small squares K×4 mm around the chart on which nothing is printed, as far as the manifest knows."""
+    rows = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, page.number)])
+    clear = _CLEAR_MM + 2 * page.blur_px / page.px_per_mm
+    low = np.maximum(rows[:, :2].min(0) - _REACH_MM, clear)
+    high = np.minimum((rows[:, :2] + rows[:, 2:]).max(0) + _REACH_MM, np.array(manifest.page_mm) - clear) - _PLACE_MM
+    steps = [np.arange(a, b + 1e-9, _PITCH_MM) if b > a else np.array([a]) for a, b in zip(low, high, strict=True)]
+    corner = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    printed = [swatch.rect_mm for swatch in manifest.chart if swatch.page == page.number]
+    printed += [_around(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
+    if chart_rows(manifest, page.number) and any(not _within(rect, manifest.cut_mm) for rect in rows):
+        printed.append(manifest.cut_mm)
+    bare = np.ones(len(corner), bool)
+    for x, y, w, h in printed:
+        apart = (corner >= np.array([x + w, y + h]) + clear) | (corner + _PLACE_MM <= np.array([x, y]) - clear)
+        bare &= apart.any(1)
+    squares = np.column_stack([corner, np.full((len(corner), 2), _PLACE_MM)])[bare]
+    inside = [_in_picture(apply_homography(page.px_from_mm, rect_corners(square)), shape) for square in squares]
+    return squares[np.array(inside, bool)]
+
+
+def _paper(srgb: np.ndarray, page: _Page, places: np.ndarray, camera: Camera | None):
+    """(places N×2 mm → the light of bare paper there, misfit): exp of a polynomial per channel, fitted robustly."""
+    if not len(places):
+        raise CannotJudge("too_small", 0, 1, "no bare paper is in view: show the white paper around the chart")
+    codes = _codes(srgb, page, places.T, 5)
+    clipped = float(np.median((codes >= CLIPPED_CODE).any(-1).mean(1)))
+    if clipped > MOST_CLIPPED:
+        raise CannotJudge("clipped", clipped, MOST_CLIPPED, "the paper is overexposed: lower the exposure by one step")
+    light = np.log(np.maximum(light_of_codes(codes / 255, camera).mean(1), 1e-4))
+    centers = places[:, :2] + places[:, 2:] / 2
+    middle, reach = centers.mean(0), max(float(np.ptp(centers, 0).max()), 1.0) / 2
+    count = next(n for n in (6, 3, 1) if len(places) >= _PLACES_PER_TERM * n or n == 1)
+
+    def rows(at: np.ndarray) -> np.ndarray:
+        x, y = ((at - middle) / reach).T
+        return np.stack([x**i * y**j for i, j in _TERMS[:count]], 1)
+
+    known, weight = rows(centers), np.ones(len(places))
+    for _ in range(30):
+        root = np.sqrt(weight)[:, None]
+        surface = np.linalg.lstsq(known * root, light * root, rcond=None)[0]
+        error = np.abs(light - known @ surface).max(1)
+        spread = max(1.4826 * float(np.median(error)), 2e-3)
+        weight = np.maximum(1 - (error / (4.7 * spread)) ** 2, 0) ** 2  # Tukey's: print lets go of the paper
+    misfit = float(np.sqrt((weight * error**2).sum() / weight.sum()))
+    return lambda at: np.exp(rows(at) @ surface), misfit
+
+
+def _codes(srgb: np.ndarray, page: _Page, rect, samples: int = _SAMPLES) -> np.ndarray:
+    """uint8 `K × samples² × 3` (or `samples² × 3` of one rectangle) of pixels nearest to a grid in rectangles of mm.
+
+    Nearest pixels, not mixtures: the mean of their light is the light's mean, whatever the tone curve.
+    """
+    x, y, w, h = (np.asarray(value, float)[..., None, None] for value in rect)
+    step = (np.arange(samples) + 0.5) / samples
+    at = np.stack(np.broadcast_arrays(x + w * step, y + h * step[:, None]), -1)
+    px = np.floor(apply_homography(page.px_from_mm, at.reshape(-1, 2))).astype(int)
+    column, line = np.clip(px, 0, [srgb.shape[1] - 1, srgb.shape[0] - 1]).T
+    return srgb[line, column].reshape(*at.shape[:-3], samples**2, 3)
+
+
+def _around(corners) -> Rect:
+    low, high = np.min(corners, 0), np.max(corners, 0)
+    return (*low, *(high - low))
+
+
+def _within(rect: Rect, outer: Rect) -> bool:
+    return _inside(rect_corners(rect), outer)
+
+
+def _inside(points: np.ndarray, rect: Rect) -> bool:
+    x, y, w, h = rect
+    return bool(((points >= [x, y]) & (points <= [x + w, y + h])).all())
+
+
+def _in_picture(points: np.ndarray, shape) -> bool:
+    return bool(((points >= 0) & (points <= [shape[1], shape[0]])).all())

@@ -1,0 +1,69 @@
+"""`calibrate printer`: a profile or photographs in, NAME.npz and NAME.json out, with what to tell the user.
+
+Nothing is written before the printer is complete, and what exists is replaced only on request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
+from patchproof.calibrate.icc import bake
+from patchproof.channel.lens import load_camera
+from patchproof.channel.printer import Printer, save_printer
+from patchproof.output import check_file, make_folder, write_whole
+from patchproof.settings import Refused
+from patchproof.sheet.manifest import load_manifest
+
+
+def printer_from_icc(
+    profile: Path, out: Path, perceptual: bool, licence: str, source: str, overwrite: bool = False
+) -> list[str]:
+    """Write the printer of an ICC output profile; returns the summary."""
+    out = _new_file(out, overwrite)
+    printer = bake(profile, out.stem, licence, source, perceptual)
+    error = printer.provenance["delta_e00_to_exact_chain"]
+    return [
+        f"{printer.provenance['profile']} ({printer.provenance['profile_colors']}), {printer.provenance['intents']}",
+        f"table against LittleCMS on {error['colors']:,} random colors: "
+        f"ΔE00 mean {error['mean']}, p95 {error['p95']}, max {error['max']}",
+        _written(printer, out),
+    ]
+
+
+def printer_from_chart(
+    photos: Sequence[Path],
+    sheet: Path,
+    out: Path,
+    camera: str | None = None,
+    overwrite: bool = False,
+    on_photo: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[list[str], tuple[str, ...]]:
+    """Write the printer that photographs of a chart show; returns the summary and warnings."""
+    out = _new_file(out, overwrite)
+    known = None if camera is None else load_camera(camera)
+    found = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, known, on_photo)
+    return [*summary_lines(found), _written(found.printer, out)], found.warnings
+
+
+def _new_file(out: Path, overwrite: bool) -> Path:
+    """`out` as NAME.npz; refused where either file exists, or the name is that of something else."""
+    if out.suffix.lower() not in {"", ".npz", ".json"}:
+        raise Refused("a printer file, NAME.npz", f"{out.name}", "choose another --out")
+    out = out.with_suffix(".npz")
+    for path in (out, out.with_suffix(".json")):
+        check_file(path, overwrite)
+    return out
+
+
+def _written(printer: Printer, out: Path) -> str:
+    make_folder(out.parent)
+    with TemporaryDirectory() as folder:
+        made = save_printer(printer, Path(folder))
+        for suffix in (".npz", ".json"):
+            write_whole(
+                out.with_suffix(suffix), lambda part, s=suffix: part.write_bytes(made.with_suffix(s).read_bytes())
+            )
+    return f"written: {out}, {out.with_suffix('.json').name}"

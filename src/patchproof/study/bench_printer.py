@@ -1,0 +1,206 @@
+"""Calibrating printers: what each rung of the ladder costs and how near it comes, by the number of swatches.
+
+In: nothing; printers are those of `inkjets` and the shipped profiles (each with the other as its only prior), charts
+are photographed by `chart_photos`. Out: a chart of every rung's time against its error, with the choice among them, and
+a table of what a camera's own tone curve does to the error with and without a camera file.
+
+The error is the mean ΔE00 over 1,000 colors that no chart holds, against what the same camera would show of the true
+print under even light at the chart's exposure: paper is white in both. A choice is held against the best of all rungs
+on these colors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.calibrate.chart import known_printers
+from patchproof.calibrate.chart_photo import read_chart
+from patchproof.calibrate.ladder import Map, choose, difference, distinct, rungs
+from patchproof.channel.lens import Camera, load_camera
+from patchproof.channel.tone import codes_of_light, light_of_codes
+from patchproof.claims import wilson
+from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.study.bench import Chart, Check, OnStage, Point, Series, Table, mean_interval, median_interval
+from patchproof.study.chart_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
+from patchproof.study.inkjets import DRIVERS, draw_inkjet
+
+SWATCHES = (6, 48, 96)
+TARGETS = {48: 2.5, 96: 1.8}
+COLORS = 1000
+NEAR, FAR = 0.3, 0.8  # ΔE00 by which a choice may be worse than the best rung: mostly, and ever
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One printer photographed once: held-out ΔE00 and seconds of a fit by rung, the choice, whose driver it was."""
+
+    driver: str
+    swatches: int
+    errors: dict[str, float]
+    seconds: dict[str, float]
+    chosen: str
+
+    @property
+    def behind(self) -> float:
+        """How much worse the choice is than the best rung that could be tried."""
+        return self.errors[self.chosen] - min(self.errors.values())
+
+
+def printer_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """The ladder's chart, with what a camera file is worth."""
+    count, toned = (12, 6) if quick else (60, 18)
+    trials, rows = [], []
+    for i in range(count):
+        trials += [trial(i, swatches) for swatches in SWATCHES]
+        on_stage("printers", i + 1, count)
+    camera = toned_camera()
+    for i in range(toned):
+        rows.append(printer_errors(i, 96, camera))
+        on_stage("cameras", i + 1, toned)
+    yield ladder_chart(trials, np.array(rows))
+
+
+def ladder_chart(trials: list[Trial], toned: np.ndarray) -> Chart:
+    """Every rung at every number of swatches; `toned` N×2 are errors against the printer, without and with a file."""
+    series, checks = [], []
+    for swatches in SWATCHES:
+        some = [one for one in trials if one.swatches == swatches]
+        names = [one.chosen for one in some]
+        usual = max(sorted(set(names)), key=names.count)
+        series.append(Series(f"{swatches} swatches", tuple(_point(name, some, usual) for name in some[0].errors)))
+        checks += _checks(swatches, some)
+    without, with_file = (mean_interval(toned[:, i]) for i in (0, 1))
+    tone = Table(
+        ("a camera with its own tone curve, 96 swatches", "ΔE00 from the printer itself", "from - to"),
+        tuple(
+            (name, f"{mean:.2f}", f"{low:.2f} - {high:.2f}")
+            for name, (mean, (low, high)) in (("no camera file", without), ("with its camera file", with_file))
+        ),
+    )
+    notes = (
+        f"{len(trials) // len(SWATCHES)} printers, each chart photographed once under uneven light with noise and JPEG",
+        f"y is the mean over {COLORS} colors that the chart does not hold, against what the camera shows of the true "
+        "print under even light; intervals are over printers",
+        "ringed: the rung that is chosen most often",
+        "6 swatches leave rungs with nothing to fit, or paper and black",
+    )
+    return Chart(
+        "ladder",
+        "Rungs of the printer's model: time of a fit and error, by swatches on the chart",
+        "milliseconds of one fit and its held-out colors",
+        "mean ΔE00 of unseen colors",
+        tuple(series),
+        notes,
+        tuple(checks),
+        (_choices(trials), tone),
+    )
+
+
+def _point(name: str, trials: list[Trial], usual: str) -> Point:
+    cost, cost_interval = median_interval(1e3 * np.array([one.seconds[name] for one in trials]))
+    error, interval = mean_interval(np.array([one.errors[name] for one in trials]))
+    return Point(name, cost, error, cost_interval, interval, default=name == usual)
+
+
+def _checks(swatches: int, trials: list[Trial]) -> list[Check]:
+    behind = np.array([one.behind for one in trials])
+    if swatches not in TARGETS:
+        fitted = np.mean([one.chosen not in ("identity", "white_black", "prior") for one in trials])
+        return [Check(f"{swatches} swatches: share of choices with anything fitted", float(fitted), 0.0)]
+    chosen = float(np.mean([one.errors[one.chosen] for one in trials]))
+    return [
+        Check(f"{swatches} swatches: mean ΔE00 of the chosen rung", chosen, TARGETS[swatches]),
+        Check(
+            f"{swatches} swatches: share chosen within {NEAR} of the best", float((behind <= NEAR).mean()), 0.9, True
+        ),
+        Check(f"{swatches} swatches: largest distance from the best", float(behind.max()), FAR),
+    ]
+
+
+def _choices(trials: list[Trial]) -> Table:
+    """By driver and number of swatches: the chosen rung's error, how often it is near the best, what was chosen."""
+    rows = []
+    for driver in (*dict.fromkeys(one.driver for one in trials), "all"):
+        for swatches in SWATCHES:
+            some = [one for one in trials if one.swatches == swatches and driver in (one.driver, "all")]
+            errors = np.array([one.errors[one.chosen] for one in some])
+            near = sum(one.behind <= NEAR for one in some)
+            low, high = wilson(near, len(some))
+            names = [one.chosen for one in some]
+            picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
+            figures = f"{errors.mean():.2f}", f"{errors.max():.2f}", f"{near}/{len(some)} [{low:.2f}, {high:.2f}]"
+            rows.append((f"{driver}, {swatches} swatches", *figures, picked))
+    return Table(("printer", "mean", "worst", f"within {NEAR} of best", "chosen"), tuple(rows))
+
+
+def trial(seed: int, swatches: int, camera: Camera | None = None, known: Camera | None = None) -> Trial:
+    """One printer's chart photographed by `camera` and read as if by `known`, every rung on it."""
+    driver, shows, priors = drawn_printer(seed)
+    manifest = chart_manifest(swatches)
+    shot = photograph_page(printed_page(manifest, shows), seed, camera)
+    light = read_chart(shot.photo, manifest, known).light
+    usable = np.isfinite(light).all(1)
+    sent, seen = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
+    ladder = rungs(priors)
+    choice = choose(ladder, sent, seen)
+    truth, errors = shown_by(shows, shot, camera, known, held_out_colors()), {}
+    for rung in (rung for rung in ladder if rung.name not in choice.left_out):
+        seen_by = relative(rung.fit(*distinct(sent, seen)), held_out_colors())
+        errors[rung.name] = float(difference(seen_by, truth).mean())
+    return Trial(driver, swatches, errors, {f.name: f.seconds for f in choice.figures}, choice.name)
+
+
+def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, float]:
+    """Error of the chosen rung against the printer itself, without and with the camera's file."""
+    _, shows, priors = drawn_printer(seed)
+    manifest, colors = chart_manifest(swatches), held_out_colors()
+    shot = photograph_page(printed_page(manifest, shows), seed, camera)
+    truth, found = shown_by(shows, shot, None, None, colors), []
+    for known in (None, camera):
+        light = read_chart(shot.photo, manifest, known).light
+        usable = np.isfinite(light).all(1)
+        sent = np.array([s.srgb for s in manifest.chart])[usable]
+        choice = choose(rungs(priors), sent, srgb_from_linear(light[usable]))
+        found.append(float(difference(relative(choice.predict, colors), truth).mean()))
+    return found[0], found[1]
+
+
+def relative(predict: Map, colors: np.ndarray) -> np.ndarray:
+    """What a map shows of colors N×3, white being paper, as in the printer's table."""
+    light = linear_from_srgb(np.clip(predict(np.vstack([colors, np.ones((1, 3))])), 0, 1.2))
+    return srgb_from_linear(np.clip(light[:-1] / light[-1], 0, 1))
+
+
+def drawn_printer(seed: int) -> tuple[str, Shows, dict]:
+    """A printer's kind, what it shows, and the priors that a calibration may have: never the printer itself."""
+    priors, kinds = known_printers(), len(DRIVERS) + 1
+    if seed % kinds < len(DRIVERS):
+        inkjet = draw_inkjet(len(DRIVERS) * (seed // kinds) + seed % kinds)
+        return inkjet.driver, inkjet, priors
+    name = ("coated", "uncoated")[seed // kinds % 2]
+    own = priors.pop(name)
+    return "the other profile", lambda colors: linear_from_srgb(own(colors)), priors
+
+
+def shown_by(shows: Shows, shot: Shot, camera: Camera | None, known: Camera | None, colors: np.ndarray) -> np.ndarray:
+    """sRGB N×3 of colors on the true print under even light, through the camera and read with what is known of it."""
+    white = np.ones((1, 3))
+    light = shows(np.vstack([colors, white])) / shows(white) * shot.paper
+    read = light_of_codes(codes_of_light(light, camera), known)
+    return srgb_from_linear(read[:-1] / read[-1])
+
+
+def held_out_colors() -> np.ndarray:
+    """Colors N×3 spread evenly over the cube."""
+    return np.random.default_rng(99).random((COLORS, 3))
+
+
+def toned_camera() -> Camera:
+    """A camera with a tone curve as phones have: lighter middle tones and a soft shoulder, steeper in the dark."""
+    codes = np.linspace(0, 1, 65)
+    light = linear_from_srgb(codes)
+    curve = 0.65 * light**1.15 + 0.35 * (codes**2 * (3 - 2 * codes)) ** 1.8
+    return load_camera("phone").model_copy(update={"name": "toned", "tone_light": tuple((curve / curve[-1]).tolist())})
