@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from patchproof.calibrate.chart_photo import ChartPhoto, read_chart
+from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.ladder import Choice, Map, choose, difference, rungs
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import (
@@ -98,7 +98,7 @@ def calibrate_chart(
         "relative_to": "paper: sRGB white is seen as bare paper",
         "chosen": choice.name,
         "ladder": ladder_table(choice),
-        "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": int((~known).sum())},
+        "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": _unreadable(manifest, known)},
         "delta_e00_of_duplicates": _duplicates(sent[known], light[known]),
         "print_to_print": print_variation(by_print),
         "photographs": [_row(one, error) for one, error in zip(readings, agreement, strict=True)],
@@ -249,6 +249,12 @@ def _agreement(readings: Sequence[Reading], by_print: Sequence[np.ndarray]) -> l
         seen, mean = (srgb_from_linear(light[both]) for light in (one.chart.light, means[one.of_print]))
         errors.append(None if alone else float(difference(seen, mean).mean()))
     return errors
+
+
+def _unreadable(manifest: Manifest, known: np.ndarray) -> int:
+    """Swatches of charts in view that no photograph shows well enough; those of the piece are not the chart's."""
+    pages = {swatch.page for swatch, one in zip(manifest.chart, known, strict=True) if one}
+    return sum(not known[row] for page in pages for row in chart_rows(manifest, page))
 
 
 def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:

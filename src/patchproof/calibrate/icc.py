@@ -54,7 +54,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
         {
             "source": source,
             "licence": licence,
-            "profile": (profile.profile_description or "").strip(),
+            "profile": _description(profile),
             "profile_sha256": hashlib.sha256(data).hexdigest(),
             "profile_colors": profile.xcolor_space.strip(),
             "intents": _INTENTS[perceptual],
@@ -108,9 +108,11 @@ def _chain(data: bytes, file_name: str, perceptual: bool = False):
 
     try:
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
-    except (OSError, ImageCms.PyCMSError) as error:
-        raise Refused("an ICC profile that can be read", f"{file_name} ({error})", "use another one") from error
-    kind, colors = profile.profile.device_class.strip(), profile.profile.xcolor_space.strip()
+        kind, colors = profile.profile.device_class.strip(), profile.profile.xcolor_space.strip()
+        _description(profile.profile), _paper_white(profile.profile)  # damage shows where a tag is read
+    except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
+        got = f"{file_name} ({' '.join(str(error).split())[:100]})"
+        raise Refused("an ICC profile that can be read", got, "use another one") from error
     if kind != "prtr" or colors not in {"RGB", "CMYK"}:
         got = f"class {kind} with {colors} in {file_name}"
         raise Refused("a printer's profile (class prtr, RGB or CMYK)", got, "use the profile of your printer and paper")
@@ -120,8 +122,8 @@ def _chain(data: bytes, file_name: str, perceptual: bool = False):
     exact = flags.SOFTPROOFING | flags.NOOPTIMIZE | flags.NOCACHE
     try:
         chain = ImageCms.buildProofTransform(srgb, srgb, profile, "RGB", "RGB", there, relative, flags=exact)
-    except (ImageCms.PyCMSError, ValueError) as error:
-        got = f"{file_name} without them ({error})"
+    except (ImageCms.PyCMSError, ValueError, TypeError) as error:
+        got = f"{file_name} without them ({' '.join(str(error).split())[:100]})"
         raise Refused("a profile with tables to and from the printer", got, "use another one") from error
 
     def show(srgb_8bit: np.ndarray) -> np.ndarray:
@@ -129,6 +131,10 @@ def _chain(data: bytes, file_name: str, perceptual: bool = False):
         return np.asarray(ImageCms.applyTransform(image, chain)).reshape(srgb_8bit.shape)
 
     return show, profile.profile
+
+
+def _description(profile) -> str:
+    return (profile.profile_description or "").strip()
 
 
 def _paper_white(profile) -> tuple[float, float, float] | None:

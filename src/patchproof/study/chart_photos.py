@@ -43,7 +43,7 @@ _GAP_MM = 0.4
 
 @dataclass(frozen=True)
 class Shot:
-    """A photograph, and the light of bare paper under the middle of the chart as its sensor saw it (3,)."""
+    """A photograph, and the light of bare paper in the middle of the page as its sensor saw it (3,)."""
 
     photo: Photo
     paper: np.ndarray
@@ -91,19 +91,19 @@ def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
 def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:
     """One photograph of a page lying flat, from above and a little from the side; all conditions follow the seed."""
     rng = np.random.default_rng([seed, 4])
-    middle = np.array(PAGE_MM) / 2
-    eye = geometry.orbit(rng.uniform(-25, 25), rng.uniform(-25, 25), (0, 0, -1.0), (0, -1.0, 0)) * rng.uniform(250, 330)
+    page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
+    distance = rng.uniform(1.2, 1.55) * page_mm.max()
+    eye = geometry.orbit(rng.uniform(-25, 25), rng.uniform(-25, 25), (0, 0, -1.0), (0, -1.0, 0)) * distance
     pose = geometry.look_at(eye, rng.uniform(-8, 8, 3) * [1, 1, 0], rng.uniform(-8, 8), (0, -1.0, 0))
     flat = np.eye(4)
-    flat[:2, 3] = -middle
+    flat[:2, 3] = -page_mm / 2
     px_from_mm = geometry.plane_homography(geometry.intrinsics(50, PHOTO_PX), pose, flat)
-    fill_light = _light(rng)
-    light = _falling(px_from_mm, fill_light)
+    sources = _light(rng)
     white_balance = 1 + rng.uniform(-0.15, 0.15, 3)
-    x, y, w, h = _CHART_MM
-    at_chart = _falling_at(np.array([[x + w / 2, y + h / 2]]), fill_light)
-    brightest = _falling_at(geometry.rect_corners((0, 0, *PAGE_MM)), fill_light).max()
-    exposure = rng.uniform(0.5, 0.85) / (brightest * white_balance.max())
+    corners = geometry.rect_corners((0, 0, *page_mm))
+    at_middle, brightest = (_falling(at - page_mm / 2, sources) for at in (corners.mean(0)[None], corners))
+    exposure = rng.uniform(0.5, 0.85) / (brightest.max() * white_balance.max())
+    light = _light_in_picture(px_from_mm, page_mm / 2, sources)
     seen = _warped(page, px_from_mm) * light[..., None]
     drawn = SimpleNamespace(
         vignetting=np.array([rng.uniform(0, 0.2)]),
@@ -119,7 +119,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = torch.tensor(seen.transpose(2, 0, 1)[None], dtype=torch.float32)
     picture = develop(picture, drawn, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     codes = codes_of_light(linear_from_srgb(picture), camera)
-    return Shot(_stored(codes, int(drawn.jpeg[0])), at_chart * exposure * white_balance)
+    return Shot(_stored(codes, int(drawn.jpeg[0])), at_middle * exposure * white_balance)
 
 
 def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
@@ -142,21 +142,19 @@ def _light(rng: np.random.Generator) -> Light:
     return Light(on(rng.uniform(0.3, 0.7)), on(rng.uniform(0, 0.5)), direction, lamp=near)
 
 
-def _falling_at(page_mm: np.ndarray, light: Light) -> np.ndarray:
-    """Light on page points N×2, N."""
-    world = np.column_stack([page_mm - np.array(PAGE_MM) / 2, np.zeros(len(page_mm))])
-    position = torch.tensor(world, dtype=torch.float32)
-    normal = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(position), 3)
-    return irradiance(normal, torch.zeros(len(position), dtype=torch.long), light, position).numpy().astype(float)
+def _falling(from_middle_mm: np.ndarray, sources: Light) -> np.ndarray:
+    """Light N on points N×2 of the page's plane."""
+    position = torch.tensor(np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))]), dtype=torch.float32)
+    normal, view = torch.tensor([[0.0, 0.0, -1.0]]).expand_as(position), torch.zeros(len(position), dtype=torch.long)
+    return irradiance(normal, view, sources, position).numpy().astype(float)
 
 
-def _falling(px_from_mm: np.ndarray, light: Light) -> np.ndarray:
-    """Light H×W on the plane of the page as the photograph sees it; computed at every 8th pixel, it is smooth."""
+def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: Light) -> np.ndarray:
+    """Light H×W on the page's plane as the photograph sees it; computed at every 8th pixel, since it is smooth."""
     width, height = PHOTO_PX
-    x, y = np.meshgrid(np.arange(4, width, 8) + 0.0, np.arange(4, height, 8) + 0.0)
+    x, y = np.meshgrid(np.arange(4.0, width, 8), np.arange(4.0, height, 8))
     at = geometry.apply_homography(np.linalg.inv(px_from_mm), np.stack([x.ravel(), y.ravel()], 1))
-    coarse = _falling_at(at, light).reshape(x.shape)
-    return cv2.resize(coarse, PHOTO_PX, interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(_falling(at - middle_mm, sources).reshape(x.shape), PHOTO_PX, interpolation=cv2.INTER_LINEAR)
 
 
 def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:

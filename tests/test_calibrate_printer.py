@@ -1,0 +1,320 @@
+"""Printers from their charts: the ladder, the reading of a chart in a photograph, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageCms
+
+from patchproof import cli
+from patchproof.calibrate import icc
+from patchproof.calibrate.chart import calibrate_chart, combine, map_of, print_variation, printer_of, prints_of
+from patchproof.calibrate.chart_photo import read_chart
+from patchproof.calibrate.ladder import choose, difference, distinct, fit_affine, fit_white_black, rungs
+from patchproof.channel.lens import load_camera
+from patchproof.channel.printer import BLACK_LIFT, DENSITY, DOT_GAIN, load_printer, vary
+from patchproof.channel.tone import codes_of_light, light_of_codes
+from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.read import Photo
+from patchproof.settings import Refused
+from patchproof.sheet.chart import chart_colors
+from patchproof.sheet.manifest import dump_manifest
+from patchproof.study import bench_printer
+from patchproof.study.chart_photos import chart_manifest, photograph_page, printed_page
+from patchproof.study.inkjets import DRIVERS, draw_inkjet
+
+UNSEEN = np.random.default_rng(8).random((500, 3))
+WHITE = np.ones((1, 3))
+
+
+def shown(printer, colors) -> np.ndarray:
+    """sRGB N×3 relative to paper."""
+    return srgb_from_linear(printer(colors) / printer(WHITE))
+
+
+def chart(count: int) -> np.ndarray:
+    return np.array(chart_colors(count))
+
+
+@pytest.fixture(scope="module")
+def priors():
+    return {name: map_of(load_printer(name)) for name in ("coated", "uncoated")}
+
+
+# ------------------------------------------------------------------------------------------------ the ladder
+
+
+def test_each_rung_finds_a_printer_of_its_own_kind_and_none_above_it_is_taken(priors):
+    rng = np.random.default_rng(2)
+    mix = np.column_stack([np.diag([0.75, 0.7, 0.65]) + 0.06, [0.07, 0.1, 0.15]])
+    kinds = {
+        "identity": lambda colors: colors,
+        "white_black": lambda colors: srgb_from_linear(0.06 + 0.94 * linear_from_srgb(colors)),
+        "affine": lambda colors: colors @ mix[:, :3].T + mix[:, 3],
+        "prior": priors["uncoated"],
+        "prior+affine": lambda colors: priors["coated"](colors) @ mix[:, :3].T + mix[:, 3],
+        "spline": lambda colors: shown(draw_inkjet(0), colors),
+    }
+    sent = chart(72)
+    for name, show in kinds.items():
+        seen = np.clip(show(sent) + rng.normal(0, 0.003, sent.shape), 0, 1)
+        choice = choose(rungs(priors), sent, seen)
+        assert choice.name == name, choice.figures
+        assert difference(choice.predict(UNSEEN), show(UNSEEN)).mean() < (1.0 if name == "spline" else 0.5)
+
+
+def test_affine_and_paper_with_black_by_hand():
+    sent = chart(24)
+    matrix = np.array([[0.8, 0.1, 0.0], [0.05, 0.7, 0.1], [0.0, 0.2, 0.6]])
+    np.testing.assert_allclose(fit_affine(sent, sent @ matrix.T + 0.05)(UNSEEN), UNSEEN @ matrix.T + 0.05, atol=1e-12)
+    seen = sent.copy()
+    seen[(sent == 0).all(1)] = srgb_from_linear(np.array([0.02, 0.04, 0.06]))
+    lifted = linear_from_srgb(fit_white_black(sent, seen)(np.array([[1.0, 1, 1], [0, 0, 0]])))
+    np.testing.assert_allclose(lifted, [[1, 1, 1], [0.02, 0.04, 0.06]], atol=1e-12)
+
+
+def test_a_color_sent_twice_counts_once_with_the_mean_of_its_light():
+    sent, light = np.array([[0.5] * 3, [1.0] * 3, [0.5] * 3]), np.array([[0.2] * 3, [1.0] * 3, [0.4] * 3])
+    colors, seen = distinct(sent, srgb_from_linear(light))
+    np.testing.assert_allclose(colors[:, 0], [0.5, 1])
+    np.testing.assert_allclose(linear_from_srgb(seen)[:, 0], [0.3, 1])
+
+
+def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
+    seen_in_training = []
+
+    def spy(sent, seen):
+        seen_in_training.append(sent)
+        return lambda colors: colors
+
+    sent = chart(48)
+    free = rungs({})
+    choice = choose([replace(free[0], fit=spy)], sent, sent)
+    corners = np.isin(distinct(sent, sent)[0], (0.0, 1.0)).all(1)
+    assert choice.held_out == (~corners).sum() == 34
+    for training in seen_in_training:
+        assert np.isin(training, (0.0, 1.0)).all(1).sum() == 8
+    assert sum(len(corners) - len(training) for training in seen_in_training[:-1]) == 34
+
+
+@pytest.mark.parametrize("count", [6, 12])
+def test_few_swatches_leave_rungs_with_nothing_to_fit(priors, count):
+    sent = chart(count)
+    choice = choose(rungs(priors), sent, shown(draw_inkjet(1), sent))
+    assert choice.name in {"identity", "white_black", "prior"}
+    assert "spline" in choice.left_out and "affine" in choice.left_out
+
+
+def test_splines_start_at_24_colors(priors):
+    sent = np.vstack([chart(14), np.random.default_rng(4).random((10, 3))])
+    names = {figure.name for figure in choose(rungs(priors), sent, sent).figures}
+    assert "spline" in names
+    names = {figure.name for figure in choose(rungs(priors), sent[:-1], sent[:-1]).figures}
+    assert "spline" not in names and "prior+affine" in names
+
+
+def test_the_simplest_within_one_standard_error_wins_by_hand():
+    """Two rungs: the second is better by more than the error of the difference, or by less."""
+    sent = chart(48)
+    off = np.zeros_like(sent)
+    off[:, 0] = 0.1 * sent[:, 0] * (1 - sent[:, 0])
+    free = rungs({})
+    near = replace(free[2], name="true", fit=lambda a, b: lambda c: c + np.array([0.1, 0, 0]) * (c * (1 - c)))
+    assert choose([free[0], near], sent, sent + off).name == "true"
+    noise = np.random.default_rng(0).normal(0, 0.05, sent.shape)
+    faint = choose([free[0], near], sent, np.clip(sent + 0.5 * off + noise, 0, 1))
+    assert faint.name == "identity" and faint.figures[0].worse_by <= faint.figures[0].standard_error
+
+
+# ------------------------------------------------------------------------------------------------ photographs
+
+
+@pytest.fixture(scope="module")
+def shots():
+    """A printer, and two photographs of its chart of 48 swatches."""
+    printer, manifest = draw_inkjet(2), chart_manifest(48)
+    page = printed_page(manifest, printer)
+    return printer, manifest, [photograph_page(page, seed) for seed in (1, 4)]
+
+
+def test_swatches_are_read_relative_to_paper_under_uneven_light(shots):
+    printer, manifest, (first, second) = shots
+    sent = np.array([swatch.srgb for swatch in manifest.chart])
+    for shot in (first, second):
+        read = read_chart(shot.photo, manifest)
+        assert np.isfinite(read.light).all() and read.unevenness > 1.05
+        error = difference(srgb_from_linear(read.light), shown(printer, sent))
+        assert error.mean() < 1.2 and error.max() < 4
+        np.testing.assert_allclose(read.paper, shot.paper, rtol=0.06)
+
+
+def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots):
+    """The guard that the test above can fail: light that falls off by a third is read as ink where it is not taken
+    out.
+    """
+    _, manifest, (shot, _) = shots
+    falling = np.linspace(1, 0.6, shot.photo.srgb.shape[1])[:, None]
+    darker = (srgb_from_linear(linear_from_srgb(shot.photo.srgb / 255) * falling) * 255 + 0.5).astype(np.uint8)
+    before, after = read_chart(shot.photo, manifest), read_chart(Photo(darker, None, Path("x")), manifest)
+    error = difference(srgb_from_linear(after.light), srgb_from_linear(before.light))
+    assert error.mean() < 0.5 and after.paper[1] < 0.9 * before.paper[1]
+
+
+def test_photographs_that_show_no_chart(shots):
+    _, manifest, (shot, _) = shots
+    photo = shot.photo
+    with pytest.raises(CannotJudge, match="too_few_markers"):
+        read_chart(Photo(np.full_like(photo.srgb, 90), None, Path("x")), manifest)
+    with pytest.raises(CannotJudge, match="mirrored"):
+        read_chart(Photo(np.ascontiguousarray(photo.srgb[:, ::-1]), None, Path("x")), manifest)
+    light = linear_from_srgb(photo.srgb / 255) * 8
+    white = Photo((srgb_from_linear(light.clip(0, 1)) * 255).astype(np.uint8), None, Path("x"))
+    with pytest.raises(CannotJudge, match=r"clipped|too_few"):
+        read_chart(white, manifest)
+
+
+def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
+    printer, manifest, both = shots
+    (tmp_path / "chart.json").write_text(dump_manifest(manifest), encoding="utf-8")
+    for i, shot in enumerate(both):
+        Image.fromarray(shot.photo.srgb).save(tmp_path / f"{i}.png")
+    (tmp_path / "bad.jpg").write_bytes(b"no picture")
+    command = ["calibrate", "printer", "--sheet", str(tmp_path / "chart.json"), "--out", str(tmp_path / "mine.npz")]
+    command += ["--chart", *(str(tmp_path / name) for name in ("0.png", "1.png", "bad.jpg"))]
+    with pytest.raises(SystemExit) as ended:
+        cli.app(command)
+    told = capsys.readouterr()
+    assert ended.value.code == 0 and "chosen" in told.out and "appearance" in told.out and "bad.jpg" in told.err
+    mine = load_printer(str(tmp_path / "mine.npz"))
+    assert mine.method == "measured" and mine.provenance["chosen"] == "spline"
+    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in rungs({"x": None})]
+    assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
+    np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
+    assert difference(map_of(mine)(UNSEEN), shown(printer, UNSEEN)).mean() < 2
+    with pytest.raises(Refused, match="which exists"):
+        cli.app(command, standalone_mode=False)
+
+
+def test_what_cannot_be_calibrated_is_refused_in_one_sentence(shots, tmp_path):
+    _, manifest, (shot, _) = shots
+    Image.fromarray(np.full_like(shot.photo.srgb, 90)).save(tmp_path / "none.png")
+    with pytest.raises(Refused, match=r"chart can be read, got none of 1"):
+        calibrate_chart([[tmp_path / "none.png"]], manifest, "x")
+    with pytest.raises(Refused, match="with a chart"):
+        calibrate_chart([[tmp_path / "none.png"]], manifest.model_copy(update={"chart": ()}), "x")
+    with pytest.raises(Refused, match="no file at"):
+        prints_of([tmp_path / "missing.jpg"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(Refused, match="photographs of one print"):
+        prints_of([tmp_path / "empty"])
+
+
+def test_folders_are_prints_and_files_are_of_one(tmp_path):
+    for name in ("a/1.jpg", "a/2.png", "a/notes.txt", "b/1.jpg", "c.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = prints_of([tmp_path / "a", tmp_path / "c.jpg", tmp_path / "b"])
+    assert [[path.name for path in one] for one in found] == [["c.jpg"], ["1.jpg", "2.png"], ["1.jpg"]]
+
+
+def test_readings_are_combined_without_the_one_that_is_off():
+    good = np.full((4, 3), 0.4)
+    glare, gap = good + np.array([[0.5], [0], [0], [0]]), good.copy()
+    gap[3] = np.nan
+    np.testing.assert_allclose(combine([good, glare, good, gap]), good)
+    assert np.isnan(combine([gap, gap])[3]).all()
+
+
+def test_print_to_print_variation_is_found():
+    light = torch.tensor(linear_from_srgb(map_of(load_printer("coated"))(chart(72))))
+    draws = np.random.default_rng(5).random((12, 3))
+    prints = [vary(light, torch.tensor(draw)).numpy() for draw in draws]
+    found = print_variation(prints)
+    expected = 2 * draws.std(0, ddof=1) * [DOT_GAIN, DENSITY, BLACK_LIFT]
+    got = [found[key] for key in ("dot_gain_sd", "density_sd", "black_lift_sd")]
+    np.testing.assert_allclose(got, expected, rtol=0.15)
+    assert print_variation(prints[:1]) is None and print_variation(prints[:1] * 3)["delta_e00"] < 1e-4
+
+
+# ------------------------------------------------------------------------------------------------ cameras
+
+
+def test_tone_curves_close_and_a_camera_without_one_is_srgb():
+    camera, codes = bench_printer.toned_camera(), np.linspace(0, 1, 200)
+    np.testing.assert_allclose(codes_of_light(light_of_codes(codes, camera), camera), codes, atol=1e-9)
+    np.testing.assert_allclose(light_of_codes(codes, load_camera("phone")), linear_from_srgb(codes))
+    np.testing.assert_allclose(codes_of_light(np.array([2.0, -1.0]), camera), [1, 0])
+
+
+def test_a_tone_curve_that_falls_is_refused(tmp_path):
+    data = json.loads(load_camera("phone").model_dump_json())
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(data | {"tone_light": [0, 0.1, 0.3, 0.6, 1]}))
+    assert load_camera(str(path)).tone_light[2] == 0.3
+    for wrong in ([0, 0.3, 0.1, 0.6, 1], [0.1, 0.2, 0.3, 0.6, 1], [0, 0.1, 0.3, 0.6, 0.9]):
+        path.write_text(json.dumps(data | {"tone_light": wrong}))
+        with pytest.raises(Refused, match="grows from 0 to 1"):
+            load_camera(str(path))
+
+
+def test_a_camera_file_tells_printer_and_camera_apart():
+    camera = bench_printer.toned_camera()
+    without, with_file = bench_printer.printer_errors(0, 48, camera)
+    assert with_file < 1.5 and without > with_file + 1
+
+
+# ------------------------------------------------------------------------------------------------ simulated printers
+
+
+@pytest.mark.parametrize("seed", range(len(DRIVERS)))
+def test_simulated_printers_are_printers(seed):
+    printer = draw_inkjet(seed)
+    light = shown(printer, np.vstack([WHITE, np.zeros((1, 3)), UNSEEN]))
+    np.testing.assert_allclose(light[0], 1)
+    assert light.min() > 0 and light.max() <= 1 + 1e-9 and light[1].max() < 0.6
+    assert printer.driver == DRIVERS[seed]
+
+
+def test_the_table_of_a_map_leaves_paper_white_and_clips():
+    printer = printer_of("x", lambda colors: 0.9 * colors + 0.02, {})
+    np.testing.assert_allclose(printer.lut[-1, -1, -1], 1)
+    assert printer.lut.min() >= 0 and printer.gamut[-1, -1, -1] < 0.01 < printer.gamut[0, 0, 0]
+
+
+# ------------------------------------------------------------------------------------------------ RGB profiles
+
+
+def rgb_printer_profile(path: Path) -> Path:
+    """LittleCMS's own sRGB profile, called a printer's: a profile of another color space than the shipped ones."""
+    data = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    data[12:16] = b"prtr"
+    path.write_bytes(bytes(data))
+    return path
+
+
+def test_an_rgb_profile_is_baked_with_both_intents(tmp_path):
+    path = rgb_printer_profile(tmp_path / "rgb.icc")
+    for perceptual, word in ((False, "relative"), (True, "perceptual")):
+        printer = icc.bake(path, "rgb", "none", "test", perceptual)
+        assert printer.provenance["profile_colors"] == "RGB" and printer.provenance["intents"].startswith(word)
+        assert difference(map_of(printer)(UNSEEN), UNSEEN).mean() < 0.3  # what it prints is sRGB, in 8 bits
+
+
+def test_damaged_profiles_never_end_in_anything_but_a_sentence(tmp_path):
+    whole = rgb_printer_profile(tmp_path / "rgb.icc").read_bytes()
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), 12):
+            data[at] = rng.integers(256)
+        (tmp_path / "damaged.icc").write_bytes(bytes(data))
+        try:
+            icc.bake(tmp_path / "damaged.icc", "x", "none", "test")
+        except Refused as error:
+            assert "\n" not in str(error)
