@@ -269,6 +269,32 @@ def test_a_camera_file_tells_printer_and_camera_apart():
     assert with_file < 1.5 and without > with_file + 1
 
 
+# ------------------------------------------------------------------------------------------------ the benchmark
+
+
+def test_the_bench_holds_choices_against_the_best_rung():
+    def one(chosen, driver):
+        errors = {"white_black": 5.0, "affine": 2.0, "spline": 1.0}
+        return bench_printer.Trial(driver, 48, errors, {"white_black": 0.1, "affine": 0.2, "spline": 0.4}, chosen)
+
+    trials = [one("spline", "plain"), one("spline", "plain"), one("affine", "matching")]
+    drawn = bench_printer.ladder_chart(trials, np.array([[4.0, 1.0], [3.0, 1.0]]))
+    points = {point.setting: point for point in drawn.series[0].points}
+    assert points["spline"].cost == pytest.approx(4) and points["spline"].default and points["affine"].error == 2
+    mean, share, worst = drawn.checks
+    assert mean.figure == pytest.approx(4 / 3) and mean.holds
+    assert share.figure == pytest.approx(2 / 3) and not share.holds
+    assert worst.figure == pytest.approx(1) and not worst.holds
+
+
+def test_a_printer_is_never_its_own_prior():
+    for seed in (5, 11):
+        driver, shows, priors = bench_printer.drawn_printer(seed)
+        assert driver == "the other profile" and len(priors) == 1
+        prior = next(iter(priors.values()))
+        assert difference(prior(UNSEEN), shown(shows, UNSEEN)).mean() > 3
+
+
 # ------------------------------------------------------------------------------------------------ simulated printers
 
 

@@ -60,18 +60,17 @@ def printer_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     for i in range(toned):
         rows.append(printer_errors(i, 96, camera))
         on_stage("cameras", i + 1, toned)
-    yield ladder_chart(trials, np.array(rows))
+    for swatches in SWATCHES:
+        yield ladder_chart([one for one in trials if one.swatches == swatches], np.array(rows))
 
 
 def ladder_chart(trials: list[Trial], toned: np.ndarray) -> Chart:
-    """Every rung at every number of swatches; `toned` N×2 are errors against the printer, without and with a file."""
-    series, checks = [], []
-    for swatches in SWATCHES:
-        some = [one for one in trials if one.swatches == swatches]
-        names = [one.chosen for one in some]
-        usual = max(sorted(set(names)), key=names.count)
-        series.append(Series(f"{swatches} swatches", tuple(_point(name, some, usual) for name in some[0].errors)))
-        checks += _checks(swatches, some)
+    """Every rung on charts of one size; `toned` N×2 are errors against the printer itself, without and with a camera
+    file.
+    """
+    names, swatches = [one.chosen for one in trials], trials[0].swatches
+    usual = max(sorted(set(names)), key=names.count)
+    points = tuple(_point(name, trials, usual) for name in trials[0].errors)
     without, with_file = (mean_interval(toned[:, i]) for i in (0, 1))
     tone = Table(
         ("a camera with its own tone curve, 96 swatches", "ΔE00 from the printer itself", "from - to"),
@@ -81,26 +80,26 @@ def ladder_chart(trials: list[Trial], toned: np.ndarray) -> Chart:
         ),
     )
     notes = (
-        f"{len(trials) // len(SWATCHES)} printers, each chart photographed once under uneven light with noise and JPEG",
+        f"{len(trials)} printers, each chart photographed once under uneven light with noise and JPEG",
         f"y is the mean over {COLORS} colors that the chart does not hold, against what the camera shows of the true "
         "print under even light; intervals are over printers",
         "ringed: the rung that is chosen most often",
-        "6 swatches leave rungs with nothing to fit, or paper and black",
     )
     return Chart(
-        "ladder",
-        "Rungs of the printer's model: time of a fit and error, by swatches on the chart",
-        "milliseconds of one fit and its held-out colors",
+        f"{swatches}_swatches",
+        f"Models of a printer from a chart of {swatches} swatches",
+        "time of one fit, ÷ that of white_black",
         "mean ΔE00 of unseen colors",
-        tuple(series),
+        (Series("rungs", points),),
         notes,
-        tuple(checks),
-        (_choices(trials), tone),
+        tuple(_checks(swatches, trials)),
+        (_choices(trials), tone) if swatches == max(SWATCHES) else (_choices(trials),),
     )
 
 
 def _point(name: str, trials: list[Trial], usual: str) -> Point:
-    cost, cost_interval = median_interval(1e3 * np.array([one.seconds[name] for one in trials]))
+    times = np.array([one.seconds[name] / one.seconds["white_black"] for one in trials])
+    cost, cost_interval = median_interval(times)
     error, interval = mean_interval(np.array([one.errors[name] for one in trials]))
     return Point(name, cost, error, cost_interval, interval, default=name == usual)
 
@@ -121,18 +120,17 @@ def _checks(swatches: int, trials: list[Trial]) -> list[Check]:
 
 
 def _choices(trials: list[Trial]) -> Table:
-    """By driver and number of swatches: the chosen rung's error, how often it is near the best, what was chosen."""
+    """By driver: the chosen rung's error, how often it is near the best, what was chosen."""
     rows = []
     for driver in (*dict.fromkeys(one.driver for one in trials), "all"):
-        for swatches in SWATCHES:
-            some = [one for one in trials if one.swatches == swatches and driver in (one.driver, "all")]
-            errors = np.array([one.errors[one.chosen] for one in some])
-            near = sum(one.behind <= NEAR for one in some)
-            low, high = wilson(near, len(some))
-            names = [one.chosen for one in some]
-            picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
-            figures = f"{errors.mean():.2f}", f"{errors.max():.2f}", f"{near}/{len(some)} [{low:.2f}, {high:.2f}]"
-            rows.append((f"{driver}, {swatches} swatches", *figures, picked))
+        some = [one for one in trials if driver in (one.driver, "all")]
+        errors = np.array([one.errors[one.chosen] for one in some])
+        near = sum(one.behind <= NEAR for one in some)
+        low, high = wilson(near, len(some))
+        names = [one.chosen for one in some]
+        picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
+        figures = f"{errors.mean():.2f}", f"{errors.max():.2f}", f"{near}/{len(some)} [{low:.2f}, {high:.2f}]"
+        rows.append((driver, *figures, picked))
     return Table(("printer", "mean", "worst", f"within {NEAR} of best", "chosen"), tuple(rows))
 
 
