@@ -18,6 +18,7 @@ from patchproof.sheet.manifest import dump_manifest, load_manifest
 from patchproof.sheet.pdf import srgb_profile
 from patchproof.sheet.piece import control_design, frame_image, lay_out_piece
 from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
+from patchproof.sheet.shop import shop_lines
 from patchproof.sheet.template import load_template
 from patchproof.sheet.write import check_sheet, write_sheet
 
@@ -276,12 +277,23 @@ def test_blank_sheet_has_no_design_and_white_in_its_middle(tmp_path):
 
 
 def test_check_sheet_tells_the_print_shop(sheet, tmp_path):
-    lines = check_sheet(sheet[1])
+    lines = check_sheet(sheet[1]) + shop_lines(sheet[0])
     text = " ".join(lines)
-    for word in ("210 × 297 mm", "100 %", "bleed", "162.9 × 162.9 mm", "sRGB", "22 ppi", "embedded", "matte", "100 mm"):
+    for word in (
+        "210 × 297 mm",
+        "100 %",
+        "bleed",
+        "162.9 × 162.9 mm",
+        "sRGB",
+        "22 ppi",
+        "embedded",
+        "matte",
+        "100 mm",
+        "lossless",
+    ):
         assert word in text
     assert all(line.endswith(".") for line in lines)
-    assert "swatches, so" not in text
+    assert "swatches, so" not in text and "PROBLEM" not in text
     few = write(tmp_path / "few.pdf", (40, 40), 20)
     assert "room for 8 of 12 swatches" in " ".join(check_sheet(few))
 

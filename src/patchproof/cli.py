@@ -25,8 +25,7 @@ app = typer.Typer(
     help="Optimise a patch on a 3D object, print it at true size, photograph it, and judge the photographs.",
 )
 
-
-calibrate = typer.Typer(no_args_is_help=True, help="Measure a printer or a camera from photographs or a profile.")
+calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 app.add_typer(calibrate, name="calibrate")
 
 
@@ -165,6 +164,7 @@ def sheet(
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.optimize.run import load_run
     from patchproof.output import check_file
+    from patchproof.sheet.shop import shop_lines
     from patchproof.sheet.write import check_sheet
     from patchproof.study.sheet import blank_page, sheet_of
 
@@ -177,7 +177,7 @@ def sheet(
         manifest = sheet_of(load_run(run), out, template=template, control=kind)
     _say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {out.with_suffix('.json').name}")
     if check:
-        _say(*check_sheet(manifest))
+        _say(*check_sheet(manifest), *shop_lines(out))
 
 
 @app.command()
@@ -297,6 +297,25 @@ def calibrate_printer(
             lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, on_photo)
     _warn(warned)
     _say(*lines)
+
+
+@calibrate.command("camera")
+def calibrate_camera_(
+    photos: Annotated[Path, typer.Argument(help="A folder of photographs of a board.")],
+    board: Annotated[str, typer.Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
+    out: Annotated[Path, typer.Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
+        "camera.json"
+    ),
+    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Focal length, middle and lens distortion of a camera."""
+    from patchproof.calibrate.camera import calibrate_camera, calibration_lines
+
+    ruler = None if ruler_mm is None else _pair(ruler_mm, "--ruler-mm")
+    with _progress() as bar:
+        found = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
+    _say(*calibration_lines(found), f"camera: {out}")
 
 
 @app.command()

@@ -82,12 +82,19 @@ def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int
     except (OSError, ValueError) as error:
         raise Refused("a camera file (JSON)", f"{path} that cannot be read", "calibrate again") from error
     camera = validated(Camera, data, str(path))
-    _refuse_outside(camera, path)
-    _refuse_tone(camera, path)
-    _refuse_folded(camera, path)
+    check_camera(camera, str(path))
     if photo_px is not None:
         _refuse_aspect(camera, photo_px, path)
     return camera
+
+
+def check_camera(camera: Camera, where: str) -> None:
+    """Refuse a camera whose middle lies outside of its picture, or whose distortion cannot be undone; `where` is said
+    of it.
+    """
+    _refuse_outside(camera, where)
+    _refuse_tone(camera, where)
+    _refuse_folded(camera, where)
 
 
 def matrix_px(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
@@ -212,7 +219,7 @@ def _path(name_or_file: str, base: Path | None) -> Path:
     return shipped("calibration", "cameras", f"{name_or_file}.json")
 
 
-def _refuse_outside(camera: Camera, path: Path) -> None:
+def _refuse_outside(camera: Camera, path: str) -> None:
     width, height = camera.image_px
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise Refused(
@@ -222,7 +229,7 @@ def _refuse_outside(camera: Camera, path: Path) -> None:
         )
 
 
-def _refuse_tone(camera: Camera, path: Path) -> None:
+def _refuse_tone(camera: Camera, path: str) -> None:
     light = camera.tone_light
     if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
         raise Refused(
@@ -232,7 +239,7 @@ def _refuse_tone(camera: Camera, path: Path) -> None:
         )
 
 
-def _refuse_folded(camera: Camera, path: Path) -> None:
+def _refuse_folded(camera: Camera, path: str) -> None:
     """Where undistorting closes, neighbors keep their order and stay within twice their distance: no direction is seen
     twice.
     """

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
+from patchproof.settings import Refused
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
@@ -62,6 +63,27 @@ def read_photo(path: str | Path) -> Photo:
         raise _unreadable(_why(path, error)) from error
     diagonal_px = math.hypot(*srgb.shape[:2])
     return Photo(srgb, focal_35mm / _DIAGONAL_35MM * diagonal_px if focal_35mm else None, path)
+
+
+def list_photos(folder: str | Path) -> list[Path]:
+    """The pictures of a folder by suffix, in the order of their names; refused where there are none."""
+    folder = Path(folder)
+    if folder.is_file():
+        return [folder]
+    if not folder.is_dir():
+        raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
+    paths = pictures_in(folder)
+    if not paths:
+        raise Refused(
+            f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}", "none", "copy the photographs there"
+        )
+    return paths
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The files of a folder that are pictures by their suffix, none hidden, in the order of their names."""
+    files = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
 
 
 def _formats(image_module) -> list[str]:

@@ -56,17 +56,18 @@ class PageLayout:
     """All that is on the page, in page millimetres."""
 
     page_mm: tuple[float, float]
-    piece: Piece
-    cut_mm: RectMm
-    design_mm: RectMm
+    piece: Piece | None  # none on a board's page, nor what follows from it
+    cut_mm: RectMm | None
+    design_mm: RectMm | None
     markers: tuple[PieceMarker, ...]  # the piece's first
     swatches: tuple[SwatchRect, ...]  # the chart's first
     qr_mm: tuple[RectMm, ...]
     ticks: tuple[Line, ...]
-    card_mm: RectMm
+    card_mm: RectMm | None
     card_radius_mm: float
     texts: tuple[TextLine, ...]
     boxes: tuple[Box, ...]
+    squares_mm: tuple[RectMm, ...] = ()  # a board's black squares
 
 
 def largest_piece_mm(template: Template) -> tuple[float, float]:

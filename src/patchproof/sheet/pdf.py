@@ -75,7 +75,9 @@ def _draw(canvas: Canvas, layout: PageLayout, design: np.ndarray | None) -> None
         _fill(canvas, [(x, y, w / 2, h), (x + w / 2, y, w / 2, h)], srgb, height)
     for marker in layout.markers:
         _fill(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
-    _fill(canvas, layout.qr_mm, (0.0, 0.0, 0.0), height)
+    for rects in (layout.qr_mm, layout.squares_mm):
+        if rects:
+            _fill(canvas, rects, (0.0, 0.0, 0.0), height)
     canvas.setStrokeGray(0)
     for line in layout.ticks:
         x0, y0, x1, y1 = line.ends_mm
@@ -91,16 +93,18 @@ def _draw(canvas: Canvas, layout: PageLayout, design: np.ndarray | None) -> None
 def _outlines(canvas: Canvas, layout: PageLayout) -> None:
     """The card's outline, and the cut line just outside the piece."""
     height = layout.page_mm[1]
-    x, y, w, h = layout.card_mm
     canvas.setStrokeGray(0.45)
-    canvas.setLineWidth(0.2)
-    canvas.roundRect(x, height - y - h, w, h, layout.card_radius_mm)
-    x, y, w, h = layout.cut_mm
-    half = CUT_LINE_MM / 2
-    canvas.setLineWidth(CUT_LINE_MM)
-    canvas.setDash(2.0, 1.5)
-    canvas.rect(x - half, height - y - h - half, w + 2 * half, h + 2 * half)
-    canvas.setDash()
+    if layout.card_mm is not None:
+        x, y, w, h = layout.card_mm
+        canvas.setLineWidth(0.2)
+        canvas.roundRect(x, height - y - h, w, h, layout.card_radius_mm)
+    if layout.cut_mm is not None:
+        x, y, w, h = layout.cut_mm
+        half = CUT_LINE_MM / 2
+        canvas.setLineWidth(CUT_LINE_MM)
+        canvas.setDash(2.0, 1.5)
+        canvas.rect(x - half, height - y - h - half, w + 2 * half, h + 2 * half)
+        canvas.setDash()
 
 
 def _image(canvas: Canvas, design: np.ndarray, rect: RectMm, height: float) -> None:

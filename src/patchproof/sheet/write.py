@@ -2,8 +2,8 @@
 
 In: a piece, a template, the design's pixels, and the promise. Out: two files with the same stem, and the manifest, of
 which the PDF carries the same bytes as an attachment. They are written beside their places first and moved there
-last, so that a full disk or a crash leaves what was there before. `check_sheet` says in plain sentences what a print
-shop needs to know.
+last, so that a full disk or a crash leaves what was there before. `check_sheet` says in plain sentences what whoever
+prints and cuts it needs to know.
 Left out on purpose: asking before overwriting, which is the command line's business.
 """
 
@@ -54,7 +54,7 @@ def write_sheet(
     manifest = _manifest(page, template, sheet_id, kind, design_srgb8, promise, settings)
     text = dump_manifest(manifest)
     pdf = page_pdf(page, design_srgb8, f"patchproof sheet {sheet_id} {kind}", text)
-    _replace_both({pdf_path: pdf, pdf_path.with_suffix(".json"): text.encode()})
+    replace_both({pdf_path: pdf, pdf_path.with_suffix(".json"): text.encode()})
     return manifest
 
 
@@ -64,34 +64,25 @@ def qr_text(sheet_id: str, kind: str, design_srgb8: np.ndarray | None) -> str:
 
 
 def check_sheet(manifest: Manifest) -> list[str]:
-    """What whoever prints this sheet should know, in sentences."""
+    """What whoever prints this sheet should know of what is on it, in sentences; `shop.shop_lines` reads the PDF."""
     width, height = manifest.page_mm
     lines = [
-        f"The page is {width:g} × {height:g} mm, one side; print it at 100 %, as the file asks viewers to.",
-        f"No bleed is needed: markers, swatches and cut line stay {_nearest_ink_mm(manifest):.1f} mm from the edge.",
-        "Trim box and bleed box are the whole page.",
-        f"Cut the piece of {manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm along the dashed line.",
-        _design_line(manifest),
-        "All fonts are embedded; words, markers and swatches are vector, in sRGB; black is RGB 0 0 0.",
-        "Use matte white paper of 160 g/m² or more, color, best quality, and switch off all color enhancement.",
+        f"Print the {width:g} × {height:g} mm page at 100 %; markers, swatches and cut line stay "
+        f"{_nearest_ink_mm(manifest):.1f} mm from its edge.",
+        "Use matte white paper of 160 g/m² or more, color, best quality.",
         f"After printing both rulers must measure {manifest.ruler_mm[0]:g} and {manifest.ruler_mm[1]:g} mm.",
     ]
+    if manifest.kind == "board":
+        return [*lines, "Glue the uncut page to something flat and stiff."]
+    lines.append(f"Cut the piece of {manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm along the dashed line.")
+    if manifest.design is None:
+        lines.append("The piece carries no design: its middle stays white paper.")
     inside = sum(_within(swatch.rect_mm, manifest.cut_mm) for swatch in manifest.chart)
     if inside < len(FRAME_COLORS):
         lines.append(
             f"The frame has room for {inside} of {len(FRAME_COLORS)} swatches, so color on it is measured less well."
         )
     return lines
-
-
-def _design_line(manifest: Manifest) -> str:
-    if manifest.design is None:
-        return "The piece carries no design: its middle stays white paper."
-    (columns, rows), (_, _, w, h) = manifest.design.size_px, manifest.design.rect_mm
-    return (
-        f"The design is an RGB image tagged sRGB, {columns} × {rows} pixels on {w:g} × {h:g} mm "
-        f"({columns / w * 25.4:.0f} ppi), lossless; its pixels are meant as they are, so do not resample or sharpen."
-    )
 
 
 def _manifest(
@@ -131,7 +122,7 @@ def _check_pixels(design: np.ndarray) -> None:
         raise Refused("a design of uint8 H×W×3 pixels", f"{design.dtype} {design.shape}", "convert it to 8-bit RGB")
 
 
-def _replace_both(contents: dict[Path, bytes]) -> None:
+def replace_both(contents: dict[Path, bytes]) -> None:
     """Write all files under other names in the same folder, then move each to its place."""
     waiting = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
     try:

@@ -17,6 +17,7 @@ from patchproof.optimize.run import Run
 from patchproof.scene.scene import build_scene
 from patchproof.settings import Refused
 from patchproof.sheet.blank import blank_sheet
+from patchproof.sheet.board import board_sheet, is_board
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.piece import MODULES, control_design, lay_out_piece
 from patchproof.sheet.template import load_template
@@ -57,9 +58,9 @@ def sheet_of(run: Run, pdf_path: str | Path, *, template: str | None = None, con
 
 
 def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:
-    """Write the blank page of a template with a [blank] table, which needs no run; all else does."""
+    """Write the page of a template with a [blank] or a [board] table, which needs no run; all else does."""
     if control is not None:
         raise Refused(f"the run whose {control} control belongs on the page", "none", "name the run")
     if template is None:
         raise Refused("a run, or the template of a blank page", "neither", "name a run, or --template blank_a4")
-    return blank_sheet(template, pdf_path)
+    return board_sheet(template, pdf_path) if is_board(template) else blank_sheet(template, pdf_path)

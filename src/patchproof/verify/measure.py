@@ -17,6 +17,7 @@ from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import Found, find_markers, is_mirrored
+from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -66,6 +67,11 @@ def measure(
     light = frame_light(photo.srgb, found.markers.values())
     entry = _with_geometry(entry, photo, found, fit, light, surface)
     page_check = _is_uncut(fit, found, surface)
+    if page_check and surface.page_mm is not None:
+        try:
+            refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
+        except CannotJudge as other:
+            return Measured(_coded(entry.model_copy(update={"status": "rejected"}), other), False, {})
     scan = scan_dpi is not None and is_scan(fit.px_from_mm, surface, scan_dpi)
     counted = not (page_check or scan)
     cannot, pictures = _trouble(entry, fit, found, surface), {}
@@ -103,8 +109,10 @@ def identify(srgb: np.ndarray, surface: Surface) -> Found:
                 None,
                 "the photo is mirrored: switch off the camera's mirror setting and save it again",
             )
-        if found.foreign:
-            advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
+        said = read_label(srgb)
+        if found.foreign or (said is not None and said != surface.label):
+            which = "another sheet" if said is None else f"sheet {said.sheet_id} ({said.printed})"
+            advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
             raise CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
         raise CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
     if len(found.foreign) > 1 or len(found.doubled) > 1:

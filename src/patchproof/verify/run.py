@@ -18,7 +18,7 @@ import numpy as np
 
 from patchproof.claims import wilson
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.read import SUFFIXES, Photo, read_photo
+from patchproof.photo.read import Photo, list_photos, pictures_in, read_photo
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.verify.classify import check_primary, predict, squares_of, target_indices
@@ -75,34 +75,14 @@ def gather_evidence(
     return _evidence(manifest, models, indices, entries, looks, control_looks)
 
 
-def list_photos(folder: str | Path) -> list[Path]:
-    """The pictures of a folder by suffix, in the order of their names; refused where there are none."""
-    folder = Path(folder)
-    if folder.is_file():
-        return [folder]
-    if not folder.is_dir():
-        raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
-    paths = _pictures(folder)
-    if not paths:
-        raise Refused(
-            f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}", "none", "copy the photographs there"
-        )
-    return paths
-
-
-def _pictures(folder: Path) -> list[Path]:
-    files = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
-
-
 def _list_controls(folder: str | Path) -> dict[str, list[Path]]:
     """Photographs by control: the folder's own pictures, or one control for each folder in it."""
     folder = Path(folder)
     if not folder.is_dir():
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
-    if own := _pictures(folder):
+    if own := pictures_in(folder):
         return {folder.name: own}
-    inside = {p.name: _pictures(p) for p in sorted(folder.iterdir()) if p.is_dir() and not p.name.startswith(".")}
+    inside = {p.name: pictures_in(p) for p in sorted(folder.iterdir()) if p.is_dir() and not p.name.startswith(".")}
     inside = {name: files for name, files in inside.items() if files}
     if not inside:
         raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")

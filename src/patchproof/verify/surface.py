@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from patchproof.color import linear_from_srgb
+from patchproof.photo.label import Label, label_of
 from patchproof.sheet.manifest import Manifest
 
 _LARGEST_PX = 512  # of the design as it is compared; photographs never resolve more
@@ -28,6 +29,8 @@ class Surface:
     center_mm: tuple[float, float]
     swatch_rects_mm: tuple[tuple[float, float, float, float], ...]
     swatches_srgb: np.ndarray
+    label: Label  # what the page's code says
+    page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
 
     @property
     def page_ids(self) -> frozenset[int]:
@@ -64,6 +67,8 @@ def surface_of(manifest: Manifest) -> Surface:
         (rect[0] + rect[2] / 2, rect[1] + rect[3] / 2),
         tuple(s.rect_mm for s in swatches),
         np.array([s.srgb for s in swatches]).reshape(-1, 3),
+        label_of(manifest),
+        None if manifest.tiles else manifest.page_mm,
     )
 
 

@@ -1,0 +1,159 @@
+"""Photographs of a ChArUco board become corners: where on the board, where in the picture.
+
+In: a folder of photographs and a printed board. Out: one `View` for each photograph that shows enough of the board,
+and a reason for each of the others. All views come from one camera in one state: the picture size, the way it was
+held, and the focal length that most photographs share; a phone that switched lenses between two photographs would
+otherwise be calibrated as the mean of both. Corners are saddle points, symmetric under half a turn, so neither blur
+nor the tone curve shifts them. Pixel centers are at .5.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.detect import luminance
+from patchproof.photo.read import FORMATS, list_photos, read_photo
+from patchproof.settings import Refused
+from patchproof.sheet.board import Board
+
+FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
+_ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph's corners: `ids` N of the board's, `board_mm` N×2 as printed, `px` N×2 of `size_px` (w, h)."""
+
+    file: str
+    ids: np.ndarray
+    board_mm: np.ndarray
+    px: np.ndarray
+    size_px: tuple[int, int]
+
+    def only(self, keep: np.ndarray) -> View:
+        """The view with these of its corners."""
+        return View(self.file, self.ids[keep], self.board_mm[keep], self.px[keep], self.size_px)
+
+
+@dataclass(frozen=True)
+class Left:
+    """A photograph that is left out, and why."""
+
+    file: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Seen:
+    """All photographs: views, those left out, and what the files say of the camera ("" where they say nothing)."""
+
+    views: tuple[View, ...]
+    left: tuple[Left, ...]
+    camera: str
+
+
+def see_boards(
+    photos: str | Path, board: Board, ruler_mm: tuple[float, float] | None = None, progress=lambda done, total: None
+) -> Seen:
+    """The board's corners in every picture of the folder; `ruler_mm` are the printed rulers (x, y) as measured."""
+    paths, views, left, states = list_photos(photos), [], [], []
+    places = corner_places_mm(board, ruler_mm)
+    for number, path in enumerate(paths, 1):
+        try:
+            view, focal_px = _view(path, board, places)
+            views.append(view)
+            states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
+        except CannotJudge as cannot:
+            left.append(Left(path.name, cannot.advice))
+        progress(number, len(paths))
+    if not views:
+        raise Refused(
+            f"photographs of the board {board.sheet_id}", f"{len(paths)} without it", "name the board with --board"
+        )
+    common = Counter(states).most_common(1)[0][0]
+    kept = []
+    for view, state in zip(views, states, strict=True):
+        if state == common:
+            kept.append(view)
+        else:
+            left.append(Left(view.file, _other_state(state, common)))
+    return Seen(tuple(kept), tuple(left), common[1][1])
+
+
+def corner_places_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
+    """Inner corners M×2 by id, from the board's top-left corner; scaled as the rulers came out of the printer."""
+    column, row = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
+    nominal = np.column_stack([column.ravel(), row.ravel()]) * board.square_mm
+    return nominal if ruler_mm is None else nominal * (np.array(ruler_mm) / board.ruler_mm)
+
+
+def _view(path: Path, board: Board, places_mm: np.ndarray) -> tuple[View, float | None]:
+    photo = read_photo(path)
+    ids, px, markers = find_corners(photo.srgb, board)
+    if len(ids) < FEWEST_CORNERS or np.linalg.matrix_rank(places_mm[ids] - places_mm[ids].mean(0)) < 2:
+        advice = f"{markers} markers and {len(ids)} corners of the board were read, {FEWEST_CORNERS} corners are needed"
+        raise CannotJudge("too_few_markers", len(ids), FEWEST_CORNERS, f"{advice}: show more of it, sharp")
+    height, width = photo.srgb.shape[:2]
+    return View(path.name, ids, places_mm[ids], px, (width, height)), photo.focal_px
+
+
+def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray, int]:
+    """(ids N, pixels N×2, number of markers) of the board's inner corners in a picture.
+
+    Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
+    """
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    light = np.clip(luminance(srgb) * 255 + 0.5, 0, 255).astype(np.uint8)
+    quads, names, _ = cv2.aruco.ArucoDetector(dictionary, _settings()).detectMarkers(light)
+    none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
+    if names is None:
+        return none
+    size = (board.columns, board.rows)
+    pattern = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, np.array(board.ids, np.int32))
+    gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(gray, None, None, quads, names)
+    if ids is None or len(ids) == 0:
+        return none
+    # OpenCV 4 gives N×1 and N×1×2, OpenCV 5 gives N and N×2
+    return np.asarray(ids).reshape(-1), np.asarray(corners, float).reshape(-1, 2) + 0.5, len(quads)
+
+
+def _settings():
+    """Those of `photo.detect`: the defaults lose most markers that are blurred by a third of a module."""
+    settings = cv2.aruco.DetectorParameters()
+    settings.perspectiveRemovePixelPerCell = 8
+    settings.perspectiveRemoveIgnoredMarginPerCell = 0.3
+    settings.adaptiveThreshConstant = 3
+    return settings
+
+
+def _tags(path: Path) -> tuple[int, str]:
+    """(EXIF orientation, maker and model) as the file has them."""
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
+            exif = image.getexif()
+            words = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
+            return int(exif.get(_ORIENTATION, 1)), " ".join(word for word in words if word)
+    except (OSError, ValueError, SyntaxError, TypeError):  # the picture has been read; its labels are a bonus
+        return 1, ""
+
+
+def _other_state(state, common) -> str:
+    """In what a photograph's camera differs from most."""
+    (size, (turned, camera), focal), (most_size, (_, most_camera), _) = state, common
+    if size != most_size:
+        got, most = f"{size[0]} × {size[1]} px", f"{most_size[0]} × {most_size[1]}"
+        return f"{got} where most have {most}: hold the camera one way and keep its picture size"
+    if camera != most_camera:
+        return f"taken with another camera ({camera or 'unnamed'}): calibrate one camera at a time"
+    if turned != common[1][0]:
+        return "the camera was held another way round: the picture's middle is elsewhere then"
+    return f"another focal length ({focal or 'unknown'} px): keep the zoom and the lens"

@@ -1,0 +1,239 @@
+"""A camera from photographs of a board: which are used, the lens they pay for, and a file that scenes can read.
+
+In: photographs and a board. Out: `Calibrated`, and three files: NAME.json in the form of calibration/cameras,
+NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. What the photographs
+cannot tell is refused: too few of them, boards that all face the same way (a plane's picture then hardly depends on
+the focal length), a focal length known to no better than 1 %. The print's size does not matter, its proportions do:
+rulers that differ are typed in.
+Left out on purpose: fisheye lenses, and how flat the board is: that shows as a residual, no more.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.calibrate.boards import FEWEST_CORNERS, Left, View, see_boards
+from patchproof.calibrate.lens_ladder import NUMBERS, Climbed, Fit, climb, fit_rung
+from patchproof.channel.lens import Camera, check_camera
+from patchproof.output import check_file, make_folder, write_whole
+from patchproof.settings import Refused
+from patchproof.sheet.board import Board, load_board
+
+FEWEST_PHOTOS = 6
+LEAST_TURN_DEG = 10.0  # between the two boards that differ most; 20 to 45° of tilt are asked for
+MOST_FOCAL_SHARE = 0.01  # one standard deviation of the focal length
+WELL_COVERED = 0.75  # of the half diagonal; a lens bends most beyond
+_TRIAL_RUNG = "k1 k2"  # bends enough for any lens of the ladder to show which photographs are odd
+_MISFIT = 1.0  # px rms, of a picture of 2 megapixels or less; sharp photographs of flat boards leave 0.05 to 0.3
+_ODD_PHOTO, _ODD_CORNER, _ODD_PX = 3.0, 5.0, 0.5  # times the median error, and never below this
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A camera, the ladder with the fit it comes from, the views used, those left out, and the board."""
+
+    camera: Camera
+    climbed: Climbed
+    views: tuple[View, ...]
+    left: tuple[Left, ...]
+    board: Board
+
+    @property
+    def coverage(self) -> float:
+        """How far the corners reach towards the picture's corners, as a share of its half diagonal."""
+        middle = np.array(self.views[0].size_px) / 2
+        return max(float(np.linalg.norm(v.px - middle, axis=1).max()) for v in self.views) / float(np.hypot(*middle))
+
+
+def calibrate_camera(
+    photos: str | Path,
+    board: str | Path,
+    out: str | Path,
+    *,
+    ruler_mm: tuple[float, float] | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Calibrated:
+    """Calibrate and write the three files; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
+    from patchproof.calibrate.camera_picture import residual_picture
+
+    out = Path(out)
+    if out.suffix.lower() != ".json":
+        raise Refused("a file name that ends in .json", f'"{out}"', "name the camera CAMERA.json")
+    figures, picture = out.with_suffix(".fit.json"), out.with_suffix(".residuals.png")
+    for path in (out, figures, picture):
+        check_file(path, overwrite)
+    printed = load_board(board)
+    seen = see_boards(photos, printed, ruler_mm, lambda done, total: progress("find corners", done, total))
+    found = solve(
+        seen.views, seen.left, printed, out.stem, seen.camera, lambda done, total: progress("lens models", done, total)
+    )
+    make_folder(out.parent)
+    write_whole(figures, lambda path: path.write_text(_text(fit_figures(found)), encoding="utf-8"))
+    write_whole(picture, lambda path: path.write_bytes(residual_picture(found)))
+    write_whole(out, lambda path: path.write_text(_text(found.camera.model_dump()), encoding="utf-8"))
+    return found
+
+
+def solve(
+    views: Sequence[View],
+    left: Sequence[Left],
+    board: Board,
+    name: str,
+    camera: str = "",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Calibrated:
+    """The camera that took these views; refused where they cannot tell. `camera` is what it calls itself."""
+    _enough(views, left)
+    views, odd = _without_odd(views)
+    left = (*left, *odd)
+    _enough(views, left)
+    size_px = views[0].size_px
+    climbed = climb(views, lambda fit: _undoable(_camera(fit, name, size_px, "", "")), progress)
+    _refuse_blind(climbed.fit)
+    about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
+    made = _camera(climbed.fit, name, size_px, about, _uncertainty(climbed.fit))
+    check_camera(made, "this calibration")
+    return Calibrated(made, climbed, tuple(views), tuple(left), board)
+
+
+def fit_figures(found: Calibrated) -> dict:
+    """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
+    fit = found.climbed.fit
+    figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
+    photos = [
+        {
+            "file": view.file,
+            "status": "used",
+            "corners": len(view.ids),
+            "rms_px": figure(np.sqrt((residual**2).sum(1).mean())),
+            "tilt_deg": round(float(tilt), 2),
+        }
+        for view, residual, tilt in zip(found.views, fit.residuals_px, fit.tilts_deg, strict=True)
+    ]
+    photos += [{"file": one.file, "status": "left out", "reason": one.reason} for one in found.left]
+    return {
+        "board": found.board.sheet_id,
+        "rung": fit.rung,
+        "ladder": [
+            {"rung": r.name, "held_out_px": figure(r.held_out_px), "standard_error_px": figure(r.standard_error_px)}
+            for r in found.climbed.rungs
+        ],
+        "numbers": {
+            n: {"value": float(v), "standard_deviation": float(s)}
+            for n, v, s in zip(NUMBERS, fit.numbers, fit.sd, strict=True)
+        },
+        "rms_px": figure(fit.rms_px),
+        "coverage": round(found.coverage, 3),
+        "photos": sorted(photos, key=lambda photo: photo["file"]),
+    }
+
+
+def calibration_lines(found: Calibrated) -> list[str]:
+    """What a user wants to know of it, in a few lines."""
+    fit, camera = found.climbed.fit, found.camera
+    steps = ", ".join(f"{r.name} {r.held_out_px:.3f}" for r in found.climbed.rungs if np.isfinite(r.held_out_px))
+    lines = [
+        f"lens: {fit.rung} (held-out error in px: {steps})",
+        f"focal length {camera.fx:.1f} ± {fit.sd[0]:.1f} × {camera.fy:.1f} ± {fit.sd[1]:.1f} px "
+        f"at {camera.image_px[0]} × {camera.image_px[1]}, middle {camera.cx:.1f} ± {fit.sd[2]:.1f}, "
+        f"{camera.cy:.1f} ± {fit.sd[3]:.1f}",
+        f"{len(found.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
+        f"{fit.tilts_deg.max():.0f}°",
+    ]
+    lines += [f"left out: {one.file}: {one.reason}" for one in found.left]
+    if found.coverage < WELL_COVERED:
+        lines.append(
+            f"warning: the board's corners reach {found.coverage:.0%} of the way to the picture's corners; "
+            "beyond, distortion is a guess: photograph the board there, too"
+        )
+    return lines
+
+
+def _enough(views: Sequence[View], left: Sequence[Left]) -> None:
+    if len(views) < FEWEST_PHOTOS:
+        why = f" ({left[0].file}: {left[0].reason})" if left else ""
+        raise Refused(
+            f"at least {FEWEST_PHOTOS} photographs that show {FEWEST_CORNERS} corners of the board",
+            f"{len(views)} of {len(views) + len(left)}{why}",
+            "take 15 or more, sharp, from different sides",
+        )
+
+
+def _without_odd(views: Sequence[View]) -> tuple[list[View], list[Left]]:
+    """Views without the photographs, then without the corners, that lie far off: moved, of a bent board, occluded."""
+    kept, odd = list(views), []
+    while len(kept) >= FEWEST_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
+        errors = [np.linalg.norm(residual, axis=1) for residual in fit.residuals_px]
+        typical = np.array([np.median(error) for error in errors])
+        usual, worst = float(np.median(typical)), int(typical.argmax())
+        if typical[worst] > max(_ODD_PHOTO * usual, _ODD_PX):
+            # the worst alone: an odd photograph drags the others along until it is gone, and so does a corner
+            reason = (
+                f"its corners miss by {typical[worst]:.2f} px where most miss by {usual:.2f}: moved, or a bent board"
+            )
+            odd.append(Left(kept.pop(worst).file, reason))
+            continue
+        farthest = max(float(error.max()) for error in errors)
+        if farthest <= max(_ODD_CORNER * usual, _ODD_PX):
+            break
+        kept = [view.only(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
+        few = "too few of its corners agree with the others: show more of the board, sharp"
+        odd += [Left(view.file, few) for view in kept if len(view.ids) < FEWEST_CORNERS]
+        kept = [view for view in kept if len(view.ids) >= FEWEST_CORNERS]
+    return kept, odd
+
+
+def _refuse_blind(fit: Fit) -> None:
+    """Refuse views from which the focal length cannot be told."""
+    turns = np.degrees(np.arccos(np.clip(fit.normals @ fit.normals.T, -1, 1))).max()
+    share = max(fit.sd[0] / fit.numbers[0], fit.sd[1] / fit.numbers[1])
+    if fit.rms_px > _MISFIT * max(1.0, float(np.hypot(*fit.numbers[2:4])) / 1000):
+        raise Refused(
+            "photographs of a flat board that a lens model explains",
+            f"{fit.rms_px:.1f} px that it leaves over",
+            "glue the board to something flat, measure both of its rulers and type them in with --ruler-mm",
+        )
+    if turns < LEAST_TURN_DEG or share > MOST_FOCAL_SHARE:
+        raise Refused(
+            f"boards turned against each other by {LEAST_TURN_DEG:g}° and more, and a focal length known to "
+            f"{MOST_FOCAL_SHARE:.0%}",
+            f"{turns:.0f}° and {share:.1%}",
+            "photograph the board from 20 to 45° aside, from all sides",
+        )
+
+
+def _undoable(camera: Camera) -> bool:
+    try:
+        check_camera(camera, "a trial")
+    except Refused:
+        return False
+    return True
+
+
+def _camera(fit: Fit, name: str, size_px: tuple[int, int], instrument: str, uncertainty: str) -> Camera:
+    numbers = {n: round(float(v), 6) for n, v in zip(NUMBERS, fit.numbers, strict=True)}
+    return Camera(
+        name=name,
+        method="measured",
+        when=date.today().isoformat(),
+        instrument=instrument,
+        uncertainty=uncertainty,
+        image_px=size_px,
+        **numbers,
+    )
+
+
+def _uncertainty(fit: Fit) -> str:
+    parts = ", ".join(f"{n} {s:.2g}" for n, s in zip(NUMBERS, fit.sd, strict=True) if s > 0)
+    return f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
+
+
+def _text(data: dict) -> str:
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"

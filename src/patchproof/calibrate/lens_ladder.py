@@ -1,0 +1,183 @@
+"""Which lens model the photographs of a board pay for: a ladder, climbed by held-out reprojection error.
+
+In: corners of several photographs. Out: every rung's error on photographs that it was not fitted to, the rung that was
+chosen, and its fit to all. The rungs are pinhole, k1, k1 k2, those with tangential terms p1 p2, and with k3 on top;
+the chosen one is the lowest whose error is within one standard error of the best one's (Breiman's rule): a term that
+buys less than chance is left out. A held-out photograph gives its pose, six numbers, and nothing else.
+OpenCV fits (Zhang's method); the standard deviations are its own or those between the folds, whichever are larger:
+photographs share a bent board, and corners of one photograph are not independent.
+
+Source: Zhang, A Flexible New Technique for Camera Calibration, PAMI 2000; Hastie et al., The Elements of Statistical
+Learning, 7.10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from patchproof.calibrate.boards import View
+from patchproof.settings import Refused
+
+FOLDS = 5
+NUMBERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+_NO_K3, _NO_P = cv2.CALIB_FIX_K3, cv2.CALIB_ZERO_TANGENT_DIST
+RUNGS = {
+    "pinhole": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K1,
+    "k1": _NO_P | _NO_K3 | cv2.CALIB_FIX_K2,
+    "k1 k2": _NO_P | _NO_K3,
+    "k1 k2 p1 p2": _NO_K3,
+    "k1 k2 p1 p2 k3": 0,
+}
+_FREE = {"pinhole": 4, "k1": 5, "k1 k2": 6, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}  # of NUMBERS, from the first
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One rung fitted to some views: `numbers` and their standard deviations `sd` as in NUMBERS, and each view's pose
+    (rotation and translation vectors) and residuals N×2 px.
+    """
+
+    rung: str
+    numbers: np.ndarray
+    sd: np.ndarray
+    poses: tuple[tuple[np.ndarray, np.ndarray], ...]
+    residuals_px: tuple[np.ndarray, ...]
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the residuals' lengths over all corners."""
+        return float(np.sqrt((np.concatenate(self.residuals_px) ** 2).sum(1).mean()))
+
+    @property
+    def tilts_deg(self) -> np.ndarray:
+        """How far each board is turned away from facing the camera."""
+        return np.degrees(np.arccos(np.clip(np.abs(self.normals[:, 2]), 0, 1)))
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normals of the boards as the camera sees them."""
+        return np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation, _ in self.poses])
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A rung's held-out error: mean over photographs of their RMS in px, and its standard error (inf: no fit)."""
+
+    name: str
+    held_out_px: float
+    standard_error_px: float
+
+
+@dataclass(frozen=True)
+class Climbed:
+    """All rungs with their figures, and the chosen one's fit to all photographs."""
+
+    rungs: tuple[Rung, ...]
+    fit: Fit
+
+
+def climb(
+    views: Sequence[View], usable: Callable[[Fit], bool] = lambda fit: True, progress=lambda done, total: None
+) -> Climbed:
+    """The ladder on these views; a rung whose fit is not `usable` is passed over."""
+    folds = [np.arange(len(views)) % min(FOLDS, len(views)) == k for k in range(min(FOLDS, len(views)))]
+    rungs, fits, spreads = [], {}, {}
+    start = None
+    for number, name in enumerate(RUNGS, 1):
+        fit = fit_rung(views, name, start)
+        if fit is not None and usable(fit):
+            start, errors, spreads[name] = fit, *_held_out(views, folds, fit)
+            fits[name] = fit
+            error = float(errors.std(ddof=1) / np.sqrt(len(errors))) if np.isfinite(errors).all() else np.inf
+            rungs.append(Rung(name, float(errors.mean()), error))
+        else:
+            rungs.append(Rung(name, np.inf, np.inf))
+        progress(number, len(RUNGS))
+    name = chosen(rungs)
+    if name is None:
+        raise Refused(
+            "photographs of a board that a lens model fits",
+            "none that does",
+            "photograph the board, glued to something flat, from more directions",
+        )
+    fit = fits[name]
+    sd = np.maximum(fit.sd, spreads[name])
+    return Climbed(tuple(rungs), Fit(name, fit.numbers, sd, fit.poses, fit.residuals_px))
+
+
+def chosen(rungs: Sequence[Rung]) -> str | None:
+    """The lowest rung within one standard error of the best; None where no rung has a figure."""
+    best = min(rungs, key=lambda rung: rung.held_out_px)
+    if not np.isfinite(best.held_out_px):
+        return None
+    return next(r.name for r in rungs if r.held_out_px <= best.held_out_px + best.standard_error_px)
+
+
+def fit_rung(views: Sequence[View], name: str, start: Fit | None = None) -> Fit | None:
+    """One rung on all of these views, from a lower rung's numbers where given; None where OpenCV finds no fit."""
+    flags, matrix, bends = RUNGS[name], np.eye(3), np.zeros(5)
+    if start is not None:
+        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+        matrix, bends = matrix_and_bends(start.numbers)
+    boards = [_flat(view) for view in views]
+    pictures = [view.px.astype(np.float32) for view in views]
+    try:
+        _, matrix, bends, turns, moves, sd, _, _ = cv2.calibrateCameraExtended(
+            boards, pictures, views[0].size_px, matrix, bends, flags=flags, criteria=_STOP
+        )
+    except cv2.error:
+        return None
+    bends, sd = np.asarray(bends).reshape(-1)[:5], np.asarray(sd).reshape(-1)[:9]
+    numbers = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *bends])
+    if not (np.isfinite(numbers).all() and np.isfinite(sd).all() and (numbers[:2] > 0).all()):
+        return None
+    poses = tuple(
+        (np.asarray(r, float).reshape(3), np.asarray(t, float).reshape(3)) for r, t in zip(turns, moves, strict=True)
+    )
+    residuals = tuple(_residual(view, numbers, pose) for view, pose in zip(views, poses, strict=True))
+    return Fit(name, numbers, np.where(np.arange(9) < _FREE[name], sd, 0.0), poses, residuals)
+
+
+def matrix_and_bends(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's 3×3 matrix and k1 k2 p1 p2 k3."""
+    fx, fy, cx, cy = numbers[:4]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:].copy()
+
+
+def _held_out(views, folds, whole: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """RMS px of every view under the fit without its fold, and the numbers' standard deviations from those fits.
+
+    Those are the delete-a-group jackknife's.
+    """
+    errors, numbers = np.full(len(views), np.inf), []
+    for fold in folds:
+        fit = fit_rung([v for v, out in zip(views, fold, strict=True) if not out], whole.rung, whole)
+        if fit is None:
+            return errors, np.zeros(9)
+        numbers.append(fit.numbers)
+        for i in np.flatnonzero(fold):
+            pose = _pose(views[i], fit.numbers, whole.poses[i])
+            errors[i] = np.sqrt((_residual(views[i], fit.numbers, pose) ** 2).sum(1).mean())
+    count = len(folds)
+    return errors, np.sqrt((count - 1) / count * ((np.array(numbers) - np.mean(numbers, 0)) ** 2).sum(0))
+
+
+def _pose(view: View, numbers: np.ndarray, near) -> tuple[np.ndarray, np.ndarray]:
+    """The board's pose of least reprojection error near another one: a plane has a mirrored twin far from it."""
+    turn, move = (vector.reshape(3, 1).copy() for vector in near)
+    turn, move = cv2.solvePnPRefineLM(_flat(view), view.px, *matrix_and_bends(numbers), turn, move)
+    return turn.reshape(3), move.reshape(3)
+
+
+def _residual(view: View, numbers: np.ndarray, pose) -> np.ndarray:
+    seen, _ = cv2.projectPoints(_flat(view).astype(float), *pose, *matrix_and_bends(numbers))
+    return view.px - seen.reshape(-1, 2)
+
+
+def _flat(view: View) -> np.ndarray:
+    return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))]).astype(np.float32)

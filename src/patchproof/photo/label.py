@@ -1,0 +1,68 @@
+"""What a page says of itself: the QR code beside the piece, read in a photograph or scan.
+
+In: pixels. Out: a `Label` (sheet id, and the design's SHA-256 in short, or the kind of a sheet without a design), or
+None where no code of ours can be read. Marker ids tell sheets apart, too, but two designs of one scene and seed share
+them, and only the code says which of the two was printed. It lies outside of the cut: a piece on an object has none.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.rectify import rectify
+from patchproof.sheet.manifest import Manifest
+
+_LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
+_PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template
+
+
+@dataclass(frozen=True)
+class Label:
+    """`printed` is 16 digits of the design's SHA-256, or the kind of a sheet without one."""
+
+    sheet_id: str
+    printed: str
+
+
+def label_of(manifest: Manifest) -> Label:
+    """What the code on this manifest's page says."""
+    return Label(manifest.sheet_id, manifest.design.sha256[:16] if manifest.design else manifest.kind)
+
+
+def parsed(text: str) -> Label | None:
+    """The label in a code's text; None where the code is not ours."""
+    match = re.match(r"patchproof:([0-9A-Z]{10}):([0-9a-z]+)", text)
+    return Label(match[1], match[2]) if match else None
+
+
+def read_label(srgb: np.ndarray) -> Label | None:
+    """The code that a picture shows."""
+    shrink = _LARGEST_PX / max(srgb.shape[:2])
+    if shrink < 1:
+        srgb = cv2.resize(srgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    try:
+        text, _, _ = cv2.QRCodeDetector().detectAndDecode(cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY))
+    except cv2.error:  # some quadrangles that are no code make its decoder stumble
+        return None
+    return parsed(text)
+
+
+def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], label: Label) -> None:
+    """`CannotJudge("wrong_sheet")` where the page under this homography carries another code than `label`."""
+    scale = min(_PAGE_PX_PER_MM, _LARGEST_PX / max(page_mm))
+    said = read_label(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
+    if said is None or said == label:
+        return
+    if said.sheet_id != label.sheet_id:
+        advice = f"its code says sheet {said.sheet_id}, the JSON is of {label.sheet_id}: name that sheet's JSON"
+    else:
+        advice = (
+            f"it is sheet {said.sheet_id} with another design: its code says {said.printed}, the JSON {label.printed}; "
+            "name the JSON that was written with this PDF"
+        )
+    raise CannotJudge("wrong_sheet", None, None, advice)

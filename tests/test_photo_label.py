@@ -1,0 +1,110 @@
+"""The code on the page: it names sheet and design, and a page that is another's is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from patchproof.channel.printer import identity_printer
+from patchproof.photo.label import Label, label_of, parsed, read_label
+from patchproof.photo.read import Photo
+from patchproof.sheet.blank import blank_sheet
+from patchproof.sheet.piece import lay_out_piece
+from patchproof.sheet.raster import page_pixels
+from patchproof.sheet.template import load_template
+from patchproof.sheet.write import write_sheet
+from patchproof.verify.measure import measure
+from patchproof.verify.ranges import promised_ranges
+from patchproof.verify.surface import promised_of, surface_of
+
+
+def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):
+    return write_sheet(
+        path,
+        template=load_template("a4"),
+        piece=lay_out_piece((90, 90), 16.0, identity, kind),
+        sheet_id=identity,
+        kind=kind,
+        design_srgb8=np.random.default_rng(seed).integers(0, 256, (16, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1),
+        promise=None,
+        settings={},
+    )
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """Manifests and pages at 150 dpi: a sheet, the same sheet with another design, and another sheet."""
+    folder = tmp_path_factory.mktemp("labels")
+    made = {}
+    for name, seed, identity in (("ours", 0, "A1B2C3D4E5"), ("design", 1, "A1B2C3D4E5"), ("sheet", 0, "Z9Y8X7W6V5")):
+        manifest = sheet(folder / f"{name}.pdf", seed, identity)
+        made[name] = manifest, page_pixels(folder / f"{name}.pdf", 1, 150)
+    return made
+
+
+def verified(manifest, srgb, scan_dpi=None):
+    surface = surface_of(manifest)
+    promised = promised_of(manifest, surface, identity_printer())
+    return measure(Photo(srgb, None, Path("a")), "a", surface, promised, promised_ranges(()), scan_dpi)
+
+
+def oblique(page):
+    """The page on a gray table, seen from aside: 4 px per mm on its near side, 3 on its far one."""
+    height, width = page.shape[:2]
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    seen = np.array([[160, 60], [800, 90], [930, 1190], [70, 1170]], np.float32)
+    size = (1000, 1250)
+    picture = cv2.warpPerspective(
+        page, cv2.getPerspectiveTransform(corners, seen), size, flags=cv2.INTER_AREA, borderValue=(120, 120, 120)
+    )
+    return cv2.GaussianBlur((picture * 0.8).astype(np.uint8), (0, 0), 0.6)
+
+
+def test_every_page_carries_what_its_manifest_says(pages, tmp_path):
+    for manifest, page in pages.values():
+        assert read_label(page) == label_of(manifest)
+    blank = blank_sheet("blank_a4", tmp_path / "blank.pdf")
+    assert read_label(page_pixels(tmp_path / "blank.pdf", 1, 150)) == label_of(blank) == Label(blank.sheet_id, "blank")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "patchproof:", "https://example.org", "patchproof:short:00", "x patchproof:A1B2C3D4E5:0"]
+)
+def test_other_codes_are_none_of_ours(text):
+    assert parsed(text) is None
+
+
+@pytest.mark.parametrize(("look", "scan_dpi"), [(lambda page: (page * 0.8).astype(np.uint8), 150), (oblique, None)])
+def test_a_page_of_another_design_is_the_wrong_sheet_though_its_markers_are_ours(pages, look, scan_dpi):
+    ours, page = pages["ours"]
+    good = verified(ours, look(page), scan_dpi)
+    assert good.entry.status == "measured" and good.entry.code is None
+    other, other_page = pages["design"]
+    assert {m.id for m in other.markers} == {m.id for m in ours.markers}
+    bad = verified(ours, look(other_page), scan_dpi)
+    assert (bad.entry.status, bad.entry.code, bad.counted) == ("rejected", "wrong_sheet", False)
+    assert other.design.sha256[:16] in bad.entry.advice and ours.design.sha256[:16] in bad.entry.advice
+    # and without its code the design is not told apart: then its colors show it
+    hidden = other_page.copy()
+    hidden[: int(55 / 25.4 * 150), int(175 / 25.4 * 150) :] = 255
+    assert verified(ours, look(hidden), scan_dpi).entry.status == "measured"
+
+
+def test_another_sheet_is_named(pages):
+    entry = verified(pages["ours"][0], pages["sheet"][1][: int(65 / 25.4 * 150)]).entry
+    assert (entry.status, entry.code) == ("rejected", "wrong_sheet")
+    assert "Z9Y8X7W6V5" in entry.advice
+
+
+def test_the_code_alone_tells_of_another_sheet_when_no_marker_can_be_read(pages):
+    manifest, page = pages["sheet"]
+    covered = page.copy()
+    for marker in manifest.markers:
+        low, high = (np.array(marker.corners_mm)[[0, 2]] * 150 / 25.4).astype(int)
+        covered[low[1] : high[1], low[0] : high[0]] = 128
+    covered = covered[: int(65 / 25.4 * 150)]
+    assert verified(pages["ours"][0], covered).entry.code == "wrong_sheet"
+    assert verified(manifest, covered).entry.code == "too_few_markers"
