@@ -23,10 +23,12 @@ def page_of(template, design_mm, needed_mm=20.0, kind="design"):
 @pytest.mark.parametrize("kind", ["design", "shuffled"])
 def test_a4_holds_small_large_and_oblong_designs(design_mm, kind):
     page = page_of(load_template("a4"), design_mm, kind=kind)
-    assert page.design_mm[2:] == design_mm
+    assert page.designs_mm[0][2:] == design_mm
     # the design is in the middle of the piece
-    assert page.design_mm[0] - page.cut_mm[0] == pytest.approx((page.cut_mm[2] - design_mm[0]) / 2, abs=2e-6)
-    assert len({m.id for m in page.markers}) == len(page.markers) == len(page.piece.markers) + 4
+    assert page.designs_mm[0][0] - page.cuts_mm[0][0] == pytest.approx(
+        (page.cuts_mm[0][2] - design_mm[0]) / 2, abs=2e-6
+    )
+    assert len({m.id for m in page.markers}) == len(page.markers) == (8 if min(design_mm) > 20 else 4) + 4
 
 
 def test_a4_holds_110_mm_with_20_mm_markers():

@@ -155,9 +155,13 @@ def evaluate(
 @app.command()
 def sheet(
     out: Annotated[Path, typer.Option(help="The PDF; its manifest is written beside it.")],
-    run: Annotated[Path | None, typer.Argument(help="A finished run; none for a blank page.")] = None,
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
+    ] = None,
     template: Annotated[str | None, typer.Option(help="A template's name or file.")] = None,
     control: Annotated[Control | None, typer.Option(help="The sheet of a control in place of the design's.")] = None,
+    copies: Annotated[int, typer.Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
     check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -165,19 +169,26 @@ def sheet(
     from patchproof.optimize.run import load_run
     from patchproof.output import check_file
     from patchproof.sheet.shop import shop_lines
-    from patchproof.sheet.write import check_sheet
-    from patchproof.study.sheet import blank_page, sheet_of
+    from patchproof.sheet.write import check_sheet, manifest_paths
+    from patchproof.study.sheet import blank_page, sheet_of, sheet_of_several
 
-    for path in (out, out.with_suffix(".json")):
+    runs = runs or []
+    if copies > 1 and len(runs) != 1:
+        raise typer.BadParameter("copies are of one run's sheet", param_hint="--copies")
+    paths = manifest_paths(out, len(runs))
+    for path in (out, *paths):
         check_file(path, overwrite)
     kind = control.value if control else None
-    if run is None:
-        manifest = blank_page(out, template=template, control=kind)
+    if not runs:
+        manifests = [blank_page(out, template=template, control=kind)]
+    elif len(runs) == 1:
+        manifests = [sheet_of(load_run(runs[0]), out, template=template, control=kind, copies=copies)]
     else:
-        manifest = sheet_of(load_run(run), out, template=template, control=kind)
-    _say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {out.with_suffix('.json').name}")
+        manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=kind)
+    for manifest, path in zip(manifests, paths, strict=True):
+        _say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
-        _say(*check_sheet(manifest), *shop_lines(out))
+        _say(*(line for manifest in manifests for line in check_sheet(manifest)), *shop_lines(out))
 
 
 @app.command()

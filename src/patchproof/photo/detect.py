@@ -12,7 +12,7 @@ do.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 
 import cv2
@@ -43,15 +43,21 @@ class Found:
 
 
 def find_markers(
-    srgb: np.ndarray, expected: Set[int], also: Set[int] = frozenset(), dictionary: str = DICTIONARY
+    srgb: np.ndarray,
+    expected: Set[int],
+    also: Set[int] = frozenset(),
+    dictionary: str = DICTIONARY,
+    or_all_of: Sequence[Set[int]] = (),
 ) -> Found:
-    """All markers of `expected` and `also` in the picture; the search ends when every one of `expected` is found."""
+    """All markers of `expected` and `also` in the picture; the search ends when every one of `expected` is found, or
+    every one of a set in `or_all_of`.
+    """
     printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     seen: dict[int, list[np.ndarray]] = {}
     for level in _levels(srgb):
         for marker_id, corners in _detect(level, printed, srgb.shape):
             _add(seen, marker_id, corners)
-        if expected <= seen.keys():
+        if any(wanted <= seen.keys() for wanted in (expected, *or_all_of)):
             break
     ours = sorted(seen.keys() & (set(expected) | set(also)))
     rough = np.array([seen[marker_id][0] for marker_id in ours]).reshape(-1, 4, 2)

@@ -26,6 +26,7 @@ from patchproof.settings import Refused, SceneSettings, expand
 from patchproof.sheet.page import largest_piece_mm
 from patchproof.sheet.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheet.template import load_template
+from patchproof.sheet.tiles import plan_tiles
 
 _VIEWS_TRIED = 1024
 
@@ -125,10 +126,13 @@ def _hang(
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
-    page_mm = largest_piece_mm(load_template(settings.sheet.template))
+    template = load_template(settings.sheet.template)
+    page_mm = largest_piece_mm(template)
     largest_mm = page_mm if patch.bend else tuple(min(a, b) for a, b in zip(frame.extent_mm, page_mm, strict=True))
     marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
     piece = lay_out_piece(design_mm, marker_mm, identity, "design")
+    if template.tiles is not None:
+        plan_tiles(template, piece)  # refuses what no sheet could be made of, before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
     placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
     return piece, placement, unreadable, _unreadable_warning(unreadable, marker_mm)

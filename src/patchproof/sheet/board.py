@@ -148,9 +148,8 @@ def _lay_out(page: BoardTemplate, identity: str) -> parts.PageLayout:
     lines = [parts._filled(line, words) for line in page.text]
     layout = parts.PageLayout(
         page_mm=page.page_mm,
-        piece=None,
-        cut_mm=None,
-        design_mm=None,
+        cuts_mm=(),
+        designs_mm=(),
         markers=tuple(marker_at(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),
         swatches=(),
         qr_mm=qr,
@@ -162,7 +161,7 @@ def _lay_out(page: BoardTemplate, identity: str) -> parts.PageLayout:
             parts.Box("board", _rect(grid)),
             parts.Box("QR code", parts._qr_box(page, qr)),
             *(parts._ruler_box(f"{'y' if down else 'x'} ruler", ruler, start, down) for start, down in starts),
-            *(parts._text_box(line, _rect(grid)) for line in lines),
+            *(parts.text_box(line, _rect(grid)) for line in lines),
         ),
         squares_mm=_black(grid),
     )

@@ -20,8 +20,9 @@ from patchproof.sheet.template import ChartGrid
 CORNERS: tuple[Srgb, ...] = tuple((float(r), float(g), float(b)) for r, g, b in product((0, 1), repeat=3))
 GRAYS: tuple[Srgb, ...] = tuple((v / 255,) * 3 for v in (36, 73, 109, 146, 182, 219))
 DUPLICATES: tuple[Srgb, ...] = ((0.0,) * 3, (1.0,) * 3, GRAYS[1], GRAYS[4], (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-# the one of 200 that on 12 × 6 keeps duplicates 7 cells apart and all correlations of a channel with x or y below 0.1
-SHUFFLE = "chart 184"
+# (columns, rows): the one of 200 orders that keeps duplicates far apart (4 to 7 cells) and correlations of a channel
+# with x or y low (below 0.1 on 12 × 6, at most 0.15). Other grids take the first.
+ORDERS = {(12, 6): 184, (8, 12): 19, (16, 6): 81, (12, 4): 80, (6, 8): 172}
 
 
 def chart_colors(count: int) -> list[Srgb]:
@@ -35,10 +36,15 @@ def chart_colors(count: int) -> list[Srgb]:
     return (fixed + filling)[:count]
 
 
+def chart_order(columns: int, rows: int) -> list[int]:
+    """Which of `chart_colors` lies in each cell, row by row."""
+    return hash_order(f"chart {ORDERS.get((columns, rows), 184)}", columns * rows)
+
+
 def chart_swatches(grid: ChartGrid) -> tuple[SwatchRect, ...]:
     """The chart's swatches row by row, in page millimetres."""
     colors = chart_colors(grid.columns * grid.rows)
-    order = hash_order(SHUFFLE, len(colors))
+    order = chart_order(grid.columns, grid.rows)
     pitch = grid.swatch_mm + grid.gap_mm
     (x, y), side = grid.corner_mm, grid.swatch_mm
     cells = product(range(grid.rows), range(grid.columns))

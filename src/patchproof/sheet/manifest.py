@@ -71,10 +71,13 @@ class Swatch(Strict):
 
 
 class Tile(Strict):
-    """One page of a piece larger than the page."""
+    """One page of a piece larger than the page. The piece's markers on it are those within `cut_mm`; the others lie in
+    its trimmed margin and on its flaps, and serve to check the page alone.
+    """
 
     page: Page
     page_from_design_mm: tuple[tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite]]
+    cut_mm: Rect  # on the page: what shows of it when the piece is assembled
 
 
 class Target(Strict):

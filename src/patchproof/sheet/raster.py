@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.settings import Refused, validated
-from patchproof.sheet.manifest import Manifest
-from patchproof.sheet.pdf import ATTACHMENT, POINTS_PER_MM
+from patchproof.sheet.manifest import Manifest, Tile
+from patchproof.sheet.pdf import ATTACHMENT, POINTS_PER_MM, numbered
 
 LARGEST_PX = 20_000  # along a side; more would be gigabytes
 
@@ -35,26 +35,54 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
 
     The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
     """
-    pdf, page = _open_page(pdf_path, 1)
+    size_px = tuple(max(round(side / 25.4 * dpi), 1) for side in manifest.cut_mm[2:])
+    if not manifest.tiles:
+        page = manifest.design.page if manifest.design else 1
+        return _part_pixels(pdf_path, page, manifest.cut_mm, size_px)
+    pixels = np.full((size_px[1], size_px[0], 3), 255, np.uint8)
+    px_per_mm = np.array(size_px) / manifest.cut_mm[2:]
+    for tile in manifest.tiles:
+        start_mm = _piece_from_page(manifest, tile, tile.cut_mm[:2])
+        # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
+        first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
+        last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=size_px)
+        corner = np.array(tile.cut_mm[:2]) + first / px_per_mm - start_mm
+        size = last - first
+        rect = (*corner, *(size / px_per_mm))
+        pixels[first[1] : last[1], first[0] : last[0]] = _part_pixels(pdf_path, tile.page, rect, tuple(size.tolist()))
+    return pixels
+
+
+def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
+    pdf, page = _open_page(pdf_path, number)
     with pdf:
-        rect = tuple(v * POINTS_PER_MM for v in manifest.cut_mm)
-        size_px = tuple(max(round(side / 72 * dpi), 1) for side in rect[2:])
-        return _render(page, rect, size_px)
+        return _render(page, tuple(float(v) * POINTS_PER_MM for v in rect_mm), size_px)
 
 
-def attached_manifest(pdf_path: str | Path) -> Manifest:
-    """The manifest inside a sheet's PDF; refused where there is none."""
+def _piece_from_page(manifest: Manifest, tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
+    """A point of a tile's page in piece millimetres."""
+    (_, _, dx), (_, _, dy) = tile.page_from_design_mm
+    frame = np.array(manifest.design.rect_mm[:2]) - manifest.cut_mm[:2] if manifest.design else np.zeros(2)
+    return np.array(point_mm) - (dx, dy) + frame
+
+
+def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
+    """The manifest inside a sheet's PDF; of several designs' page that of `sheet_id`, else the first."""
     import pikepdf
 
     _existing(pdf_path)
     try:
         with pikepdf.open(pdf_path) as pdf:
-            data = json.loads(pdf.attachments[ATTACHMENT].get_file().read_bytes())
+            names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered(ATTACHMENT, i) for i in range(99))})
+            texts = [json.loads(pdf.attachments[name].get_file().read_bytes()) for name in names]
     except pikepdf.PdfError as error:
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
     except (KeyError, ValueError, RecursionError) as error:
         raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again") from error
-    return validated(Manifest, data, f"{ATTACHMENT} of {pdf_path}")
+    if not texts:
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again")
+    manifests = [validated(Manifest, data, f"{name} of {pdf_path}") for name, data in zip(names, texts, strict=True)]
+    return next((one for one in manifests if one.sheet_id == sheet_id), manifests[0])
 
 
 def _existing(pdf_path: str | Path) -> None:

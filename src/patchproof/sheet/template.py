@@ -73,6 +73,14 @@ class BlankPiece(Strict):
     marker_mm: Annotated[Positive, Field(ge=8)]  # of the frame; smaller ones are lost in photographs
 
 
+class TilePages(Strict):
+    """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
+
+    zone_mm: Rect  # a tile's part of the piece at its largest; what is printed of it starts at the corner
+    overlap_mm: Annotated[Positive, Field(ge=8)]  # the flap that the next tile is glued on; it holds a marker
+    marker_mm: Annotated[Positive, Field(ge=5)]  # for scans and photographs of single pages
+
+
 class TextLine(Strict):
     """One line of text; {sheet_id}, {kind}, {design} and {piece} are filled in; gray 0 is black."""
 
@@ -88,13 +96,15 @@ class Template(Strict):
 
     page_mm: tuple[Positive, Positive]
     margin_mm: NotNegative
-    piece: PieceZone
+    piece: PieceZone | None = None  # none on a page that is a chart alone
     chart: ChartGrid
     ruler: Rulers
-    card: CardOutline
+    card: CardOutline | None = None
     qr: QrCode
     marker: PageMarkers
     blank: BlankPiece | None = None
+    tiles: TilePages | None = None
+    plan_page: bool = False  # a last page that says where the piece goes and how to photograph it
     text: tuple[TextLine, ...] = ()
 
 

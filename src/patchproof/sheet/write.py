@@ -10,6 +10,7 @@ Left out on purpose: asking before overwriting, which is the command line's busi
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,12 @@ from patchproof.sheet.manifest import (
     png_base64,
 )
 from patchproof.sheet.page import PageLayout, lay_out_page
-from patchproof.sheet.pdf import page_pdf
-from patchproof.sheet.piece import DICTIONARY, Piece
-from patchproof.sheet.swatches import FRAME_COLORS
+from patchproof.sheet.pdf import ATTACHMENT, Printed, numbered, pages_pdf
+from patchproof.sheet.piece import DICTIONARY, Piece, PieceMarker
+from patchproof.sheet.plan_page import PlanPage, lay_out_plan
+from patchproof.sheet.swatches import FRAME_COLORS, RectMm
 from patchproof.sheet.template import Template
+from patchproof.sheet.tile_pages import FIRST_TILE_PAGE, tile_pages
 
 
 def write_sheet(
@@ -43,19 +46,60 @@ def write_sheet(
     design_srgb8: np.ndarray | None,
     promise: Promise | None,
     settings: dict[str, Any],
+    plan: PlanPage | None = None,
+    copies: int = 1,
 ) -> Manifest:
-    """Write SHEET.pdf and SHEET.json beside it; `design_srgb8` is uint8 H×W×3, or None for white paper."""
-    pdf_path = Path(pdf_path)
-    if pdf_path.suffix.lower() != ".pdf":
-        raise Refused("a file name that ends in .pdf", f'"{pdf_path}"', "name the sheet SHEET.pdf")
+    """Write SHEET.pdf and SHEET.json beside it; `design_srgb8` is uint8 H×W×3, or None for white paper.
+
+    A template with tiles makes a page for each. `plan` becomes the last page; `copies` repeats the page with the piece.
+    """
+    pdf_path = pdf_name(pdf_path)
     if design_srgb8 is not None:
-        _check_pixels(design_srgb8)
-    page = lay_out_page(template, piece, sheet_id, kind, qr_text(sheet_id, kind, design_srgb8))
-    manifest = _manifest(page, template, sheet_id, kind, design_srgb8, promise, settings)
-    text = dump_manifest(manifest)
-    pdf = page_pdf(page, design_srgb8, f"patchproof sheet {sheet_id} {kind}", text)
-    replace_both({pdf_path: pdf, pdf_path.with_suffix(".json"): text.encode()})
+        check_pixels(design_srgb8)
+    code = qr_text(sheet_id, kind, design_srgb8)
+    if template.tiles is None:
+        page = lay_out_page(template, piece, sheet_id, kind, code)
+        manifest = _manifest(page, template, sheet_id, kind, design_srgb8, promise, settings)
+        pages = [Printed(page, pictures_of(page, design_srgb8))] * copies
+    else:
+        if copies > 1:
+            raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
+        tiled = tile_pages(template, piece, sheet_id, kind, code, design_srgb8)
+        pages = list(tiled.pages)
+        manifest = _manifest(pages[0].layout, template, sheet_id, kind, None, promise, settings)
+        update = {"markers": tiled.markers, "chart": tiled.chart, "cut_mm": tiled.cut_mm, "tiles": tiled.tiles}
+        if design_srgb8 is not None:
+            update["design"] = printed_design(design_srgb8, tiled.design_mm, page=FIRST_TILE_PAGE)
+        manifest = manifest.model_copy(update=update)
+    if plan is not None:
+        pages.append(lay_out_plan(plan, template, sheet_id))
+    save_sheets(pdf_path, pages, {pdf_path.with_suffix(".json"): manifest})
     return manifest
+
+
+def pdf_name(path: str | Path) -> Path:
+    """The path; refused where it does not end in .pdf."""
+    path = Path(path)
+    if path.suffix.lower() != ".pdf":
+        raise Refused("a file name that ends in .pdf", f'"{path}"', "name the sheet SHEET.pdf")
+    return path
+
+
+def manifest_paths(pdf_path: Path, designs: int) -> list[Path]:
+    """Where the manifests lie: SHEET.json, or SHEET_1.json and so on beside a page of several designs."""
+    if designs < 2:
+        return [pdf_path.with_suffix(".json")]
+    return [pdf_path.with_name(numbered(f"{pdf_path.stem}.json", i)) for i in range(designs)]
+
+
+def save_sheets(pdf_path: Path, pages: Sequence[Printed], manifests: dict[Path, Manifest]) -> None:
+    """Write the PDF and its manifests, which it carries too: one as sheet.json, several as sheet_1.json..."""
+    texts = {path: dump_manifest(manifest) for path, manifest in manifests.items()}
+    first = next(iter(manifests.values()))
+    names = [ATTACHMENT] if len(texts) == 1 else [numbered(ATTACHMENT, i) for i in range(len(texts))]
+    title = f"patchproof sheet {' '.join(m.sheet_id for m in manifests.values())} {first.kind}"
+    pdf = pages_pdf(pages, title, dict(zip(names, texts.values(), strict=True)))
+    replace_both({pdf_path: pdf} | {path: text.encode() for path, text in texts.items()})
 
 
 def qr_text(sheet_id: str, kind: str, design_srgb8: np.ndarray | None) -> str:
@@ -85,6 +129,27 @@ def check_sheet(manifest: Manifest) -> list[str]:
     return lines
 
 
+def printed_design(design: np.ndarray, rect_mm: RectMm, page: int = 1) -> Design:
+    """The design as the manifest carries it."""
+    return Design(
+        sha256=design_sha256(design),
+        rect_mm=rect_mm,
+        size_px=(design.shape[1], design.shape[0]),
+        page=page,
+        png=png_base64(design),
+    )
+
+
+def printed_marker(marker: PieceMarker, page: int = 1) -> Marker:
+    """A marker as the manifest carries it."""
+    return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
+
+
+def pictures_of(page: PageLayout, design: np.ndarray | None) -> tuple[tuple[RectMm, np.ndarray], ...]:
+    """The design in its place; nothing on pages without."""
+    return () if design is None else ((page.designs_mm[0], design),)
+
+
 def _manifest(
     page: PageLayout,
     template: Template,
@@ -94,30 +159,22 @@ def _manifest(
     promise: Promise | None,
     settings: dict[str, Any],
 ) -> Manifest:
-    printed = None
-    if design is not None:
-        printed = Design(
-            sha256=design_sha256(design),
-            rect_mm=page.design_mm,
-            size_px=(design.shape[1], design.shape[0]),
-            page=1,
-            png=png_base64(design),
-        )
     return Manifest(
         sheet_id=sheet_id,
         kind=kind,
         page_mm=page.page_mm,
-        design=printed,
-        markers=tuple(Marker(dictionary=DICTIONARY, id=m.id, corners_mm=m.corners_mm, page=1) for m in page.markers),
+        design=None if design is None else printed_design(design, page.designs_mm[0]),
+        markers=tuple(printed_marker(m) for m in page.markers),
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
-        cut_mm=page.cut_mm,
+        cut_mm=page.cuts_mm[0] if page.cuts_mm else (0.0, 0.0, *page.page_mm),
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
         promise=promise,
         settings=settings,
     )
 
 
-def _check_pixels(design: np.ndarray) -> None:
+def check_pixels(design: np.ndarray) -> None:
+    """Refuse what is no picture of uint8 H×W×3."""
     if design.dtype != np.uint8 or design.ndim != 3 or design.shape[2] != 3 or design.size == 0:
         raise Refused("a design of uint8 H×W×3 pixels", f"{design.dtype} {design.shape}", "convert it to 8-bit RGB")
 

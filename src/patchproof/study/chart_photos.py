@@ -27,7 +27,7 @@ from patchproof.channel.tone import codes_of_light
 from patchproof.color import linear_from_srgb
 from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
-from patchproof.sheet.chart import SHUFFLE, chart_colors
+from patchproof.sheet.chart import chart_colors
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.piece import hash_order
 
@@ -55,7 +55,7 @@ def chart_manifest(count: int) -> Manifest:
     columns = math.ceil(math.sqrt(count * width / height))
     side = min(width / columns, height / math.ceil(count / columns))
     cells = [(x + side * (i % columns), y + side * (i // columns)) for i in range(count)]
-    colors, order = chart_colors(count), hash_order(SHUFFLE, count)
+    colors, order = chart_colors(count), hash_order(f"photographed {count}", count)
     swatches = [
         {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
         for cell, index in zip(cells, order, strict=True)

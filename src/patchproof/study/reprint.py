@@ -34,6 +34,7 @@ from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.study.sheet import sheet_of
+from patchproof.verify.surface import surface_of
 
 # The print is rasterized this much finer than the closest view can see. Rasterizers of pages average code values: fine
 # patterns of strong colors came out 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
@@ -107,6 +108,8 @@ def scan(
     import cv2
 
     manifest, _ = sheet_scene(pdf_path, run)
+    if manifest.tiles:
+        raise Refused("a sheet on one page to scan", f"{len(manifest.tiles)} tiles", "leave --scan-dpi out")
     page = torch.tensor(page_pixels(pdf_path, 1, 2 * dpi)).permute(2, 0, 1)[None] / 255  # twice as fine as the scan
     seen = _printer(run, printer).apply(page)[0].permute(1, 2, 0).numpy()
     size_px = tuple(round(side * dpi / 25.4) for side in manifest.page_mm)
@@ -133,7 +136,7 @@ def scan(
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     """A sheet's manifest and the scene with its template's frame; refused where the sheet is not of this run."""
-    manifest = attached_manifest(pdf_path)
+    manifest = attached_manifest(pdf_path, run.scene.sheet_id)
     settings, scene = run.scene.settings, run.scene
     template = manifest.settings.get("sheet", {}).get("template", settings.sheet.template)
     if template != settings.sheet.template:
@@ -193,11 +196,11 @@ def _truth(scene: Scene, manifest: Manifest | None, conditions: Conditions, prin
     drawn["print_scale"] = list(print_scale)
     if manifest is None:
         return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
-    on_piece = [marker for marker in manifest.markers if _within(np.array(marker.corners_mm), manifest.cut_mm)]
-    homography = _homography(scene, manifest, conditions)
+    surface, homography = surface_of(manifest), _homography(scene, manifest, conditions)
     corners = {
-        str(marker.id): _seen_at(scene, manifest, conditions, np.array(marker.corners_mm)).tolist()
-        for marker in on_piece
+        str(i): _seen_at(scene, manifest, conditions, corners_mm).tolist()
+        for i, corners_mm in surface.corners_mm.items()
+        if i in surface.piece_ids
     }
     return {
         "homography_px_from_mm": None if homography is None else geometry.normalized(homography).tolist(),
@@ -232,11 +235,6 @@ def _printer(run: Run, name: str | None) -> Printer:
     if name is None:
         return load_printer(run.scene.settings.printer.profile, run.scene.base)
     return load_printer(name)
-
-
-def _within(points: np.ndarray, rect) -> bool:
-    x, y, w, h = rect
-    return bool(((points >= [x, y]) & (points <= [x + w, y + h])).all())
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ def measure(
 ) -> Measured:
     """Everything that one readable photograph says; `promised` None leaves colour unmeasured."""
     try:
-        found = identify(photo.srgb, surface)
+        found, surface = identify(photo.srgb, surface)
     except CannotJudge as cannot:
         return Measured(_coded(PhotoEntry(file=name, status="rejected"), cannot), False, {})
     entry = PhotoEntry(file=name, status="judged", markers_found=len(found.markers))
@@ -72,6 +72,8 @@ def measure(
             refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
         except CannotJudge as other:
             return Measured(_coded(entry.model_copy(update={"status": "rejected"}), other), False, {})
+    if not surface.piece_ids:  # a page that shows none of the design's frame, or a part of it
+        promised = None
     scan = scan_dpi is not None and is_scan(fit.px_from_mm, surface, scan_dpi)
     counted = not (page_check or scan)
     cannot, pictures = _trouble(entry, fit, found, surface), {}
@@ -98,11 +100,14 @@ def measure(
     return Measured(entry, counted, pictures)
 
 
-def identify(srgb: np.ndarray, surface: Surface) -> Found:
-    """The sheet's markers; `CannotJudge` where none is seen, or where it is not clear which sheet it is."""
-    found = find_markers(srgb, surface.piece_ids or surface.page_ids, frozenset(surface.corners_mm), surface.dictionary)
+def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
+    """The sheet's markers and the surface they lie on: the whole, or one page of a piece in tiles. `CannotJudge` where
+    none is seen, or where it is not clear which sheet it is.
+    """
+    pages = [frozenset(page.corners_mm) for page in surface.pages]
+    found = find_markers(srgb, surface.piece_ids or surface.page_ids, surface.all_ids, surface.dictionary, pages)
     if not found.markers:
-        if is_mirrored(srgb, frozenset(surface.corners_mm), surface.dictionary):
+        if is_mirrored(srgb, surface.all_ids, surface.dictionary):
             raise CannotJudge(
                 "mirrored",
                 None,
@@ -118,7 +123,16 @@ def identify(srgb: np.ndarray, surface: Surface) -> Found:
     if len(found.foreign) > 1 or len(found.doubled) > 1:
         others = max(len(found.foreign), len(found.doubled))
         raise CannotJudge("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
-    return complete(srgb, found, surface.corners_mm, surface.dictionary)
+    surface = _page_in_view(found, surface)
+    ours = {i: borders for i, borders in found.markers.items() if i in surface.corners_mm}
+    found = Found(ours, found.foreign, found.doubled)
+    return complete(srgb, found, surface.corners_mm, surface.dictionary), surface
+
+
+def _page_in_view(found: Found, surface: Surface) -> Surface:
+    """The page that most of the markers belong to which an assembled piece hides; the whole where there is none."""
+    hidden = [len(found.markers.keys() & page.corners_mm.keys() - surface.corners_mm.keys()) for page in surface.pages]
+    return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 
 def _fit(found: Found, surface: Surface) -> PageFit | None:

@@ -1,7 +1,8 @@
 """What a manifest says about the printed surface, as the judge needs it: where things lie, how they should look.
 
 In: a manifest and a printer model. Out: `Surface` (millimetres) and `Promised` (media-relative linear light: paper is
-1). Only the page that carries the design counts; the pages of a tiled piece are brought into that page's millimetres.
+1). Only the page that carries the design counts. A piece in tiles is one surface when assembled, in the millimetres of
+the design's page; each of its pages is another, by which scans and photographs of it are known.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 
 from patchproof.color import linear_from_srgb
+from patchproof.geometry import rect_corners
 from patchproof.photo.label import Label, label_of
 from patchproof.sheet.manifest import Manifest
 
@@ -31,6 +33,12 @@ class Surface:
     swatches_srgb: np.ndarray
     label: Label  # what the page's code says
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
+    pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
+
+    @property
+    def all_ids(self) -> frozenset[int]:
+        """Its own markers and those of its pages."""
+        return frozenset(self.corners_mm).union(*(page.corners_mm for page in self.pages))
 
     @property
     def page_ids(self) -> frozenset[int]:
@@ -49,26 +57,51 @@ class Promised:
 
 def surface_of(manifest: Manifest) -> Surface:
     """The surface of the design's page; without a design, of the first page with markers, measured over the cut."""
+    if manifest.tiles:
+        return _assembled(manifest)
     page = manifest.design.page if manifest.design else min(m.page for m in manifest.markers)
-    to_page = _page_from_pages(manifest, page)
-    markers = [m for m in manifest.markers if m.page in to_page and m.dictionary == manifest.markers[0].dictionary]
-    corners = {m.id: _carry(to_page[m.page], m.corners_mm) for m in markers}
-    x, y, w, h = manifest.cut_mm
-    inside = lambda p: bool((p >= [x, y]).all() and (p <= [x + w, y + h]).all())  # noqa: E731
-    # the frame of a tiled piece lies on several pages, around the design rather than inside of one page's cut
-    piece = frozenset(corners) if manifest.tiles else frozenset(i for i, c in corners.items() if inside(c))
-    swatches = [s for s in manifest.chart if s.page == page and inside(np.reshape(_ends(s.rect_mm), (2, 2)))]
+    corners = {m.id: np.array(m.corners_mm) for m in _known(manifest) if m.page == page}
+    piece = frozenset(i for i, c in corners.items() if _inside(manifest.cut_mm, c))
+    swatches = [s for s in manifest.chart if s.page == page and _inside(manifest.cut_mm, rect_corners(s.rect_mm))]
     rect = manifest.design.rect_mm if manifest.design else manifest.cut_mm
+    rects, colors = [s.rect_mm for s in swatches], [s.srgb for s in swatches]
+    return _surface(manifest, corners, piece, rect, rects, colors)
+
+
+def _assembled(manifest: Manifest) -> Surface:
+    """The piece glued together, in the millimetres of the design's page (the first tile's without a design)."""
+    page = manifest.design.page if manifest.design else manifest.tiles[0].page
+    to_page, cuts = _page_from_pages(manifest, page), {tile.page: tile.cut_mm for tile in manifest.tiles}
+    markers = [m for m in _known(manifest) if m.page in cuts]
+    carried = {m.id: _carry(to_page[m.page], m.corners_mm) for m in markers}
+    shown = frozenset(m.id for m in markers if _inside(cuts[m.page], np.array(m.corners_mm)))
+    swatches = [s for s in manifest.chart if s.page in cuts]
+    pages = [
+        _surface(manifest, {m.id: carried[m.id] for m in markers if m.page == number}, frozenset(), rect)
+        for number, rect in ((n, _carry_rect(to_page[n], cut)) for n, cut in cuts.items())
+    ]
+    for number in sorted({m.page for m in _known(manifest)} - set(cuts)):  # the page with the chart
+        corners = {m.id: np.array(m.corners_mm) for m in _known(manifest) if m.page == number}
+        low, high = np.concatenate(list(corners.values())).min(0), np.concatenate(list(corners.values())).max(0)
+        pages.append(_surface(manifest, corners, frozenset(), tuple(float(v) for v in (*low, *(high - low)))))
+    piece = {i: c for i, c in carried.items() if i in shown}
+    rect = manifest.design.rect_mm if manifest.design else manifest.cut_mm
+    rects, colors = [_carry_rect(to_page[s.page], s.rect_mm) for s in swatches], [s.srgb for s in swatches]
+    return _surface(manifest, piece, shown, rect, rects, colors, tuple(pages))
+
+
+def _surface(manifest, corners, piece, rect, swatch_rects=(), colors=(), pages=()) -> Surface:
     return Surface(
         manifest.markers[0].dictionary,
         corners,
         piece,
         rect,
         (rect[0] + rect[2] / 2, rect[1] + rect[3] / 2),
-        tuple(s.rect_mm for s in swatches),
-        np.array([s.srgb for s in swatches]).reshape(-1, 3),
+        tuple(swatch_rects),
+        np.array(colors).reshape(-1, 3),
         label_of(manifest),
         None if manifest.tiles else manifest.page_mm,
+        pages,
     )
 
 
@@ -93,9 +126,18 @@ def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
     return Promised(design, swatches[:-1], swatches[-1])
 
 
-def _ends(rect):
+def _known(manifest: Manifest) -> list:
+    return [m for m in manifest.markers if m.dictionary == manifest.markers[0].dictionary]
+
+
+def _inside(rect, points: np.ndarray) -> bool:
     x, y, w, h = rect
-    return [x, y, x + w, y + h]
+    return bool((points >= [x, y]).all() and (points <= [x + w, y + h]).all())
+
+
+def _carry_rect(matrix, rect) -> tuple[float, float, float, float]:
+    (x0, y0), _, (x1, y1), _ = _carry(matrix, rect_corners(rect)).tolist()
+    return x0, y0, x1 - x0, y1 - y0
 
 
 def _carry(matrix, points) -> np.ndarray:
@@ -103,8 +145,6 @@ def _carry(matrix, points) -> np.ndarray:
 
 
 def _page_from_pages(manifest: Manifest, page: int) -> dict[int, np.ndarray]:
-    """2×3 maps from each page's millimetres to those of `page`."""
+    """2×3 maps from each tile's millimetres to those of `page`."""
     square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
-    if page not in square:
-        return {page: np.eye(3)[:2]}
     return {number: (square[page] @ np.linalg.inv(matrix))[:2] for number, matrix in square.items()}

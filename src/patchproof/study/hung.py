@@ -1,0 +1,104 @@
+"""Where the piece goes on the object: a picture of the object's side, and millimetres to its edges.
+
+In: a scene with a mesh and its piece. Out: a `Hung` for the sheet's last page. The picture is rendered by the project's
+own rasterizer from so far away that it is a plan: at 60 times the object's length perspective moves nothing by more
+than 1 % of the object's depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from patchproof.color import srgb_from_linear
+from patchproof.geometry import rect_corners
+from patchproof.render.stage import set_stage
+from patchproof.render.views import see
+from patchproof.scene.backgrounds import load_backgrounds
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.settings import BackgroundSettings
+from patchproof.sheet.plan_page import Hung
+from patchproof.sheet.template import Template
+from patchproof.sheet.tiles import plan_tiles
+
+AWAY = 60.0  # of the object's length
+PICTURE_PX = 600  # along the longer side
+ROOM = 1.06  # of the object's extent
+
+
+def hang(scene: MeshScene, template: Template) -> Hung:
+    """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
+    frame, placement = scene.frame, scene.placement
+    axes = np.stack([frame.right, -frame.up])  # millimetres right and down, from the middle of the object
+
+    def flat(points: np.ndarray) -> np.ndarray:
+        return np.asarray(points) @ axes.T
+
+    low, high = flat(scene.mesh.vertices).min(0), flat(scene.mesh.vertices).max(0)
+    border = np.concatenate([_edge(a, b) for a, b in _sides(rect_corners((0, 0, *placement.size_mm)))])
+    outline = flat(placement.world(border))
+    half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
+    seams, names = [], []
+    if template.tiles is not None:
+        for tile in plan_tiles(template, scene.piece):
+            corners = flat(placement.world(rect_corners(tile.part_mm)))
+            seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
+            names.append((tuple(corners.mean(0)), tile.name))
+    return Hung(
+        picture=_picture(scene, half),
+        picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
+        object_mm=(*low, *(high - low)),
+        outline_mm=tuple(map(tuple, outline)),
+        seams_mm=tuple(seams),
+        names_mm=tuple(names),
+    )
+
+
+def _picture(scene: MeshScene, half_mm: np.ndarray) -> np.ndarray:
+    """uint8 H×W×3: the object in even light on white, spanning ± half_mm."""
+    length = scene.settings.object.length_mm
+    distance = AWAY * length
+    px_per_mm = PICTURE_PX / (2 * half_mm.max())
+    size_px = tuple(int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
+    fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
+    settings = scene.settings
+    settings = settings.model_copy(
+        update={
+            "view": settings.view.model_copy(update={"fov_deg": fov, "look_at": "object"}),
+            "camera": settings.camera.model_copy(update={"photo_px": size_px, "file": None}),
+        }
+    )
+    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
+    plain = replace(scene, settings=settings, backgrounds=white, camera=None)
+    zero = np.zeros(1)
+    conditions = replace(
+        scene.draw("select", 1),
+        azimuth_deg=zero,
+        elevation_deg=zero,
+        roll_deg=zero,
+        distance_mm=np.full(1, distance),
+        look_at_offset=np.zeros((1, 3)),
+        ambient=np.full(1, 0.55),
+        directional=np.full(1, 0.45),
+        light_azimuth_deg=np.full(1, -30.0),
+        light_elevation_deg=np.full(1, 45.0),
+        point=zero,
+        sh2=zero,
+        gloss=zero,
+    )
+    with torch.no_grad():
+        light = see(set_stage(plain), None, conditions, size_px, supersample=2).bare
+    picture = srgb_from_linear(light.clamp(0, 1)).reshape(size_px[1], size_px[0], 3).cpu().numpy()
+    return (picture * 255 + 0.5).astype(np.uint8)
+
+
+def _sides(corners: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+
+
+def _edge(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Points from start up to end: bent paper has bent edges."""
+    return start + np.linspace(0, 1, 16, endpoint=False)[:, None] * (end - start)

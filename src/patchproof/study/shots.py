@@ -1,0 +1,157 @@
+"""The shot plan: how many photographs, from where and of which controls, so that the verdict will not be `cannot_tell`.
+
+In: a promise and the scene's ranges. Out: counts, and sentences for the sheet's last page. A verdict needs as many
+photographs as narrow the prediction interval to the rule of `verify.verdict`. An effect needs as many pairs of design
+and control that McNemar's exact test, or Newcombe's interval where photographs are not paired, finds it with 90 %
+power. Design and control are taken to be recognized independently at their promised rates, which asks for more
+photographs than pairs of one view need. Assumed: the promise holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.claims import CONFIDENCE, independent_difference
+from patchproof.settings import SceneSettings
+from patchproof.sheet.manifest import Promise
+from patchproof.verify.verdict import judge
+
+POWER = 0.90
+MOST_PHOTOS = 150  # nobody takes more
+STEADY = 12  # so many counts in a row must do: floors of intervals are whole photographs, so that some n just miss
+
+
+@dataclass(frozen=True)
+class ShotPlan:
+    """Photographs for a verdict, for an effect with and without pairs (None: more than 150), and the best control."""
+
+    verdict: int | None
+    control: str
+    paired: int | None
+    unpaired: int | None
+
+
+def plan_shots(promise: Promise) -> ShotPlan:
+    """The counts for a promise; the control that is hardest to beat decides."""
+    deceive = promise.target.goal == "deceive"
+    best = (min if deceive else max)(promise.controls, key=lambda name: promise.controls[name].rate)
+    rates = (promise.rate, promise.controls[best].rate)
+    better, worse = rates[::-1] if deceive else rates
+    return ShotPlan(
+        verdict=fewest(lambda n: _can_tell(promise, n)),
+        control=best,
+        paired=fewest(lambda n: paired_power(better, worse, n) >= POWER),
+        unpaired=fewest(lambda n: unpaired_power(better, worse, n) >= POWER),
+    )
+
+
+def _can_tell(promise: Promise, n: int) -> bool:
+    """Whether n photographs, recognized as often as promised, keep the promise."""
+    likely = round(promise.rate * n)
+    return judge(likely, n, promise.rate, promise.n, promise.target.goal, 0).verdict == "kept"
+
+
+def fewest(enough: Callable[[int], bool]) -> int | None:
+    """The smallest n from 5 to 150 from which on n photographs are enough; None where there is none."""
+    run = 0
+    for n in range(5, MOST_PHOTOS + STEADY):
+        run = run + 1 if enough(n) else 0
+        if run == STEADY:
+            return n - STEADY + 1
+    return None
+
+
+def paired_power(better: float, worse: float, n: int) -> float:
+    """Chance that McNemar's exact test on n independent pairs shows the better rate to be better."""
+    from scipy.stats import binom
+
+    only_better, only_worse = better * (1 - worse), worse * (1 - better)
+    differing = only_better + only_worse
+    if differing <= 0:
+        return 0.0
+    power = 0.0
+    for count in range(1, n + 1):
+        # the smallest number of pairs in favor that is significant, both tails
+        needed = binom.isf((1 - CONFIDENCE) / 2, count, 0.5) + 1
+        power += binom.pmf(count, n, differing) * binom.sf(needed - 1, count, only_better / differing)
+    return float(power)
+
+
+def unpaired_power(better: float, worse: float, n: int) -> float:
+    """Chance that Newcombe's interval of n photographs each lies above zero."""
+    from scipy.stats import binom
+
+    counts = np.arange(n + 1)
+    chances = binom.pmf(counts, n, better), binom.pmf(counts, n, worse)
+    power, most = 0.0, -1
+    for a in counts:
+        # the more of the better, the more of the worse may be recognized: the border only ever moves up
+        while most < n and independent_difference(int(a), n, most + 1, n)[1][0] > 0:
+            most += 1
+        power += float(chances[0][a] * chances[1][: most + 1].sum())
+    return power
+
+
+def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """What to photograph, as (heading, lines)."""
+    plan = plan_shots(promise)
+    return (("How many photographs", _how_many(promise, plan)), ("From where", _from_where(settings)))
+
+
+def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
+    control = promise.controls[plan.control]
+    lines = [
+        f"Promised: {promise.rate:.0%} recognized as {promise.target.label}; the best control ({plan.control}) "
+        f"{control.rate:.0%}."
+    ]
+    if plan.verdict is None:
+        lines.append("The promise is too weak for a verdict from any reasonable number of photographs.")
+    else:
+        lines.append(
+            f"For a verdict on the promise: at least {plan.verdict} photographs of the piece on the object. With fewer "
+            "the verdict may be cannot_tell however well they go."
+        )
+    if plan.paired is None and plan.unpaired is None:
+        lines.append(
+            f"No {MOST_PHOTOS} photographs would show that the patch beats {plan.control}: it is not promised to, or "
+            "by too little."
+        )
+        return tuple(lines)
+    wanted = plan.paired if plan.paired is not None else plan.unpaired
+    kind = "bare object (without any marker)" if plan.control == "bare" else f"{plan.control} control"
+    lines.append(
+        f"To show that the patch makes the difference (90 % power): {wanted} pairs, each view once with the piece and "
+        f"once with the {kind} in the same place and light, saved under equal file names in a folder of its own."
+    )
+    if plan.unpaired is not None:
+        lines.append(f"Without pairs: {plan.unpaired} of each.")
+    lines.append(
+        "Print the other controls (mean, grey, noise) too, if you can: the effect is shown only where the patch beats "
+        "every control that you photograph."
+    )
+    return tuple(lines)
+
+
+def _from_where(settings: SceneSettings) -> tuple[str, ...]:
+    if settings.object.mesh is None:
+        return ("As the scene's own photographs were taken: the same places, distances and light.",)
+    view, low = settings.view, settings.light.ambient
+    target = "object" if view.look_at == "object" else "piece"
+    return (
+        f"Spread over all of these, not the best ones: {_degrees(view.azimuth_deg)} to the left (-) and right (+) of "
+        f"facing the piece's side ({settings.patch.side}), {_degrees(view.elevation_deg)} above it, "
+        f"{view.distance_mm[0] / 10:.0f} to {view.distance_mm[1] / 10:.0f} cm from the middle of the {target}, the "
+        f"camera turned by {_degrees(view.roll_deg)}.",
+        f"The {target} belongs in the middle of the picture, the whole piece in view; classifiers see the picture's "
+        "centered square.",
+        "Light as it comes, without flash, shine or filters; views outside of these ranges are not counted."
+        if low[0] < 1
+        else "Bright light, without flash, shine or filters; views outside of these ranges are not counted.",
+    )
+
+
+def _degrees(bounds: tuple[float, float]) -> str:
+    return f"{bounds[0]:g}° to {bounds[1]:g}°"

@@ -1,0 +1,237 @@
+"""Pages of every template, pieces in tiles, several designs on a page: read back by PDFium, OpenCV and pikepdf."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pikepdf
+import pytest
+
+from patchproof.geometry import apply_homography, rect_corners
+from patchproof.photo.read import Photo
+from patchproof.settings import Refused
+from patchproof.sheet.chart_page import chart_sheet
+from patchproof.sheet.manifest import load_manifest
+from patchproof.sheet.page import Box, largest_piece_mm, prove_apart
+from patchproof.sheet.piece import lay_out_piece
+from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
+from patchproof.sheet.several import OneDesign, write_several
+from patchproof.sheet.template import load_template, template_names
+from patchproof.sheet.tiles import plan_tiles
+from patchproof.sheet.write import write_sheet
+from patchproof.verify.measure import measure
+from patchproof.verify.ranges import promised_ranges
+from patchproof.verify.surface import surface_of
+from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
+
+NAMES = [name for name in template_names() if not name.startswith("charuco")]
+DESIGN = cv2.resize(sample_design(12, 12), (120, 120), interpolation=cv2.INTER_CUBIC)
+
+
+def write(path, name, design_mm=None, marker_mm=None, design=DESIGN, **more):
+    template = load_template(name)
+    if template.piece is None:
+        return chart_sheet(template, path)
+    design_mm = design_mm or ((300, 300) if template.tiles else (70, 70))
+    piece = lay_out_piece(design_mm, marker_mm or (20 if template.tiles else 8), ID, "design")
+    return write_sheet(
+        path,
+        template=template,
+        piece=piece,
+        sheet_id=ID,
+        kind="design",
+        design_srgb8=design,
+        promise=None,
+        settings={},
+        **more,
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_page_has_its_markers_within_a_tenth_of_a_millimetre_and_its_fonts(tmp_path, name):
+    path = tmp_path / "s.pdf"
+    manifest = write(path, name)
+    with pikepdf.open(path) as pdf:
+        count = len(pdf.pages)
+        for page in pdf.pages:
+            fonts = page.obj.Resources.Font
+            assert all("/FontFile2" in font.FontDescriptor for font in fonts.values())
+            size = [0, 0, *(side / 25.4 * 72 for side in manifest.page_mm)]
+            for box in ("/MediaBox", "/TrimBox", "/BleedBox"):
+                assert [float(v) for v in page.obj[box]] == pytest.approx(size, abs=1e-3)
+            for image in page.obj.Resources.get("/XObject", {}).values():
+                assert image.ColorSpace[0] == "/ICCBased"
+    for number in range(1, count + 1):
+        found = detect(page_pixels(path, number, DPI))
+        expected = [marker for marker in manifest.markers if marker.page == number]
+        assert set(found) == {marker.id for marker in expected} and expected
+        for marker in expected:
+            assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
+    assert attached_manifest(path) == load_manifest(path.with_suffix(".json")) == manifest
+
+
+def test_letter_and_a4_differ_in_layout_alone():
+    def content(name):
+        data = load_template(name).model_dump()
+        for line in data["text"]:
+            del line["at_mm"]
+        for table, key in (
+            ("chart", "corner_mm"),
+            ("card", "corner_mm"),
+            ("qr", "corner_mm"),
+            ("marker", "corners_mm"),
+        ):
+            del data[table][key]
+        for key in ("x_start_mm", "y_start_mm"):
+            del data["ruler"][key]
+        return {key: value for key, value in data.items() if key not in ("page_mm", "piece")}
+
+    assert content("letter") == content("a4")
+    assert content("blank_letter") == content("blank_a4")
+    assert load_template("letter").page_mm == (215.9, 279.4)
+
+
+def test_charts_have_the_colors_that_they_promise(tmp_path):
+    for name, count in (("chart_a4", 96), ("chart_letter", 96), ("chart48_a4", 48)):
+        manifest = write(tmp_path / f"{name}.pdf", name)
+        assert len(manifest.chart) == count and manifest.kind == "chart"
+        pixels = page_pixels(tmp_path / f"{name}.pdf", 1, 50)
+        for swatch in manifest.chart:
+            x, y, w, h = (v * 50 / 25.4 for v in swatch.rect_mm)
+            assert np.array_equal(pixels[int(y + h / 2), int(x + w / 2)], np.rint(np.array(swatch.srgb) * 255))
+
+
+@pytest.fixture(scope="module")
+def tiled(tmp_path_factory):
+    path = tmp_path_factory.mktemp("tiles") / "s.pdf"
+    return path, write(path, "a4_tiles", (600, 600), 30)
+
+
+def scanned(page, seed):
+    """A page turned by up to 2° and shifted by up to 3 mm on the scanner, and its homography from page mm to px."""
+    rng = np.random.default_rng(seed)
+    turn, shift = np.radians(rng.uniform(-2, 2)), rng.uniform(-18, 18, 2)
+    c, s = np.cos(turn), np.sin(turn)
+    matrix = np.array([[c, -s, shift[0]], [s, c, shift[1]], [0, 0, 1.0]])  # of edges, about the corner
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    size = page.shape[1] + 120, page.shape[0] + 120
+    move = np.array([[1, 0, 60], [0, 1, 60], [0, 0, 1.0]])
+    whole = half @ move @ matrix @ np.linalg.inv(half)
+    scan = cv2.warpAffine(page, whole[:2], size, flags=cv2.INTER_LINEAR, borderValue=(255, 255, 255))
+    return scan, move @ matrix @ np.diag([PX_PER_MM, PX_PER_MM, 1])
+
+
+def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimetre(tiled):
+    path, manifest = tiled
+    surface, origin, errors = surface_of(manifest), np.array(manifest.design.rect_mm[:2]), []
+    assert len(manifest.tiles) >= 12 and len(surface.piece_ids) == 8
+    for tile in manifest.tiles[:: max(len(manifest.tiles) // 4, 1)]:
+        scan, truth = scanned(page_pixels(path, tile.page, DPI), tile.page)
+        measured = measure(Photo(scan, None, None), "scan", surface, None, promised_ranges(()), DPI)
+        entry = measured.entry
+        assert entry.status == "measured" and not measured.counted
+        assert entry.scale_x == pytest.approx(1, abs=0.002) and entry.scale_y == pytest.approx(1, abs=0.002)
+        corners = rect_corners(tile.cut_mm)
+        in_design_page = corners - np.array(tile.page_from_design_mm)[:, 2] + origin
+        seen = apply_homography(np.array(entry.homography_px_from_mm), in_design_page)
+        errors.append(np.linalg.norm(seen - apply_homography(truth, corners), axis=1).max() / PX_PER_MM)
+    assert max(errors) < 0.5
+
+
+def test_assembled_tiles_are_the_design_and_its_whole_frame(tiled):
+    path, manifest = tiled
+    pixels = piece_pixels(path, manifest, 50)
+    scale = pixels.shape[1] / manifest.cut_mm[2]
+    found, surface = detect(pixels), surface_of(manifest)
+    assert set(found) == surface.piece_ids
+    for i in surface.piece_ids:
+        assert np.abs(found[i] / scale + manifest.cut_mm[:2] - surface.corners_mm[i]).max() < 0.25
+    x, y, w, h = manifest.design.rect_mm
+    at = (np.arange(120) + 0.5) / 120
+    columns = ((x - manifest.cut_mm[0] + at * w) * scale).astype(int)
+    rows = ((y - manifest.cut_mm[1] + at * h) * scale).astype(int)
+    assert np.abs(pixels[np.ix_(rows, columns)].astype(int) - DESIGN).mean() < 4
+    measured = measure(Photo(pixels, None, None), "p", surface, None, promised_ranges(()))
+    assert measured.counted and measured.entry.markers_found == 8  # glued together it is no page check
+
+
+def test_a_scan_of_the_first_page_is_a_page_check(tiled):
+    path, manifest = tiled
+    page = page_pixels(path, 1, 75)
+    measured = measure(Photo(page, None, None), "p", surface_of(manifest), None, promised_ranges(()))
+    assert measured.entry.code is None and not measured.counted
+
+
+def test_seams_are_even_and_spare_the_markers():
+    template, piece = load_template("a4_tiles"), lay_out_piece((600, 600), 30, ID, "design")
+    tiles = plan_tiles(template, piece)
+    area = sum(t.part_mm[2] * t.part_mm[3] for t in tiles)
+    assert area == pytest.approx(piece.size_mm[0] * piece.size_mm[1], rel=1e-6)
+    for axis in (0, 1):
+        seams = sorted({t.part_mm[axis] for t in tiles} - {0.0})
+        assert max(b - a for a, b in pairwise([0.0, *seams, piece.size_mm[axis]])) <= template.tiles.zone_mm[2 + axis]
+        for marker in piece.markers:
+            low, high = marker.corners_mm[0][axis], marker.corners_mm[2][axis]
+            assert not any(low < seam < high for seam in seams)
+
+
+def test_copies_are_pages_of_the_same(tmp_path):
+    write(tmp_path / "s.pdf", "label_102x152", copies=3)
+    pages = [page_pixels(tmp_path / "s.pdf", n, 50) for n in (1, 2, 3)]
+    assert np.array_equal(pages[0], pages[1]) and np.array_equal(pages[0], pages[2])
+
+
+def designs(*ids, design_mm=(60, 60)):
+    return [
+        OneDesign(lay_out_piece(design_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
+        for n, i in enumerate(ids)
+    ]
+
+
+def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
+    manifests = write_several(tmp_path / "s.pdf", load_template("a3"), designs(ID, "B1B2C3D4E5", "C1B2C3D4E5"))
+    found = detect(page_pixels(tmp_path / "s.pdf", 1, DPI))
+    for number, manifest in enumerate(manifests, 1):
+        assert load_manifest(tmp_path / f"s_{number}.json") == manifest
+        assert attached_manifest(tmp_path / "s.pdf", manifest.sheet_id) == manifest
+        surface = surface_of(manifest)
+        assert len(surface.piece_ids) == 8 and len(surface.page_ids) > 4
+        for marker in manifest.markers:
+            assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
+        assert len(piece_pixels(tmp_path / "s.pdf", manifest, 50)) > 100
+    cuts = [Box(f"piece {i}", m.cut_mm) for i, m in enumerate(manifests)]
+    prove_apart(tuple(cuts), manifests[0].page_mm, 7.0)
+
+
+def test_two_times_is_the_same_bytes(tmp_path):
+    for folder in ("1", "2"):
+        write(tmp_path / folder / "t.pdf", "letter_tiles")
+        write_several(tmp_path / folder / "s.pdf", load_template("a4"), designs(ID, "B1B2C3D4E5", design_mm=(50, 50)))
+        chart_sheet(load_template("chart_a4"), tmp_path / folder / "c.pdf")
+    for name in ("t.pdf", "t.json", "s.pdf", "s_1.json", "s_2.json", "c.pdf"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_what_cannot_be_printed_is_refused_in_one_sentence(tmp_path):
+    path = tmp_path / "s.pdf"
+    with pytest.raises(Refused, match=r"a piece of at most .* such as a4_tiles"):
+        write(path, "letter", (300, 300))
+    with pytest.raises(Refused, match="at most 30 tiles, for which there are marker ids"):
+        write(path, "a4_tiles", (2000, 2000), 30)
+    with pytest.raises(Refused, match=r'"lettre".*did you mean "letter"'):
+        write(path, "lettre")
+    with pytest.raises(Refused, match="a chart alone"):
+        largest_piece_mm(load_template("chart_a4"))
+    with pytest.raises(Refused, match="twice: use --copies"):
+        write_several(path, load_template("a3"), designs(ID, ID))
+    with pytest.raises(Refused, match="put fewer designs"):
+        write_several(path, load_template("a4"), designs(*(f"{i}AAAAAAAAA" for i in range(6))))
+    with pytest.raises(Refused, match="one copy of a piece in tiles"):
+        write(path, "a4_tiles", copies=2)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(Refused, match="a folder that can be written to"):
+        chart_sheet(load_template("chart_a4"), tmp_path / "file" / "c.pdf")
+    assert json.loads(json.dumps([p.name for p in tmp_path.iterdir()])) == ["file"]
