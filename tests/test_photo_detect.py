@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
 from patchproof.geometry import apply_homography
 from patchproof.photo import detect
-from patchproof.photo.complete import complete
+from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import find_markers, is_mirrored, possible
 from test_photo_synthetic import CUT_MM, PAGE_IDS, PIECE_IDS, make_manifest, page_raster, photograph, view
 
@@ -139,13 +136,52 @@ def test_a_covered_stretch_of_a_border_does_not_move_it(manifest, piece):
     assert corner_errors(found, manifest, homography).max() < 0.25
 
 
-def test_real_photographs_of_a_printed_board_are_read():
-    if not os.environ.get("PATCHPROOF_DATA"):
-        pytest.skip("PATCHPROOF_DATA is not set: no real photographs here")
-    files = sorted((Path(os.environ["PATCHPROOF_DATA"]) / "markers" / "grid_6x6").glob("*.jpg"))
-    counts = []
-    for file in files:
+def test_a_covered_marker_does_not_send_the_search_to_finer_levels(manifest, piece, monkeypatch):
+    homography, sizes = view(10, 5, 300, size_px=(1600, 1200)), []
+    photo = photograph(piece, homography, (1600, 1200), blur_px=0.5, fine=2)
+    quad = apply_homography(homography, corners_mm(manifest)[100])
+    low, high = quad.min(0).astype(int) - 5, quad.max(0).astype(int) + 5
+    photo[low[1] : high[1], low[0] : high[0]] = 150
+    inner = detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda level, *rest: sizes.append(level.shape) or inner(level, *rest))
+    found = find_sheet(photo, IDS, corners_mm(manifest))
+    assert found.markers.keys() == IDS - {100} and sizes == [(600, 800)]
+
+
+def test_finer_levels_look_only_where_markers_are_missing(manifest, piece, monkeypatch):
+    photo = photograph(piece, view(45, 0, 1000, size_px=(1600, 1200)), (1600, 1200), blur_px=0.8, fine=2)
+    sizes, inner = [], detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda level, *rest: sizes.append(level.shape) or inner(level, *rest))
+    found = find_sheet(photo, IDS | {900}, corners_mm(manifest) | {900: corners_mm(manifest)[100] + [60.0, 60.0]})
+    assert found.markers.keys() == IDS  # 900 is nowhere: the search goes on for it, in its own corner
+    assert any(h * w < 600 * 800 / 4 for h, w in sizes)
+
+
+def test_huge_pictures_are_looked_at_in_bounded_levels(monkeypatch):
+    monkeypatch.setattr(detect, "LARGEST_LEVEL_PX", 500_000)
+    sizes, inner = [], detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda level, *rest: sizes.append(level.size) or inner(level, *rest))
+    find_markers(np.full((1200, 1600, 3), 128, np.uint8), IDS)
+    assert sizes and max(sizes) <= 500_000
+
+
+@pytest.mark.parametrize(
+    ("pattern", "dictionary", "counts"),
+    [
+        ("grid_6x6/*.jpg", "DICT_6X6_250", [20] * 10),  # OpenCV's defaults read 198 of these 200
+        ("charuco_6x6_250/*calibration*.jpg", "DICT_6X6_250", [17] * 4),
+        ("charuco_6x6_250/*chocclusion*.jpg", "DICT_6X6_250", [13]),
+        ("charuco_6x6_250/*singlemarkers*.jpg", "DICT_6X6_250", [6]),
+        ("four_corner_4x4/*.jpg", "DICT_4X4_50", [4, 4]),
+    ],
+)
+def test_real_photographs_of_printed_markers_are_read(data, pattern, dictionary, counts):
+    seen = []
+    for file in sorted((data / "markers").glob(pattern)):
         photo = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
-        counts.append(len(find_markers(photo, frozenset(range(20)), frozenset(range(250)), "DICT_6X6_250").markers))
-    # OpenCV's defaults read 198 of 200
-    assert len(counts) == 10 and sum(counts) >= 199
+        boards = {"grid": 20, "four": 4, "charuco_6x6_250/*s": 250}
+        wanted = next((n for start, n in boards.items() if pattern.startswith(start)), 17)
+        found = find_markers(photo, frozenset(range(wanted)), frozenset(), dictionary)
+        assert not found.foreign and not found.doubled
+        seen.append(len(found.markers))
+    assert seen == counts

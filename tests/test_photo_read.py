@@ -36,6 +36,13 @@ def test_every_orientation_comes_out_upright(tmp_path, orientation):
     assert (read_photo(path).srgb == UPRIGHT).all()
 
 
+def test_real_photographs_under_every_orientation_come_out_alike(data):
+    for shape in ("Landscape", "Portrait"):
+        files = sorted((data / "photos" / "exif_orientation").glob(f"{shape}_*.jpg"))
+        small = [np.asarray(Image.fromarray(read_photo(f).srgb).resize((30, 30))).astype(float) for f in files]
+        assert len(files) >= 3 and all(np.abs(one - small[0]).mean() < 6 for one in small)
+
+
 def test_the_focal_length_is_scaled_to_the_photos_own_diagonal(tmp_path):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 26

@@ -157,3 +157,27 @@ def test_the_hand_made_page_lies_where_its_homography_says(azimuth):
     homography = view(azimuth_deg=azimuth, roll_deg=10)
     center = apply_homography(homography, [[105.0, 130.0]])[0]
     assert center == pytest.approx([600.0, 450.0], abs=1e-6)
+
+
+def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=3, blur_px=0.6, seed=0):
+    """uint8 sRGB photo of the piece rolled round an upright cylinder that touches the page's plane at the design's
+    center: each ray of 3×3 per pixel is met with the cylinder, so nothing of the tool's own model is used.
+    """
+    center, radius = np.array(DESIGN_MM[:2]) + np.array(DESIGN_MM[2:]) / 2, 1 / curvature
+    width, height = size_px
+    v, u = np.mgrid[0 : height * fine, 0 : width * fine]
+    pixels = np.stack([(u + 0.5) / fine, (v + 0.5) / fine, np.ones(u.shape)], -1)
+    rotation, eye = camera_from_page[:3, :3], -camera_from_page[:3, :3].T @ camera_from_page[:3, 3]
+    ray = pixels @ (np.linalg.inv(matrix_px).T @ rotation)
+    a, b = (ray[..., [0, 2]] ** 2).sum(-1), ray[..., 0] * eye[0] + ray[..., 2] * (eye[2] - radius)
+    rest = b * b - a * (eye[0] ** 2 + (eye[2] - radius) ** 2 - radius**2)
+    far = (-b - np.sign(radius) * np.sqrt(np.where(rest > 0, rest, np.nan))) / a
+    x, y, z = (eye[i] + far * ray[..., i] for i in range(3))
+    along = radius * np.arctan2(x / radius, (radius - z) / radius) + center[0]
+    left, top, w, h = CUT_MM
+    inside = (along > left) & (along < left + w) & (y + center[1] > top) & (y + center[1] < top + h)
+    maps = [np.where(inside, m * PX_PER_MM - 0.5, 0).astype(np.float32) for m in (along, y + center[1])]
+    light = np.where(inside[..., None], cv2.remap(page, *maps, cv2.INTER_NEAREST), np.float32(0.2))
+    linear = cv2.GaussianBlur(cv2.resize(light, size_px, interpolation=cv2.INTER_AREA), (0, 0), blur_px)
+    noisy = linear * 0.8 + np.random.default_rng(seed).normal(0, 0.004, linear.shape)
+    return np.clip(srgb_from_linear(np.clip(noisy, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)

@@ -17,6 +17,7 @@ CODES = (
     "wrong_sheet",
     "several_sheets",
     "mirrored",
+    "curled",
 )
 
 

@@ -1,36 +1,100 @@
-"""Markers that the detector missed, looked for where the others say they must be.
+"""All markers of a known page: those that the detector sees, and those it missed, where the others say they must be.
 
-In: the photograph, what was found, and where every marker lies on the page. Out: the same with more markers. A
-homography from the markers found predicts the corners of the rest; borders are fitted from there, and a marker counts
-when its borders fit near the prediction and its cells are the printed ones. That needs no contours, so it still works
-for small, blurred or partly covered markers; it never identifies a sheet by itself.
+In: the photograph and where every marker lies on the page. Out: `Found`. After each level of the detector a homography
+from the markers found predicts the corners of the rest; borders are fitted from there, and a marker counts when its
+borders fit near the prediction and its cells are the printed ones. That needs no contours, so it still works for
+small, blurred or partly covered markers, and it spares the finer levels, which cost most; they then look only where
+markers are still missing. Prediction never identifies a sheet by itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 
 import cv2
 import numpy as np
 
 from patchproof.geometry import apply_homography
-from patchproof.photo.detect import DICTIONARY, Found, cells_of, luminance, possible, refine
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.detect import (
+    COARSEST_PX,
+    DICTIONARY,
+    Box,
+    Found,
+    cells_of,
+    fitted,
+    levels,
+    look,
+    luminance,
+    possible,
+    printed_markers,
+    refine,
+    whole,
+)
 from patchproof.photo.edges import Borders, sample
 from patchproof.photo.rectify import fit_page
 
-LEAST_CORRELATION = (
-    0.7  # of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
-)
+# of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
+LEAST_CORRELATION = 0.7
+# px of a marker's side, 4 per module: the detector reads nearly all of those (0.99), so one that is missing is covered
+READABLE_PX = 28.0
+
+
+def find_sheet(
+    srgb: np.ndarray,
+    expected: Set[int],
+    corners_mm: Mapping[int, np.ndarray],
+    dictionary: str = DICTIONARY,
+    coarsest_px: int = COARSEST_PX,
+) -> Found:
+    """The markers of `corners_mm` (page mm by id) that are in the picture.
+
+    The search ends when every one of `expected` is found, or shown to be out of the picture or covered.
+    """
+    printed = printed_markers(dictionary)
+    seen: dict[int, list[np.ndarray]] = {}
+    box, found = whole(srgb), Found({}, (), ())
+    for level in levels(srgb, box, coarsest_px):
+        before = set(seen)
+        look(srgb, box, level, printed, seen)
+        if seen.keys() != before:
+            found = complete(srgb, fitted(srgb, seen, set(corners_mm), printed), corners_mm, dictionary)
+        wanted = expected - found.markers.keys()
+        if wanted and found.markers:
+            wanted, box = _still_wanted(srgb, wanted, found, corners_mm, level.scale)
+        if not wanted:
+            break
+    return found
+
+
+def _still_wanted(srgb, wanted: Set[int], found: Found, corners_mm, scale: float) -> tuple[Set[int], Box]:
+    """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
+    sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
+    if len(sure) < 2:  # one marker says too little about where the others are
+        return wanted, whole(srgb)
+    try:
+        px_from_mm = fit_page(sure, corners_mm).px_from_mm
+    except (CannotJudge, np.linalg.LinAlgError):
+        return wanted, whole(srgb)
+    quads = {i: apply_homography(px_from_mm, np.asarray(corners_mm[i])) for i in wanted}
+    quads = {i: quad for i, quad in quads.items() if possible(quad) and _inside(quad, srgb)}
+    wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
+    if not wanted:
+        return wanted, whole(srgb)
+    points = np.concatenate([quads[i] for i in wanted])
+    margin = 2 * max(_side_px(quads[i]) for i in wanted)
+    low = np.maximum(np.floor(points.min(0) - margin).astype(int), 0)
+    high = np.minimum(np.ceil(points.max(0) + margin).astype(int), [srgb.shape[1], srgb.shape[0]])
+    return wanted, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
 
 def complete(
     srgb: np.ndarray, found: Found, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
 ) -> Found:
     """`found` with all markers of `corners_mm` that verify at their predicted places; bad fits are replaced."""
-    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    light = luminance(srgb)
+    printed = printed_markers(dictionary)
     for _ in range(3):  # each round's markers predict farther ones better
-        more = _round(srgb, light, found, corners_mm, printed)
+        more = _round(srgb, found, corners_mm, printed)
         if not more:
             break
         kept = {i: b for i, b in found.markers.items() if i not in more}
@@ -38,12 +102,15 @@ def complete(
     return found
 
 
-def _round(srgb, light, found: Found, corners_mm, printed) -> dict[int, Borders]:
+def _round(srgb, found: Found, corners_mm, printed) -> dict[int, Borders]:
     """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
     sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
     if not sure:
         return {}
-    px_from_mm = fit_page(sure, corners_mm).px_from_mm
+    try:
+        px_from_mm = fit_page(sure, corners_mm).px_from_mm
+    except (CannotJudge, np.linalg.LinAlgError):
+        return {}
     predicted = {i: apply_homography(px_from_mm, np.asarray(mm)) for i, mm in corners_mm.items() if i not in sure}
     ids = sorted(i for i, quad in predicted.items() if possible(quad) and _inside(quad, srgb))
     if not ids:
@@ -53,21 +120,24 @@ def _round(srgb, light, found: Found, corners_mm, printed) -> dict[int, Borders]
     return {
         i: b
         for i, b, code in zip(ids, borders, cells, strict=True)
-        if b.fitted and _near(b, predicted[i]) and _reads(light, b, code)
+        if b.fitted and _near(b, predicted[i]) and _reads(srgb, b, code)
     }
 
 
 def _inside(quad: np.ndarray, srgb: np.ndarray) -> bool:
     limit = [srgb.shape[1] - 2, srgb.shape[0] - 2]
-    side = np.sqrt(abs(cv2.contourArea(quad.astype(np.float32))))
-    return bool((quad > 2).all() and (quad < limit).all() and side >= 10)
+    return bool((quad > 2).all() and (quad < limit).all() and _side_px(quad) >= 10)
+
+
+def _side_px(quad: np.ndarray) -> float:
+    return float(np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
 
 
 def _near(borders: Borders, quad: np.ndarray) -> bool:
     return bool(np.linalg.norm(borders.corners_px - quad, axis=1).max() < max(0.5 * borders.module_px, 1.0))
 
 
-def _reads(light: np.ndarray, borders: Borders, code: np.ndarray) -> bool:
+def _reads(srgb: np.ndarray, borders: Borders, code: np.ndarray) -> bool:
     """Whether the cells show the printed pattern: correlation of their light with it."""
     n = len(code)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
@@ -76,5 +146,8 @@ def _reads(light: np.ndarray, borders: Borders, code: np.ndarray) -> bool:
     centers = apply_homography(to_px, np.column_stack([columns.ravel(), rows.ravel()]))
     inner = np.zeros((n, n), bool)
     inner[1:-1, 1:-1] = True
-    seen = sample(light, centers)[inner.ravel()]
+    low, high = np.floor(centers.min(0)).astype(int) - 1, np.ceil(centers.max(0)).astype(int) + 1
+    low, high = np.maximum(low, 0), np.minimum(high, [srgb.shape[1], srgb.shape[0]])
+    light = luminance(np.ascontiguousarray(srgb[low[1] : high[1], low[0] : high[0]]))
+    seen = sample(light, centers - low)[inner.ravel()]
     return float(seen.std()) > 1e-6 and float(np.corrcoef(seen, code[inner])[0, 1]) > LEAST_CORRELATION

@@ -20,10 +20,12 @@ from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
 ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
+REACH = 0.87  # of a border's half-length: nearer to its ends the next border's blur mixes in
 # in modules: inwards the printed cells are known, outwards only one module of paper is
 INWARD, OUTWARD = 1.0, 0.6
 # what sampling adds to the blur: a pixel's own width (1/12 px²) and bilinear interpolation (mean over phases 1/6 px²)
 _SAMPLING_VARIANCE = 1 / 12 + 1 / 6
+_MOST_STEPS, _SETTLED_PX = (6, 5), 1e-3
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def _fit_round(luminance, corners, behind):
     middle, half, normal = border_frame(corners)
     module = _module_px(corners, behind.shape[2])
     inward, outward = np.clip(INWARD * module, 1.2, 12.0), np.clip(OUTWARD * module, 1.0, 10.0)
-    s = np.linspace(-0.87, 0.87, ALONG)
+    s = np.linspace(-REACH, REACH, ALONG)
     t = np.linspace(-inward, outward, ACROSS, axis=-1)  # M×4×ACROSS
     points = (
         middle[:, :, None, None]
@@ -108,10 +110,10 @@ def _fit_round(luminance, corners, behind):
     d, a, sigma, black, white = (fit[:, i].reshape(-1, 4) for i in range(5))
     ends = [middle + sign * half + (d + sign * a)[..., None] * normal for sign in (-1, 1)]
     fitted = (white - black > 0.01).all(1) & (np.abs(d) < outward).all(1) & np.isfinite(fit).reshape(-1, 20).all(1)
-    return _meet(*ends), fitted, sigma, black, white
+    return meet(*ends), fitted, sigma, black, white
 
 
-def _meet(start, end):
+def meet(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Corners M×4×2 where each border meets the one before it."""
     p, u = start, end - start
     q, v = np.roll(start, 1, axis=1), np.roll(u, 1, axis=1)
@@ -161,8 +163,8 @@ def _fit_steps(light, model):
     black, white = light[:, :, 4:9].min(2).mean(1), light[:, :, -4:].mean((1, 2))
     theta = np.stack([0 * reach, 0 * reach, np.log(np.maximum(0.25 * reach, 0.5)), black, white], 1)
     weight = np.ones(light.shape[:2])
-    for round_ in range(2):
-        theta = _gauss_newton(theta, light, model, weight, reach)
+    for round_, most in enumerate(_MOST_STEPS):
+        theta = _gauss_newton(theta, light, model, weight, reach, most)
         if round_ == 0:  # stretches that fit far worse than the border's typical one show something else
             misfit = np.sqrt(((_light(theta, model)[0] - light) ** 2).mean(2))
             floor = 0.03 * np.abs(theta[:, 4] - theta[:, 3])
@@ -177,24 +179,38 @@ def _light(theta, model):
     return black + (white - black) * shares[0], *shares
 
 
-def _gauss_newton(theta, light, model, weight, reach):
-    damping = np.full(len(theta), 1e-3)
-    cost = ((light - _light(theta, model)[0]) ** 2 * weight[..., None]).sum((1, 2))
-    for _ in range(12):
-        value, share, by_u, by_log_sigma = _light(theta, model)
-        span = (theta[:, 4] - theta[:, 3])[:, None, None]
-        columns = [-by_u * span, -by_u * span * model.s[:, None], by_log_sigma * span, 1 - share, share]
-        jacobian = np.stack(columns, -1)
-        weighted = jacobian * weight[..., None, None]
-        normal = np.einsum("kstp,kstq->kpq", weighted, jacobian)
-        gradient = np.einsum("kstp,kst->kp", weighted, light - value)
+def _gauss_newton(theta, light, model, weight, reach, most):
+    """Damped Gauss-Newton of all borders at once, until none moves by more than a thousandth of a pixel."""
+    theta, damping = theta.copy(), np.full(len(theta), 1e-3)
+    root = np.sqrt(weight)[..., None]
+    now = _light(theta, model)
+    cost = (((light - now[0]) * root) ** 2).sum((1, 2))
+    for _ in range(most):
+        jacobian, residual = _rows(now, light, theta, model, root)
+        normal = jacobian.transpose(0, 2, 1) @ jacobian
+        gradient = (jacobian.transpose(0, 2, 1) @ residual[..., None])[..., 0]
         scale = np.einsum("kpp->kp", normal) + 1e-9
-        step = np.linalg.solve(normal + (damping[:, None] * scale)[..., None] * np.eye(5), gradient[..., None])[..., 0]
-        trial = theta + step
+        damped = normal + (damping[:, None] * scale)[..., None] * np.eye(5)
+        trial = theta + np.linalg.solve(damped, gradient[..., None])[..., 0]
         trial[:, 0] = np.clip(trial[:, 0], -reach, reach)
         trial[:, 2] = np.clip(trial[:, 2], np.log(0.25), np.log(2 * reach))
-        new = ((light - _light(trial, model)[0]) ** 2 * weight[..., None]).sum((1, 2))
+        then = _light(trial, model)
+        new = (((light - then[0]) * root) ** 2).sum((1, 2))
         better = new <= cost
+        moved = np.abs(trial - theta)[:, :2].max(1)
         theta, cost = np.where(better[:, None], trial, theta), np.where(better, new, cost)
+        now = tuple(np.where(better[:, None, None], a, b) for a, b in zip(then, now, strict=True))
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-7, 1e6)
+        if (moved < _SETTLED_PX).all():
+            break
     return theta
+
+
+def _rows(now, light, theta, model, root):
+    """The weighted Jacobian K×N×5 of the light by the parameters, and the weighted residual K×N."""
+    value, share, by_u, by_log_sigma = now
+    span = (theta[:, 4] - theta[:, 3])[:, None, None] * root
+    by_d = -by_u * span
+    columns = [by_d, by_d * model.s[:, None], by_log_sigma * span, (1 - share) * root, share * root]
+    count = len(theta)
+    return np.stack(columns, -1).reshape(count, -1, 5), ((light - value) * root).reshape(count, -1)

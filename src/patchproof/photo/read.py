@@ -14,6 +14,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
@@ -53,7 +54,9 @@ def read_photo(path: str | Path) -> Photo:
                         f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX
                     )
                 focal_35mm = _focal_35mm(image)
-                upright = ImageOps.exif_transpose(image)
+                # turning and converting copy the picture, which for most is not needed and takes as long as decoding
+                turned = image.getexif().get(_ORIENTATION, 1) != 1
+                upright = ImageOps.exif_transpose(image) if turned else image
                 srgb = np.ascontiguousarray(_eight_bit_rgb(_in_srgb(upright)))
     except CannotJudge:
         raise
@@ -128,17 +131,20 @@ def _in_srgb(image):
 
 def _eight_bit_rgb(image) -> np.ndarray:
     if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image, float)
-        # 16-bit grey arrives as I;16 or I; floating point TIFF counts from 0 to 1
-        top = 65535.0 if image.mode.startswith("I") else max(1.0, float(np.nanmax(values, initial=0)))
-        gray = np.clip(np.nan_to_num(values) / top * 255 + 0.5, 0, 255).astype(np.uint8)
+        values = np.asarray(image)
+        if values.dtype.kind == "f":  # floating point TIFF counts from 0 to 1
+            values = np.nan_to_num(values.astype(np.float32), posinf=1.0)
+            top = max(1.0, float(values.max(initial=0)))
+        else:  # 16-bit gray arrives as I;16 or I
+            values, top = np.clip(values, 0, 65535).astype(np.uint16), 65535
+        gray = cv2.convertScaleAbs(np.maximum(values, 0), alpha=255 / top)
         return np.repeat(gray[..., None], 3, axis=2)
     if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "La", "RGBa"}:
         from PIL import Image
 
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return np.asarray(image.convert("RGB"))
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def _why(path: Path, error: Exception) -> str:

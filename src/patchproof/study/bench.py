@@ -133,10 +133,11 @@ def run_bench(
 
 
 def _benches() -> dict[str, Callable[[bool, OnStage], Iterator[Chart]]]:
+    from patchproof.study.bench_detect import detect_charts
     from patchproof.study.bench_printer import printer_charts
     from patchproof.study.bench_render import render_charts
 
-    return {"render": render_charts, "printer": printer_charts}
+    return {"render": render_charts, "printer": printer_charts, "detect": detect_charts}
 
 
 def machine() -> dict[str, Any]:

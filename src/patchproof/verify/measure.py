@@ -15,12 +15,13 @@ import numpy as np
 
 from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.complete import complete
+from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import Found, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 from patchproof.verify.appearance import MOST_CLIPPED, appearance
 from patchproof.verify.ranges import PromisedRanges
 from patchproof.verify.results import PhotoEntry
@@ -65,7 +66,12 @@ def measure(
         )
         return Measured(_coded(entry, few), True, {})
     light = frame_light(photo.srgb, found.markers.values())
+    unrolled = _unrolled(photo, found, surface)
+    srgb, fit = (photo.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
     entry = _with_geometry(entry, photo, found, fit, light, surface)
+    if unrolled is not None:  # no homography maps the page to the photograph
+        figures = {"corner_uncertainty_mm": unrolled.uncertainty_mm, "curl_radius_mm": unrolled.radius_mm}
+        entry = entry.model_copy(update=figures | {"homography_px_from_mm": None})
     page_check = _is_uncut(fit, found, surface)
     if page_check and surface.page_mm is not None:
         try:
@@ -82,7 +88,7 @@ def measure(
         if outside is not None:
             return Measured(_coded(entry.model_copy(update={"status": "rejected"}), outside), False, pictures)
     if cannot is None and promised is not None and promised.design is not None:
-        look = appearance(photo.srgb, fit.px_from_mm, surface, promised, light, entry)
+        look = appearance(srgb, fit.px_from_mm, surface, promised, light, entry)
         entry, pictures = entry.model_copy(update=look.figures), look.pictures
         if look.clipped > MOST_CLIPPED:
             advice = "the patch is overexposed: lower the exposure by one or two steps"
@@ -104,8 +110,12 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
     """The sheet's markers and the surface they lie on: the whole, or one page of a piece in tiles. `CannotJudge` where
     none is seen, or where it is not clear which sheet it is.
     """
-    pages = [frozenset(page.corners_mm) for page in surface.pages]
-    found = find_markers(srgb, surface.piece_ids or surface.page_ids, surface.all_ids, surface.dictionary, pages)
+    wanted = surface.piece_ids or surface.page_ids
+    if surface.pages:
+        pages = [frozenset(page.corners_mm) for page in surface.pages]
+        found = find_markers(srgb, wanted, surface.all_ids, surface.dictionary, pages)
+    else:
+        found = find_sheet(srgb, wanted, surface.corners_mm, surface.dictionary)
     if not found.markers:
         if is_mirrored(srgb, surface.all_ids, surface.dictionary):
             raise CannotJudge(
@@ -123,6 +133,8 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
     if len(found.foreign) > 1 or len(found.doubled) > 1:
         others = max(len(found.foreign), len(found.doubled))
         raise CannotJudge("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
+    if not surface.pages:
+        return found, surface
     surface = _page_in_view(found, surface)
     ours = {i: borders for i, borders in found.markers.items() if i in surface.corners_mm}
     found = Found(ours, found.foreign, found.doubled)
@@ -150,6 +162,15 @@ def _fit(found: Found, surface: Surface) -> PageFit | None:
     except (np.linalg.LinAlgError, CannotJudge):
         return None
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
+
+
+def _unrolled(photo: Photo, found: Found, surface: Surface) -> Unrolled | None:
+    """The piece made flat where its markers do not lie in one plane and a cylinder or a lens says why."""
+    corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in surface.piece_ids}
+    try:
+        return unroll(photo.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, photo.focal_px)
+    except (np.linalg.LinAlgError, ValueError):
+        return None  # a shape that no camera sees is no explanation; the plane's residual decides
 
 
 def _is_uncut(fit: PageFit, found: Found, surface: Surface) -> bool:
@@ -190,9 +211,13 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
     if side_mm * entry.px_per_mm < SMALLEST_DESIGN_PX:
         return CannotJudge("too_small", side_mm * entry.px_per_mm, SMALLEST_DESIGN_PX, _ADVICE["too_small"])
     agreeing = len(fit.inlier_ids)
+    least = min(LEAST_MARKERS, len(surface.piece_ids) or 1)
+    if agreeing < least:
+        advice = "too few markers agree to tell flat paper from bent: show all of the frame"
+        return CannotJudge("too_few_markers", agreeing, least, advice)
     if entry.residual_mm > MOST_RESIDUAL * side_mm or agreeing < 0.5 * len(found.markers):
-        advice = "the markers do not lie in one plane: press the sheet flat and show all of it"
-        return CannotJudge("too_few_markers", agreeing, len(found.markers), advice)
+        advice = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
+        return CannotJudge("curled", entry.residual_mm, MOST_RESIDUAL * side_mm, advice)
     if uncertain and len(found.markers) < 3:
         return CannotJudge(
             "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"

@@ -48,6 +48,7 @@ class PhotoEntry(Strict):
     contrast: Finite | None = None
     blur_px: Finite | None = None
     corner_uncertainty_mm: Finite | None = None
+    curl_radius_mm: Finite | None = None  # of paper that was unrolled; negative where it is hollow
     delta_e00_mean: Finite | None = None
     delta_e00_p95: Finite | None = None
     color_fit: str | None = None

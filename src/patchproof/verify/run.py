@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from patchproof.claims import wilson
@@ -139,7 +140,13 @@ def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
         return _Looked(Measured(entry, False, {}), None)
     if task.focal_px is not None:
         photo = Photo(photo.srgb, task.focal_px, photo.path)
-    measured = measure(photo, path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
+    try:
+        measured = measure(photo, path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
+    except (ArithmeticError, ValueError, LookupError, MemoryError, cv2.error) as error:
+        # no photograph is known that does this; one that does must not cost the others
+        advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
+        entry = PhotoEntry(file=path.name, status="rejected", code="unreadable", advice=advice)
+        return _Looked(Measured(entry, False, {}), None)
     pictures = {}
     if number < WITH_PICTURES:
         pictures = {"photo": thumbnail(photo.srgb, measured.entry, task.surface), **measured.pictures}

@@ -29,6 +29,7 @@ class Surface:
     piece_ids: frozenset[int]
     rect_mm: tuple[float, float, float, float]
     center_mm: tuple[float, float]
+    piece_mm: tuple[float, float, float, float]
     swatch_rects_mm: tuple[tuple[float, float, float, float], ...]
     swatches_srgb: np.ndarray
     label: Label  # what the page's code says
@@ -97,6 +98,7 @@ def _surface(manifest, corners, piece, rect, swatch_rects=(), colors=(), pages=(
         piece,
         rect,
         (rect[0] + rect[2] / 2, rect[1] + rect[3] / 2),
+        manifest.cut_mm,
         tuple(swatch_rects),
         np.array(colors).reshape(-1, 3),
         label_of(manifest),

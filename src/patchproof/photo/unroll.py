@@ -1,0 +1,235 @@
+"""Sheets that are no plane in the photograph: curled paper is unrolled, a lens's bending taken out, where that pays.
+
+In: marker corners in pixels and page millimetres, and the flat fit's word that they do not agree. Out: `Unrolled`: a
+picture in which the sheet is flat, with its homography, so that whatever measures flat sheets measures this one. Two
+explanations are tried against the plane: paper rolled round a cylinder of any radius and direction, seen by a pinhole
+camera (nine parameters, the focal length held near the file's own where there is one), and a plane seen through a lens
+with one radial term. One is believed where it leaves less than half of the plane's residual. Left out on purpose:
+cones, folds and dents; those stay unexplained and are refused as `curled` where they matter.
+
+Source of the shape: paper bends without stretching, so a sheet with straight rulings that are parallel is a cylinder
+(do Carmo, Differential Geometry of Curves and Surfaces, 5-8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from patchproof.geometry import apply_homography, fit_homography, plane_pose, rect_corners
+from patchproof.photo.edges import REACH, border_frame, meet
+from patchproof.photo.rectify import CORNER_NOISE_PX, PageFit
+
+FLAT_PX = 0.15  # rms per coordinate up to which a plane needs no better explanation: three times the corners' own noise
+PAYS = 0.5  # of the plane's residual
+LEAST_MARKERS = 4
+_TYPICAL_FOCAL = 0.7  # of the picture's diagonal, between a phone's 26 mm (0.6) and 35 mm (0.8)
+_FOCAL_SPREAD = {True: 0.1, False: 0.5}  # of its logarithm: by whether the file names a focal length
+_FIRST_BEND = 0.3  # radians over half the sheet, either way, from which the fit starts
+
+Project = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """`srgb` shows the sheet flat, `fit` is its homography there; `radius_mm` of the paper, positive where it bulges
+    towards the camera, None where a lens explains the picture.
+    """
+
+    srgb: np.ndarray
+    fit: PageFit
+    uncertainty_mm: float
+    radius_mm: float | None
+
+
+def unroll(
+    srgb: np.ndarray,
+    corners_px: Mapping[int, np.ndarray],
+    corners_mm: Mapping[int, np.ndarray],
+    sheet_mm,
+    rect_mm,
+    focal_px: float | None = None,
+) -> Unrolled | None:
+    """The sheet (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
+
+    The uncertainty is that of the corners of `rect_mm`.
+    """
+    ids = sorted(corners_px.keys() & corners_mm.keys())
+    if len(ids) < LEAST_MARKERS:
+        return None
+    px = np.concatenate([np.asarray(corners_px[i], float) for i in ids])
+    mm = np.concatenate([np.asarray(corners_mm[i], float) for i in ids])
+    flat = fit_homography(mm, px)
+    plain = _rms(apply_homography(flat, mm) - px)
+    if not plain > FLAT_PX:
+        return None
+    size = srgb.shape[1], srgb.shape[0]
+    best = _best(flat, mm, px, size, focal_px)
+    if best.rms_px > PAYS * plain:
+        return None
+    # the borders were fitted as straight lines, which on strongly bent paper misses the corners where they meet
+    px = px - _chord_shift(best, mm)
+    best = _best(flat, mm, px, size, focal_px)
+    grid = _net(sheet_mm)
+    straight = fit_homography(grid, best.px(grid))
+    error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
+    picture = _straightened(srgb, best.px, straight, sheet_mm, margin_px=error)
+    residual_mm = np.linalg.norm(np.einsum("nij,nj->ni", _mm_from_px(best.px, mm), best.px(mm) - px), axis=1)
+    # the covariance of the homography alone says nothing about the bend: `uncertainty_mm` has it all
+    fit = PageFit(straight, np.zeros((8, 8)), best.rms_px * np.sqrt(2), _rms(residual_mm), tuple(ids))
+    return Unrolled(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best.radius_mm)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A fitted model: `project(parameters, mm)`, the parameters with their covariance, what it leaves."""
+
+    project: Project
+    parameters: np.ndarray
+    covariance: np.ndarray
+    rms_px: float
+    radius_mm: float | None
+
+    def px(self, mm: np.ndarray) -> np.ndarray:
+        """Pixels N×2 of page points N×2."""
+        return self.project(self.parameters, np.asarray(mm, float))
+
+
+def _best(flat, mm, px, size, focal_px) -> _Shape:
+    """The explanation that leaves least."""
+    found = [_cylinder(flat, mm, px, size, focal_px), _lens(flat, mm, px, size)]
+    return min((one for one in found if one is not None), key=lambda one: one.rms_px)
+
+
+def _chord_shift(shape: _Shape, mm: np.ndarray) -> np.ndarray:
+    """How far corners where straight lines along a marker's bent borders meet lie from the marker's own, N×2 px."""
+    quads = mm.reshape(-1, 4, 2)
+    corners = shape.px(mm).reshape(-1, 4, 2)
+    s = np.linspace(-REACH, REACH, 9)
+    along = (1 + s[:, None]) / 2
+    points = quads[:, :, None] * (1 - along) + np.roll(quads, -1, axis=1)[:, :, None] * along
+    bent = shape.px(points.reshape(-1, 2)).reshape(*quads.shape[:2], len(s), 2)
+    middle, half, normal = border_frame(corners)
+    off = np.einsum("mksi,mki->mks", bent - middle[:, :, None], normal)
+    offset, slope = off.mean(2), (off * s).sum(2) / (s * s).sum()
+    ends = [middle + sign * half + (offset + sign * slope)[..., None] * normal for sign in (-1, 1)]
+    return (meet(*ends) - corners).reshape(-1, 2)
+
+
+def _cylinder(flat, mm, px, size, focal_px) -> _Shape | None:
+    """The best of eight starts: four directions of the rulings, bulging and hollow."""
+    center, reach = mm.mean(0), np.ptp(mm, axis=0).max() / 2
+    middle = np.array(size) / 2
+    focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
+
+    def project(p, points):
+        # p: rotation vector, the page centre in the camera (mm), log of focal / guess, bend, direction of the bend
+        c, s = np.cos(p[8]), np.sin(p[8])
+        x, y = ((points - center) @ [[c, -s], [s, c]]).T  # along the bend, along the rulings
+        turn = p[7] * x / reach
+        across = x * np.sinc(turn / np.pi)
+        depth = x * np.sinc(turn / 2 / np.pi) * np.sin(turn / 2)  # (1 - cos t) / t, without its hole at 0
+        world = np.column_stack([c * across - s * y, s * across + c * y, depth])
+        camera = Rotation.from_rotvec(p[:3]).apply(world) + p[3:6]
+        return focal * np.exp(p[6]) * camera[:, :2] / np.maximum(camera[:, 2:], 1e-3) + middle
+
+    matrix = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1.0]])
+    pose = plane_pose(flat @ np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1.0]]), matrix)
+    begin = [*Rotation.from_matrix(pose[:3, :3]).as_rotvec(), *pose[:3, 3], 0.0]
+    prior = CORNER_NOISE_PX / _FOCAL_SPREAD[focal_px is not None]
+    rows = lambda p: np.append((project(p, mm) - px).ravel(), prior * p[6])  # noqa: E731
+    fits = []
+    for direction in np.radians([0, 45, 90, 135]):
+        for bend in (-_FIRST_BEND, _FIRST_BEND):
+            start = np.array([*begin, bend, direction])
+            fits.append(least_squares(rows, start, x_scale=_scales(start), max_nfev=40, method="lm"))
+    best = min(fits, key=lambda fit: fit.cost)
+    bend = best.x[7]
+    if abs(bend) < 1e-6 or abs(bend) > np.pi / 2:
+        return None
+    return _shape(project, best, mm, px, reach / bend)
+
+
+def _scales(start: np.ndarray) -> np.ndarray:
+    """How far each parameter may be off, about."""
+    return np.array([0.1, 0.1, 0.1, *[0.05 * max(abs(start[5]), 1.0)] * 3, 0.2, 0.2, 0.5])
+
+
+def _lens(flat, mm, px, size) -> _Shape:
+    """A plane seen through a lens that bends about the picture's middle by one radial term."""
+    middle, half = np.array(size) / 2, np.hypot(*size) / 2
+
+    def project(p, points):
+        straight = apply_homography(np.append(p[:8] * unit, 1).reshape(3, 3), points) - middle
+        return straight * (1 + p[8] * (straight**2).sum(1, keepdims=True) / half**2) + middle
+
+    unit = np.maximum(np.abs(flat.ravel()[:8]), 1e-9)
+    start = np.append(flat.ravel()[:8] / unit, 0.0)
+    rows = lambda p: (project(p, mm) - px).ravel()  # noqa: E731
+    return _shape(project, least_squares(rows, start, max_nfev=40, method="lm"), mm, px, None)
+
+
+def _shape(project: Project, fit, mm, px, radius_mm) -> _Shape:
+    left = project(fit.x, mm) - px
+    noise = max(CORNER_NOISE_PX, float(np.sqrt((left**2).sum() / (left.size - len(fit.x)))))
+    scale = np.maximum(np.linalg.norm(fit.jac, axis=0), 1e-12)
+    inverse = np.linalg.pinv(fit.jac / scale, rcond=1e-9)
+    return _Shape(project, fit.x, noise**2 * (inverse @ inverse.T) / np.outer(scale, scale), _rms(left), radius_mm)
+
+
+def _uncertainty_mm(shape: _Shape, corners: np.ndarray) -> float:
+    """95 % point of the largest corner error, from 1000 draws of the first-order spread."""
+    here, rows = shape.px(corners), []
+    spread = np.sqrt(np.maximum(np.diag(shape.covariance), 1e-30))
+    for i, sigma in enumerate(spread):
+        step = np.zeros(len(spread))
+        step[i] = 0.1 * sigma
+        rows.append((shape.project(shape.parameters + step, corners) - here).ravel() / (0.1 * sigma))
+    values, vectors = np.linalg.eigh(shape.covariance / np.outer(spread, spread))
+    root = spread[:, None] * vectors * np.sqrt(np.maximum(values, 0))
+    draws = np.random.default_rng(0).standard_normal((1000, len(spread))) @ root.T
+    shift = np.einsum("cij,ncj->nci", _mm_from_px(shape.px, corners), (draws @ rows).reshape(-1, len(corners), 2))
+    return float(np.percentile(np.linalg.norm(shift, axis=2).max(1), 95))
+
+
+def _mm_from_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
+    """N×2×2 derivatives of page millimetres by pixels, by central differences over a tenth of a millimetre."""
+    steps = 0.05 * np.eye(2)
+    columns = [(project(mm + step) - project(mm - step)) / 0.1 for step in steps]
+    return np.linalg.inv(np.stack(columns, -1))
+
+
+def _straightened(srgb, project, px_from_mm, sheet_mm, margin_px: float) -> np.ndarray:
+    """The photograph with the sheet's part resampled as if it were flat."""
+    quad = apply_homography(px_from_mm, rect_corners(sheet_mm))
+    limit = np.array([srgb.shape[1], srgb.shape[0]])
+    low = np.clip(np.floor(quad.min(0) - margin_px).astype(int), 0, limit - 1)
+    high = np.clip(np.ceil(quad.max(0) + margin_px).astype(int), low + 1, limit)
+    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5
+    mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))
+    left, top, width, height = sheet_mm
+    on_sheet = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
+    source = (project(mm[on_sheet]) - 0.5).astype(np.float32)
+    maps = [np.full(x.shape, -1, np.float32) for _ in range(2)]
+    for one, values in zip(maps, source.T, strict=True):
+        one[on_sheet.reshape(x.shape)] = values
+    part = cv2.remap(srgb, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    picture = srgb.copy()
+    where = on_sheet.reshape(x.shape)
+    picture[low[1] : high[1], low[0] : high[0]][where] = part[where]
+    return picture
+
+
+def _net(rect_mm) -> np.ndarray:
+    x, y, width, height = rect_mm
+    across, down = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7))
+    return np.column_stack([x + width * across.ravel(), y + height * down.ravel()])
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
