@@ -27,6 +27,42 @@ def recognition_plot(
     return _svg(lambda axes: _draw(axes, x, y, px, py, label))
 
 
+def ledger_plot(ledger: Mapping) -> str:
+    """The gap ledger as a waterfall from the ideal picture's confidence to the photographs', with 95 % intervals.
+
+    `ledger` holds `shares` {step: {share, interval}}, `ideal` and `photo` (mean confidence), as the report's notes do.
+    """
+    return _svg(lambda axes: _draw_ledger(axes, ledger))
+
+
+def _draw_ledger(axes, ledger: Mapping) -> None:
+    shares, ideal = ledger["shares"], ledger["ideal"]
+    costs = np.array([share["share"] for share in shares.values()])
+    # shares count what the goal loses: for deceiving, confidence that was gained
+    after = ideal + np.sign(ledger["photo"] - ideal or -1) * np.sign(costs.sum() or 1) * np.cumsum(costs)
+    before = np.concatenate([[ideal], after[:-1]])
+    rows = np.arange(1, len(costs) + 1)
+    axes.barh([0, len(costs) + 1], [ideal, ledger["photo"]], color=_INK, alpha=0.35, height=0.62)
+    axes.barh(rows, after - before, left=before, color=[_NO if c > 0 else _YES for c in costs], height=0.62)
+    for row, start, end, share in zip(rows, before, after, shares.values(), strict=True):
+        if share["interval"] is not None:
+            ends = start + (np.sign(end - start) * np.sign(share["share"]) or -1) * np.array(share["interval"])
+            axes.plot(ends, [row, row], color=_INK, linewidth=1.2)
+    axes.set_yticks([0, *rows, len(costs) + 1], ["ideal", *(_STEPS.get(s, s) for s in shares), "photographs"])
+    axes.invert_yaxis()
+    axes.set_xlabel("confidence in the target")
+
+
+_STEPS = {
+    "gamut": "gamut",
+    "print": "print",
+    "light_and_camera": "light, camera color",
+    "print_light_and_camera": "print, light, camera",
+    "blur_and_noise": "blur, noise",
+    "photo": "not explained",
+}
+
+
 def _points(rows, figure, recognized) -> tuple[np.ndarray, np.ndarray]:
     pairs = [(row[figure], recognized(row)) for row in rows if row.get(figure) is not None]
     pairs = sorted((float(value), float(hit)) for value, hit in pairs if hit is not None)

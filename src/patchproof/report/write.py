@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from patchproof.report.images import DELTA_TOP, data_uri, delta_map, jpeg, png
-from patchproof.report.plots import recognition_plot
+from patchproof.report.plots import ledger_plot, recognition_plot
 
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 _WORDS = {
@@ -43,8 +43,8 @@ def write_report(
     """Write report.json, report.html and pictures/ into `out_dir`; returns the page's path.
 
     `report` and `manifest` are `model_dump()`s. `pictures[file]` may hold `photo`, `seen`, `fitted`, `promised`
-    (uint8 sRGB) and `delta_e00` (float cells, NaN = not measured). `notes` may hold `reason` (one sentence) and
-    `controls` (rows of the control photographs).
+    (uint8 sRGB) and `delta_e00` (float cells, NaN = not measured). `notes` may hold `reason` (one sentence) ,
+    `controls` (rows of the control photographs) and `ledger` (see `plots.ledger_plot`).
     """
     out = Path(out_dir)
     (out / "pictures").mkdir(parents=True, exist_ok=True)
@@ -83,6 +83,8 @@ def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str
         reason=notes.get("reason", ""),
         bars=_bars(report["summary"], promise, notes.get("controls", ())),
         controls=notes.get("controls", ()),
+        ledger=notes.get("ledger"),
+        waterfall=ledger_plot(notes["ledger"]) if notes.get("ledger") else "",
         plots=_plots(report, promise, primary),
         cards=[_card(photo, encoded.get(photo["file"], {})) for photo in report["photos"]],
         codes=_codes(report["photos"]),

@@ -18,7 +18,7 @@ from patchproof.report.write import write_report
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest, load_manifest
 from patchproof.verify.results import Evidence, Report
-from patchproof.verify.run import gather_evidence
+from patchproof.verify.run import LEDGER_PHOTOS, gather_evidence
 
 OWN = ("report.json", "report.html", "photos.csv", "pictures")
 
@@ -32,6 +32,7 @@ def verify_photos(
     controls: str | Path | None = None,
     scan_dpi: float | None = None,
     ruler_mm: tuple[float, float] | None = None,
+    ledger_photos: int = LEDGER_PHOTOS,
     jobs: int = 1,
     cluster: str | None = None,
     overwrite: bool = False,
@@ -53,6 +54,7 @@ def verify_photos(
             else None,
             scan_dpi=scan_dpi,
             controls=controls,
+            ledger_photos=ledger_photos,
             jobs=jobs,
             cluster=cluster,
             progress=on_photo,

@@ -42,7 +42,7 @@ def appearance(
     srgb: np.ndarray, px_from_mm: np.ndarray, surface: Surface, promised: Promised, light: FrameLight, entry: PhotoEntry
 ) -> Appearance:
     """Colour difference of the whole design; figures stay null where more than half of it is clipped."""
-    part, px_from_mm = _piece_only(srgb, px_from_mm, surface)
+    part, px_from_mm = piece_only(srgb, px_from_mm, surface)
     linear = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[part]
     fit = color_fit(part, linear, px_from_mm, surface, promised, light, entry.blur_px)
     cells_per_mm = _cells_per_mm(surface, entry)
@@ -79,14 +79,16 @@ def color_fit(
     part, linear, px_from_mm, surface: Surface, promised: Promised, light: FrameLight, blur_px: float
 ) -> ColorFit:
     """The best colour map that the piece in view supports; clipped or unresolved swatches are left out."""
-    seen, expected = [], []
-    for rect, color in zip(surface.swatch_rects_mm, promised.swatches, strict=True):
-        value = _swatch(part, linear, px_from_mm, rect, blur_px)
-        if value is not None:
-            seen.append(value)
-            expected.append(color)
-    fit = affine12(np.array(seen).reshape(-1, 3), np.array(expected).reshape(-1, 3))
+    seen = seen_swatches(part, linear, px_from_mm, surface, blur_px)
+    usable = np.isfinite(seen).all(1)
+    fit = affine12(seen[usable], promised.swatches[usable].reshape(-1, 3))
     return fit or white_black(light.paper, light.ink, promised.ink)
+
+
+def seen_swatches(part, linear, px_from_mm, surface: Surface, blur_px: float) -> np.ndarray:
+    """Linear light N×3 of the piece's swatches; NaN where one is clipped, unresolved or out of the picture."""
+    values = [_swatch(part, linear, px_from_mm, rect, blur_px) for rect in surface.swatch_rects_mm]
+    return np.array([np.full(3, np.nan) if value is None else value for value in values]).reshape(-1, 3)
 
 
 def _swatch(part, linear, px_from_mm, rect, blur_px) -> np.ndarray | None:
@@ -122,7 +124,7 @@ def _coarse(design: np.ndarray, shape: tuple[int, int], blur_design_px: float) -
     return cv2.resize(design, (shape[1], shape[0]), interpolation=way).astype(float)
 
 
-def _piece_only(srgb, px_from_mm, surface: Surface):
+def piece_only(srgb, px_from_mm, surface: Surface):
     """The part of the photo that holds the design and all swatches, and the homography to it."""
     corners = np.concatenate([rect_corners(r) for r in (surface.rect_mm, *surface.swatch_rects_mm)])
     quad = apply_homography(px_from_mm, corners)

@@ -43,11 +43,12 @@ _ADVICE = {
 
 @dataclass(frozen=True)
 class Measured:
-    """An entry without predictions, whether it is counted, and pictures by kind."""
+    """An entry without predictions, whether it is counted, pictures by kind, and the light on the frame where seen."""
 
     entry: PhotoEntry
     counted: bool
     pictures: dict[str, np.ndarray]
+    light: FrameLight | None = None
 
 
 def measure(
@@ -103,7 +104,7 @@ def measure(
             else "a photo of the uncut page checks the print and is not counted"
         )
         entry = entry.model_copy(update={"advice": advice})
-    return Measured(entry, counted, pictures)
+    return Measured(entry, counted, pictures, light)
 
 
 def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:

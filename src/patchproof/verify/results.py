@@ -70,6 +70,20 @@ class LedgerShare(Strict):
     interval: tuple[Finite, Finite] | None
 
 
+@dataclass(frozen=True)
+class Ledger:
+    """Shares by step in their order, mean confidence of the ideal pictures and of the photographs, and their number.
+
+    `culprit` is the step that clearly costs the most, None where none does.
+    """
+
+    shares: dict[str, LedgerShare]
+    culprit: str | None
+    ideal: float
+    photo: float
+    photos: int
+
+
 class Summary(Strict):
     """All photographs together, for the promise's primary model."""
 
@@ -122,7 +136,11 @@ class Evidence:
     pictures: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     controls: tuple[Control, ...] = ()
     reason: str = ""
+    ledger: Ledger | None = None
 
     def notes(self) -> dict[str, Any]:
-        """The controls and the reason as plain data, for the page."""
-        return {"reason": self.reason, "controls": [vars(control) for control in self.controls]}
+        """The controls, the reason and the ledger as plain data, for the page."""
+        ledger = None
+        if self.ledger is not None:
+            ledger = vars(self.ledger) | {"shares": {k: v.model_dump() for k, v in self.ledger.shares.items()}}
+        return {"reason": self.reason, "controls": [vars(control) for control in self.controls], "ledger": ledger}

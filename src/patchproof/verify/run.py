@@ -23,9 +23,11 @@ from patchproof.photo.read import Photo, list_photos, pictures_in, read_photo
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.verify.classify import check_primary, predict, squares_of, target_indices
+from patchproof.verify.ledger import Ledger, ledger_of, usable
 from patchproof.verify.measure import Measured, measure
 from patchproof.verify.pictures import thumbnail
 from patchproof.verify.ranges import PromisedRanges, matched_rate, promised_ranges
+from patchproof.verify.reproject import Shot, shot_of
 from patchproof.verify.results import Control, Evidence, ModelRate, PhotoEntry, Report, Summary
 from patchproof.verify.surface import Promised, Surface, promised_of, surface_of
 from patchproof.verify.verdict import Verdict, compare, effect_of, judge
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
     from patchproof.classifier import Classifier
 
+LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 
 
@@ -47,6 +50,7 @@ def gather_evidence(
     scan_dpi: float | None = None,
     controls: str | Path | None = None,
     camera_focal_px: float | None = None,
+    ledger_photos: int = LEDGER_PHOTOS,
     jobs: int = 1,
     cluster: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -54,14 +58,15 @@ def gather_evidence(
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
     `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
-    `camera_focal_px` replaces the EXIF focal length. `progress` is called with (done, all). Photographs
-    are measured by `jobs` local processes or by a Dask cluster's workers.
+    `camera_focal_px` replaces the EXIF focal length. `ledger_photos` of the photographs at most, spread evenly, go into
+    the gap ledger (0: no ledger). `progress` is called with (done, all). Photographs are measured by `jobs` local
+    processes or by a Dask cluster's workers.
     """
     paths = list_photos(photos)
     control_paths = _list_controls(controls) if controls is not None else {}
     if manifest.promise:
         check_primary(models, manifest.promise)
-    task = _task(manifest, models, printer, scan_dpi, camera_focal_px)
+    task = _task(manifest, models, printer, scan_dpi, camera_focal_px, _spread(len(paths), ledger_photos))
     total = len(paths) + sum(map(len, control_paths.values()))
     with open_workers(jobs, cluster) as workers:
         looks = workers.map(partial(_look, task), enumerate(paths), lambda done, _: progress(done, total))
@@ -73,7 +78,13 @@ def gather_evidence(
             done += len(files)
     indices = {m.name: target_indices(m, manifest) for m in models} if manifest.promise else {}
     entries = _with_predictions(looks, models, indices)
-    return _evidence(manifest, models, indices, entries, looks, control_looks)
+    ledger = _ledger(task, manifest, models, indices, entries, looks)
+    return _evidence(manifest, models, indices, entries, looks, control_looks, ledger)
+
+
+def _spread(count: int, most: int) -> frozenset[int]:
+    """At most `most` of `count` numbers from 0, evenly spread."""
+    return frozenset(range(count)) if count <= most else frozenset(i * count // most for i in range(most))
 
 
 def _list_controls(folder: str | Path) -> dict[str, list[Path]]:
@@ -100,6 +111,8 @@ class _Task:
     sizes_px: tuple[int, ...]
     scan_dpi: float | None
     focal_px: float | None
+    ledger_px: int | None  # the primary network's input size, where there can be a ledger
+    ledger: frozenset[int]  # numbers of the photographs that go into it
 
 
 @dataclass(frozen=True)
@@ -108,9 +121,10 @@ class _Looked:
 
     measured: Measured
     squares: dict[int, np.ndarray] | None
+    shot: Shot | None = None
 
 
-def _task(manifest, models, printer, scan_dpi, focal_px) -> _Task:
+def _task(manifest, models, printer, scan_dpi, focal_px, ledger) -> _Task:
     surface = surface_of(manifest)
     conditions = manifest.promise.conditions if manifest.promise else ()
     promised = None
@@ -121,7 +135,10 @@ def _task(manifest, models, printer, scan_dpi, focal_px) -> _Task:
             printer = load_printer(manifest.settings.get("printer", {}).get("profile", "coated"))
         promised = promised_of(manifest, surface, printer)
     sizes = tuple(sorted({m.input_px for m in models})) if manifest.promise else ()
-    return _Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, focal_px)
+    ledger_px = None
+    if manifest.promise and promised is not None:
+        ledger_px = next(m.input_px for m in models if m.name == manifest.promise.models[0].name)
+    return _Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, focal_px, ledger_px, ledger)
 
 
 def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
@@ -150,7 +167,10 @@ def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
     pictures = {}
     if number < WITH_PICTURES:
         pictures = {"photo": thumbnail(photo.srgb, measured.entry, task.surface), **measured.pictures}
-    return _Looked(Measured(measured.entry, measured.counted, pictures), squares_of(photo.srgb, task.sizes_px))
+    shot, entry = None, measured.entry
+    if number in task.ledger and task.ledger_px and measured.counted and usable(entry.status, entry.code):
+        shot = shot_of(photo.srgb, entry, measured.light, task.surface, task.ledger_px)
+    return _Looked(Measured(entry, measured.counted, pictures), squares_of(photo.srgb, task.sizes_px), shot)
 
 
 def _glance(task: _Task, path: Path) -> tuple[str, dict[int, np.ndarray] | None]:
@@ -174,7 +194,16 @@ def _with_predictions(looks: Sequence[_Looked], models, indices) -> list[PhotoEn
     ]
 
 
-def _evidence(manifest, models, indices, entries, looks, control_looks) -> Evidence:
+def _ledger(task: _Task, manifest, models, indices, entries, looks) -> Ledger | None:
+    shots = [look.shot for look in looks if look.shot is not None]
+    if not shots:
+        return None
+    model = next(m for m in models if m.name == manifest.promise.models[0].name)
+    confidence = {e.file: e.predictions[model.name].target_confidence for e in entries if e.predictions}
+    return ledger_of(shots, manifest, task.surface, task.promised, model, indices[model.name], confidence)
+
+
+def _evidence(manifest, models, indices, entries, looks, control_looks, ledger) -> Evidence:
     counted = [e for e, look in zip(entries, looks, strict=True) if look.measured.counted]
     verdict, effect, controls = Verdict("cannot_tell", None, "The sheet promises nothing."), "not_tested", ()
     rate, matched = ModelRate(rate=None, interval=None), None
@@ -198,11 +227,13 @@ def _evidence(manifest, models, indices, entries, looks, control_looks) -> Evide
         verdict=verdict.verdict,
         effect=effect,
         matched_rate=matched,
+        ledger=ledger.shares if ledger else None,
+        culprit=ledger.culprit if ledger else None,
         models=rates,
     )
     pictures = {look.measured.entry.file: look.measured.pictures for look in looks if look.measured.pictures}
     report = Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary)
-    return Evidence(report, pictures, controls, verdict.reason)
+    return Evidence(report, pictures, controls, verdict.reason, ledger)
 
 
 def _rate(results: list[bool]) -> ModelRate:

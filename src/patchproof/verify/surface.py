@@ -120,12 +120,17 @@ def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
     swatches = printed(colors)[0]
     design = None
     if manifest.design:
-        design = printed(manifest.design.pixels() / 255.0).astype(np.float32)
-        shrink = _LARGEST_PX / max(design.shape[:2])
-        if shrink < 1:
-            size = max(1, round(design.shape[1] * shrink)), max(1, round(design.shape[0] * shrink))
-            design = cv2.resize(design, size, interpolation=cv2.INTER_AREA)
+        design = reduced(printed(manifest.design.pixels() / 255.0).astype(np.float32))
     return Promised(design, swatches[:-1], swatches[-1])
+
+
+def reduced(linear: np.ndarray) -> np.ndarray:
+    """A design's light H×W×3 at the size at which it is compared."""
+    shrink = _LARGEST_PX / max(linear.shape[:2])
+    if shrink >= 1:
+        return linear
+    size = max(1, round(linear.shape[1] * shrink)), max(1, round(linear.shape[0] * shrink))
+    return cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
 
 
 def _known(manifest: Manifest) -> list:

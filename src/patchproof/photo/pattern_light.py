@@ -1,0 +1,91 @@
+"""The light of paper and ink from whole markers, for photographs too blurred to show either one unmixed.
+
+In: a photograph, its homography, the printed markers. Out: `PatternLight`. The printed
+cells are blurred as the photograph is, and every channel's linear light is regressed on them at the cells' centers:
+light = ink + (paper - ink) · pattern. At a blur of half a module no place shows pure paper or ink, and reading either
+one beside a border is off by a quarter of the contrast; the regression stays unbiased as long as the blur is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from patchproof.color import linear_from_srgb
+from patchproof.geometry import apply_homography, local_scale
+from patchproof.photo.detect import cells_of
+from patchproof.photo.edges import sample
+from patchproof.photo.quality import CLIPPED_CODE
+
+_FINE = 8  # samples per module of the blurred pattern
+_LEAST_SAMPLES = 30
+_BLURS = np.linspace(0.8, 1.5, 15)  # times the blur that borders show, which falls 10 % short at half a module
+
+
+@dataclass(frozen=True)
+class PatternLight:
+    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that explains the cells best."""
+
+    paper: np.ndarray
+    ink: np.ndarray
+    blur_px: float
+
+
+def pattern_light(
+    srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
+) -> PatternLight | None:
+    """Paper, ink and blur of an uint8 photograph whose borders show `blur_px`; None where too few cells are in it."""
+    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    ids = sorted(corners_mm)
+    markers, seen = [], []
+    for cells, corners in zip(cells_of(printed, ids), (corners_mm[i] for i in ids), strict=True):
+        module_px = local_scale(px_from_mm, corners.mean(0))[0] * np.linalg.norm(corners[1] - corners[0]) / len(cells)
+        points = apply_homography(px_from_mm, _centers_mm(corners, len(cells)))
+        usable = ((points > 1) & (points < [srgb.shape[1] - 1, srgb.shape[0] - 1])).all(1)
+        values = sample(srgb, points)
+        usable &= (values < CLIPPED_CODE).all(1)
+        markers.append((cells, module_px, usable))
+        seen.append(linear_from_srgb(values[usable] / 255.0))
+    light = np.concatenate(seen)
+    if len(light) < _LEAST_SAMPLES:
+        return None
+    fits = []
+    for blur in blur_px * _BLURS:
+        pattern = np.concatenate([_blurred(cells, blur / module)[usable] for cells, module, usable in markers])
+        if pattern.std() > 0.02:
+            fits.append((*_regressed(pattern, light), blur))
+    if not fits:
+        return None
+    _, paper, ink, blur = min(fits, key=lambda fit: fit[0])
+    return PatternLight(np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur))
+
+
+def _regressed(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Median error, paper and ink; robust, since a glare or a thumb may cover a marker."""
+    rows, weight = np.column_stack([1 - pattern, pattern]), np.ones(len(pattern))
+    for _ in range(4):
+        ink, paper = np.linalg.lstsq(rows * weight[:, None], light * weight[:, None], rcond=None)[0]
+        error = np.linalg.norm(rows @ np.stack([ink, paper]) - light, axis=1)
+        weight = np.sqrt(np.minimum(1, 1.345 * 1.4826 * np.median(error) / np.maximum(error, 1e-9)))
+    return float(np.median(error)), paper, ink
+
+
+def _centers_mm(corners: np.ndarray, modules: int) -> np.ndarray:
+    """Centers of a marker's modules, row by row."""
+    across, down = (corners[1] - corners[0]) / modules, (corners[3] - corners[0]) / modules
+    rows, columns = np.mgrid[0:modules, 0:modules] + 0.5
+    return corners[0] + columns.reshape(-1, 1) * across + rows.reshape(-1, 1) * down
+
+
+def _blurred(cells: np.ndarray, sigma_modules: float) -> np.ndarray:
+    """The cells at their centers, row by row, as a blur leaves them; paper lies around."""
+    fine = np.kron(np.pad(cells, 2, constant_values=1.0), np.ones((_FINE, _FINE)))
+    if sigma_modules > 0.05:
+        fine = cv2.GaussianBlur(fine, (0, 0), sigma_modules * _FINE, borderType=cv2.BORDER_REPLICATE)
+    half = _FINE // 2
+    # an even number of samples has no middle one: the four around it are averaged
+    middle = (fine[half - 1 :: _FINE, half - 1 :: _FINE] + fine[half::_FINE, half::_FINE]) / 2
+    return middle[2:-2, 2:-2].ravel()

@@ -1,0 +1,163 @@
+"""The gap ledger: Shapley's laws, a re-projection that is the photograph, and culprits that are known."""
+
+from __future__ import annotations
+
+import functools
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof.channel.printer import identity_printer
+from patchproof.classifier import Classifier
+from patchproof.color import linear_from_srgb
+from patchproof.photo.pattern_light import pattern_light
+from patchproof.report.plots import ledger_plot
+from patchproof.sheet.manifest import Manifest
+from patchproof.verify.ledger import _ledger, shapley
+from patchproof.verify.print_fit import fit_print
+from patchproof.verify.run import gather_evidence
+from patchproof.verify.surface import surface_of
+from test_photo_synthetic import CONDITION, make_manifest, page_raster, photograph, save, view
+
+SIZE, PHOTOS = (640, 480), 5
+
+
+def test_shapley_splits_what_players_do_together_evenly_and_sums_to_the_whole():
+    # a costs 3 alone, b and c cost 2 only together: 3, 1, 1
+    values = {on: 10.0 - 3 * on[0] - 2 * (on[1] and on[2]) for on in product((False, True), repeat=3)}
+    assert shapley(values) == pytest.approx([3, 1, 1])
+    noise = dict(zip(product((False, True), repeat=4), np.random.default_rng(0).random(16), strict=True))
+    assert shapley(noise).sum() == pytest.approx(noise[(False,) * 4] - noise[(True,) * 4])
+
+
+def ledger(costs, spread=0.02, photos=12, steps=("gamut", "print", "light_and_camera", "blur_and_noise")):
+    rng = np.random.default_rng(0)
+    values, seen = [], []
+    for _ in range(photos):
+        own = np.array(costs) + rng.normal(0, spread, len(costs))
+        values.append({on: 0.9 - float(own[:-1] @ np.array(on)) for on in product((False, True), repeat=len(steps))})
+        seen.append(0.9 - own.sum())
+    return _ledger(steps, values, np.array(seen), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("costs", "culprit"),
+    [
+        ((0, 0.15, 0.03, 0, 0), "print"),
+        ((0.3, 0, 0.12, 0, 0.02), "light_and_camera"),  # the promise was made with the gamut
+        ((0, 0.12, 0.12, 0, 0), None),  # two alike
+        ((0, 0.03, 0, 0, 0), None),  # too little to matter
+        ((0, 0.1, 0, 0, 0.3), None),  # most of it is not explained
+    ],
+)
+def test_a_culprit_is_named_only_where_it_is_clear(costs, culprit):
+    found = ledger(costs)
+    assert found.culprit == culprit
+    assert sum(s.share for s in found.shares.values()) == pytest.approx(found.ideal - found.photo)
+    assert ledger(costs, photos=4).culprit is None and ledger(costs, photos=4).shares["print"].interval is None
+
+
+def test_the_print_is_read_from_swatches_and_needs_eight_of_them():
+    promised = linear_from_srgb(np.array(make_manifest().model_dump()["chart"][0]["srgb"]) * 0 + 0.5)
+    corners = np.array(list(product((0.02, 1.0), repeat=3)) + [(g, g, g) for g in (0.1, 0.3, 0.6)])
+    faded = 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)
+    seen = np.stack([faded, faded, np.full_like(faded, np.nan)])
+    printed = fit_print(list(seen), corners)
+    assert printed(corners) == pytest.approx(faded, abs=0.02)
+    assert printed(promised[None]) == pytest.approx(promised[None], abs=0.03)
+    few = faded.copy()
+    few[7:] = np.nan
+    assert fit_print([few], corners) is None
+
+
+@functools.cache
+def design() -> np.ndarray:
+    """Fine stripes of strong colors."""
+    rows = np.arange(128) // 2 % 2
+    return np.repeat(np.where(rows[:, None, None], [220, 40, 60], [30, 200, 90]), 128, axis=1).astype(np.uint8)
+
+
+@functools.cache
+def sheet() -> Manifest:
+    rng = np.random.default_rng(0)
+    conditions = [CONDITION | dict(contrast=c, blur_px=0.3) for c in rng.uniform(0.6, 0.9, 50)]
+    model = dict(name="net", sha256=None, rate=0.9, interval=[0.85, 0.93], confidence=0.8)
+    target = dict(label="striped", indices=[0], goal="assist")
+    promise = dict(target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=400)
+    return make_manifest(promise | dict(controls={}, conditions=conditions), design=design())
+
+
+def stripes(pictures: torch.Tensor) -> torch.Tensor:
+    """ "striped" grows with the red-green contrast from row to row in the middle, where the design is."""
+    middle = pictures[..., 60:180, 60:180]
+    step = (middle[:, 0] - middle[:, 1]).diff(dim=1).abs().mean((1, 2))
+    return torch.stack([16 * step, torch.full_like(step, 4.0)], 1)
+
+
+NET = Classifier("net", None, 240, ("striped", "plain"), stripes)
+
+
+@functools.cache
+def raster(faded: bool) -> np.ndarray:
+    page = page_raster(sheet(), True)
+    if faded:  # paper white and marker black stay as they are
+        page = 0.45 * page + 0.55 * page.mean(-1, keepdims=True)
+    return page.astype(np.float32)
+
+
+def evidence(folder, faded=False, light=0.75, **look):
+    for i in range(PHOTOS):
+        homography = view(4 * i - 10, 5, 280, size_px=SIZE)
+        taken = dict(blur_px=0.3, noise=0.002, jpeg=95, fine=2, light=light, seed=i) | look
+        save(photograph(raster(faded), homography, SIZE, **taken), folder / f"{i}.png")
+    return gather_evidence(folder, sheet(), models=[NET], printer=identity_printer())
+
+
+@pytest.mark.parametrize(
+    ("change", "culprit"),
+    [
+        ({}, None),
+        ({"faded": True}, "print"),
+        ({"blur_px": 1.6}, "blur_and_noise"),
+        ({"light": 0.06}, "light_and_camera"),
+        ({"light": np.array([0.1, 0.1, 0.7])}, "light_and_camera"),
+    ],
+)
+def test_known_culprits_are_named(tmp_path, change, culprit):
+    found = evidence(tmp_path, **change)
+    summary = found.report.summary
+    assert summary.culprit == culprit, summary.ledger
+    whole = found.ledger.ideal - found.ledger.photo
+    assert sum(share.share for share in summary.ledger.values()) == pytest.approx(whole, abs=1e-9)
+    assert list(summary.ledger) == ["gamut", "print", "light_and_camera", "blur_and_noise", "photo"]
+    if culprit:
+        assert whole > 0.1
+        assert abs(summary.ledger["photo"].share) < 0.5 * summary.ledger[culprit].share
+    assert "not explained" in ledger_plot(found.notes()["ledger"])
+
+
+def test_without_swatches_print_and_light_are_one_step(tmp_path):
+    homography = view(5, 5, 280, size_px=SIZE)
+    save(photograph(raster(True), homography, SIZE, blur_px=0.3, fine=2, light=0.75), tmp_path / "a.png")
+    manifest = sheet().model_copy(update={"chart": ()})
+    found = gather_evidence(tmp_path, manifest, models=[NET], printer=identity_printer())
+    assert list(found.report.summary.ledger) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
+    assert found.report.summary.ledger["print_light_and_camera"].share > 0.1
+
+
+def test_no_ledger_where_none_was_asked_for(tmp_path):
+    save(photograph(raster(False), view(size_px=SIZE, distance_mm=280), SIZE, fine=2), tmp_path / "a.png")
+    found = gather_evidence(tmp_path, sheet(), models=[NET], printer=identity_printer(), ledger_photos=0)
+    assert found.report.summary.ledger is None and found.notes()["ledger"] is None
+
+
+@pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.01), (3.0, 0.03)])
+def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
+    surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
+    srgb = photograph(raster(False), homography, SIZE, blur_px=sigma, light=0.75, fine=2)
+    on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
+    found = pattern_light(srgb, homography, on_piece, surface.dictionary, 0.9 * sigma)
+    assert found.paper == pytest.approx(0.75, abs=tolerance + 0.02) and found.ink == pytest.approx(0, abs=tolerance)
+    assert found.blur_px == pytest.approx(sigma, abs=0.2)
