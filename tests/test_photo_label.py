@@ -16,6 +16,7 @@ from patchproof.sheet.piece import lay_out_piece
 from patchproof.sheet.raster import page_pixels
 from patchproof.sheet.template import load_template
 from patchproof.sheet.write import write_sheet
+from patchproof.verify.camera import view_of
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges
 from patchproof.verify.surface import promised_of, surface_of
@@ -48,7 +49,7 @@ def pages(tmp_path_factory):
 def verified(manifest, srgb, scan_dpi=None):
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(Photo(srgb, None, Path("a")), "a", surface, promised, promised_ranges(()), scan_dpi)
+    return measure(view_of(Photo(srgb, None, Path("a")), None), "a", surface, promised, promised_ranges(()), scan_dpi)
 
 
 def oblique(page):

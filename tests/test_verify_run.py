@@ -13,6 +13,7 @@ from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.photo.read import Photo
 from patchproof.settings import Refused
+from patchproof.verify.camera import view_of
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges
 from patchproof.verify.run import gather_evidence
@@ -50,7 +51,9 @@ def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
     manifest = manifest or make_manifest()
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(Photo(srgb, focal_px, Path("a")), "a", surface, promised, promised_ranges(conditions), scan_dpi)
+    return measure(
+        view_of(Photo(srgb, focal_px, Path("a")), None), "a", surface, promised, promised_ranges(conditions), scan_dpi
+    )
 
 
 def test_a_good_photo_is_measured_and_its_pose_is_right():

@@ -202,6 +202,9 @@ def reprint(
     print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
     scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
+    card: Annotated[
+        bool, typer.Option("--card", help="Photograph the uncut page with a bank card on it instead.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
@@ -212,8 +215,25 @@ def reprint(
     scale = _pair(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
         raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
+    if card and (scan_dpi is not None or control is not None):
+        raise typer.BadParameter("takes the page as it is; leave --scan-dpi and --control out", param_hint="--card")
     if scan_dpi is not None:
         truth = scan(pdf, load_run(run), n, out, scan_dpi, printer=printer, print_scale=scale, overwrite=overwrite)
+    elif card:
+        from patchproof.study.card_photo import photograph_cards
+
+        with _progress() as bar:
+            truth = photograph_cards(
+                pdf,
+                load_run(run),
+                n,
+                out,
+                seed=seed,
+                printer=printer,
+                print_scale=scale,
+                overwrite=overwrite,
+                on_photo=lambda done, total: bar("photograph", done, total),
+            )
     else:
         with _progress() as bar:
             truth = reprint_sheet(
@@ -242,6 +262,8 @@ def verify(
         float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
     ] = None,
     ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    card: Annotated[bool, typer.Option("--card", help="A bank card lies in its outline on the uncut page.")] = False,
+    camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
     require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
     ledger: Annotated[int, typer.Option(min=0, help="Photographs in the gap ledger at most; 0 for none.")] = 24,
     jobs: Jobs = 1,
@@ -264,6 +286,8 @@ def verify(
             scan_dpi=scan_dpi,
             ruler_mm=None if ruler_mm is None else _pair(ruler_mm, "--ruler-mm"),
             ledger_photos=ledger,
+            card=card,
+            camera=camera,
             jobs=jobs,
             cluster=cluster,
             overwrite=overwrite,

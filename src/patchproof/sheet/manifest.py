@@ -142,6 +142,7 @@ class Manifest(Strict):
     chart: tuple[Swatch, ...]
     cut_mm: Rect
     ruler_mm: tuple[Positive, Positive]
+    card_mm: Rect | None = None  # the printed outline that a bank card is laid into, on the design's page
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]

@@ -81,7 +81,7 @@ def reprint(
     bare = control == "bare"
     manifest, scene = sheet_scene(pdf_path, run)
     scene = scaled_print(scene, print_scale)
-    piece = None if bare else printed_piece(pdf_path, manifest, scene, _printer(run, printer))
+    piece = None if bare else printed_piece(pdf_path, manifest, scene, printer_of(run, printer))
     stage, conditions, truth = set_stage(scene), scene.draw("reprint", n, seed), {}
     with new_folder(out, OWN, overwrite) as folder:
         for i in range(n):
@@ -89,7 +89,7 @@ def reprint(
             take_photo(stage, piece, one, folder / name)
             truth[name] = _truth(scene, None if bare else manifest, one, print_scale)
             on_photo(i + 1, n)
-        _write_json(folder / "truth.json", truth)
+        write_json(folder / "truth.json", truth)
     return truth
 
 
@@ -111,7 +111,7 @@ def scan(
     if manifest.tiles:
         raise Refused("a sheet on one page to scan", f"{len(manifest.tiles)} tiles", "leave --scan-dpi out")
     page = torch.tensor(page_pixels(pdf_path, 1, 2 * dpi)).permute(2, 0, 1)[None] / 255  # twice as fine as the scan
-    seen = _printer(run, printer).apply(page)[0].permute(1, 2, 0).numpy()
+    seen = printer_of(run, printer).apply(page)[0].permute(1, 2, 0).numpy()
     size_px = tuple(round(side * dpi / 25.4) for side in manifest.page_mm)
     # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
     matrix = np.array(
@@ -130,7 +130,7 @@ def scan(
                 "marker_corners_px": corners,
                 "conditions": {"scan_dpi": dpi, "print_scale": list(print_scale)},
             }
-        _write_json(folder / "truth.json", truth)
+        write_json(folder / "truth.json", truth)
     return truth
 
 
@@ -181,13 +181,18 @@ def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions,
     """One photograph as a JPEG file of the drawn quality with the camera's focal length in its EXIF data."""
     photo_px = stage.scene.settings.camera.photo_px
     with torch.no_grad():
-        picture = photograph(stage, piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0).cpu().numpy()
-    exif = Image.Exif()
-    if isinstance(stage.scene, MeshScene):  # of pictures nobody knows the focal length
-        focal_px = stage.scene.matrix_px(photo_px)[0, 0]
+        picture = photograph(stage, piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0)
+    save_photo(picture, stage.scene, int(conditions.jpeg[0]), path)
+
+
+def save_photo(picture: torch.Tensor, scene: Scene, quality: int, path: Path) -> None:
+    """An H×W×3 sRGB picture as this scene's camera writes it."""
+    photo_px, exif = scene.settings.camera.photo_px, Image.Exif()
+    if isinstance(scene, MeshScene):  # of pictures nobody knows the focal length
+        focal_px = scene.matrix_px(photo_px)[0, 0]
         details = exif.get_ifd(0x8769)
         details[0xA405] = round(focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
-    Image.fromarray(_bytes(picture)).save(path, "JPEG", quality=int(conditions.jpeg[0]), exif=exif)
+    Image.fromarray(_bytes(picture.cpu().numpy())).save(path, "JPEG", quality=quality, exif=exif)
 
 
 def _truth(scene: Scene, manifest: Manifest | None, conditions: Conditions, print_scale) -> dict:
@@ -231,7 +236,8 @@ def _seen_at(scene: Scene, manifest: Manifest, conditions: Conditions, page_mm: 
     return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
 
 
-def _printer(run: Run, name: str | None) -> Printer:
+def printer_of(run: Run, name: str | None) -> Printer:
+    """The printer of that name or file; the scene's own where none is named."""
     if name is None:
         return load_printer(run.scene.settings.printer.profile, run.scene.base)
     return load_printer(name)
@@ -241,5 +247,6 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
     return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def _write_json(path: Path, data: dict) -> None:
+def write_json(path: Path, data: dict) -> None:
+    """The data as indented JSON."""
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

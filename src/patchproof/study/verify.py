@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.output import new_folder
@@ -33,6 +34,8 @@ def verify_photos(
     scan_dpi: float | None = None,
     ruler_mm: tuple[float, float] | None = None,
     ledger_photos: int = LEDGER_PHOTOS,
+    card: bool = False,
+    camera: str | None = None,
     jobs: int = 1,
     cluster: str | None = None,
     overwrite: bool = False,
@@ -40,6 +43,7 @@ def verify_photos(
 ) -> Report:
     """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
 
+    `card` looks for a bank card in its outline on the uncut page; `camera` is a camera file's name or path.
     Model and printer names are looked up from the manifest's folder, then as the scene's were.
     """
     manifest = load_manifest(sheet)
@@ -55,6 +59,8 @@ def verify_photos(
             scan_dpi=scan_dpi,
             controls=controls,
             ledger_photos=ledger_photos,
+            camera=None if camera is None else load_camera(camera),
+            card=card,
             jobs=jobs,
             cluster=cluster,
             progress=on_photo,

@@ -15,14 +15,17 @@ import numpy as np
 
 from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.card import NoCard, card_scale
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import Found, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
+from patchproof.photo.ratio import x_over_y
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 from patchproof.verify.appearance import MOST_CLIPPED, appearance
+from patchproof.verify.camera import View
 from patchproof.verify.ranges import PromisedRanges
 from patchproof.verify.results import PhotoEntry
 from patchproof.verify.scan import is_scan, page_scales
@@ -34,11 +37,15 @@ MOST_TILT_DEG = 78.0  # foreshortened to a fifth
 MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
 MOST_SCALE_ERROR = 0.01
+MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 _ADVICE = {
     "blurred": "hold still, tap to focus on the patch, or use more light",
     "too_small": "come closer or use the camera's full resolution",
     "tilted": "look at the patch less from the side",
 }
+
+
+_ONLY_UNCUT = "lay the card in its outline on the uncut, flat page, and show the page's own markers"
 
 
 @dataclass(frozen=True)
@@ -52,9 +59,16 @@ class Measured:
 
 
 def measure(
-    photo: Photo, name: str, surface: Surface, promised: Promised | None, ranges: PromisedRanges, scan_dpi=None
+    view: View,
+    name: str,
+    surface: Surface,
+    promised: Promised | None,
+    ranges: PromisedRanges,
+    scan_dpi: float | None = None,
+    card: bool = False,
 ) -> Measured:
-    """Everything that one readable photograph says; `promised` None leaves colour unmeasured."""
+    """Everything that one readable photograph says; `promised` None leaves colour unmeasured, `card` looks for one."""
+    photo = view.photo
     try:
         found, surface = identify(photo.srgb, surface)
     except CannotJudge as cannot:
@@ -67,13 +81,14 @@ def measure(
         )
         return Measured(_coded(entry, few), True, {})
     light = frame_light(photo.srgb, found.markers.values())
-    unrolled = _unrolled(photo, found, surface)
+    unrolled = _unrolled(view.photo, found, surface)
     srgb, fit = (photo.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
-    entry = _with_geometry(entry, photo, found, fit, light, surface)
+    entry = _with_geometry(entry, view, found, fit, light, surface)
     if unrolled is not None:  # no homography maps the page to the photograph
         figures = {"corner_uncertainty_mm": unrolled.uncertainty_mm, "curl_radius_mm": unrolled.radius_mm}
-        entry = entry.model_copy(update=figures | {"homography_px_from_mm": None})
-    page_check = _is_uncut(fit, found, surface)
+        entry = entry.model_copy(update=figures | {"homography_px_from_mm": None, "scale_x_over_y": None})
+    # a lens may keep page and piece from one fit; who lays a card on a page has not cut it
+    page_check = _is_uncut(fit, found, surface) or (card and bool(found.markers.keys() & surface.page_ids))
     if page_check and surface.page_mm is not None:
         try:
             refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
@@ -96,8 +111,11 @@ def measure(
             cannot = CannotJudge("clipped", look.clipped, MOST_CLIPPED, advice)
     entry = _coded(entry, cannot) if cannot else entry.model_copy(update={"status": "measured"})
     if scan and cannot is None:
-        entry = _with_scale(entry, fit, surface, scan_dpi)
-    if not counted and entry.code is None:
+        entry = _with_scale(entry, *page_scales(fit.px_from_mm, surface, scan_dpi))
+    elif card and cannot is None:
+        flat = page_check and unrolled is None
+        entry = _with_card(entry, view, fit, light, surface) if flat else _not_measured(entry, _ONLY_UNCUT)
+    if not counted and entry.code is None and entry.advice is None:
         advice = (
             "a scan checks the print and is not counted"
             if scan
@@ -180,7 +198,7 @@ def _is_uncut(fit: PageFit, found: Found, surface: Surface) -> bool:
 
 
 def _with_geometry(
-    entry: PhotoEntry, photo: Photo, found: Found, fit: PageFit, light: FrameLight, surface: Surface
+    entry: PhotoEntry, view: View, found: Found, fit: PageFit, light: FrameLight, surface: Surface
 ) -> PhotoEntry:
     px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
     figures = {
@@ -192,11 +210,12 @@ def _with_geometry(
         "corner_uncertainty_mm": corner_uncertainty_mm(fit, surface.rect_mm),
         "homography_px_from_mm": tuple(tuple(float(v) for v in row) for row in fit.px_from_mm),
     }
-    if photo.focal_px is not None:
-        height, width = photo.srgb.shape[:2]
-        matrix = np.array([[photo.focal_px, 0, width / 2], [0, photo.focal_px, height / 2], [0, 0, 1.0]])
-        azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, matrix), surface.center_mm)
+    if view.matrix_px is not None:
+        azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
         figures |= {"azimuth_deg": azimuth, "distance_mm": distance}
+    if view.calibrated:
+        ratio, uncertainty = x_over_y(fit, view.matrix_px, view.focal_error)
+        figures["scale_x_over_y"] = ratio if uncertainty <= MOST_RATIO_ERROR else None
     return entry.model_copy(update=figures)
 
 
@@ -228,8 +247,34 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
     return None
 
 
-def _with_scale(entry: PhotoEntry, fit: PageFit, surface: Surface, scan_dpi: float) -> PhotoEntry:
-    scale_x, scale_y = page_scales(fit.px_from_mm, surface, scan_dpi)
+def _with_card(entry: PhotoEntry, view: View, fit: PageFit, light: FrameLight, surface: Surface) -> PhotoEntry:
+    """The scale that a bank card in its outline shows, or why it shows none."""
+    if surface.card_mm is None:
+        return _not_measured(entry, "this sheet's JSON names no outline for a card: make the sheet again")
+    matrix, focal_error = view.likely_matrix_px, view.focal_error
+    ratio = x_over_y(fit, matrix, focal_error)
+    try:
+        card = card_scale(
+            view.photo.srgb,
+            fit.px_from_mm,
+            surface.card_mm,
+            surface.printed_mm,
+            matrix,
+            focal_error,
+            entry.blur_px,
+            light.paper,
+            ratio,
+        )
+    except NoCard as reason:
+        return _not_measured(entry, str(reason))
+    return _with_scale(entry.model_copy(update={"scale_uncertainty": card.uncertainty}), card.x, card.y)
+
+
+def _not_measured(entry: PhotoEntry, reason: str) -> PhotoEntry:
+    return entry.model_copy(update={"advice": f"scale not measured: {reason}"})
+
+
+def _with_scale(entry: PhotoEntry, scale_x: float, scale_y: float) -> PhotoEntry:
     entry = entry.model_copy(update={"scale_x": scale_x, "scale_y": scale_y})
     worst = max((scale_x, scale_y), key=lambda scale: abs(scale - 1))
     if abs(worst - 1) <= MOST_SCALE_ERROR:

@@ -42,6 +42,8 @@ class PhotoEntry(Strict):
     px_per_mm: Finite | None = None
     scale_x: Finite | None = None
     scale_y: Finite | None = None
+    scale_uncertainty: Finite | None = None  # 95 %, relative, of the worse axis; of card photographs
+    scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
     tilt_deg: Finite | None = None
     azimuth_deg: Finite | None = None
     distance_mm: Finite | None = None

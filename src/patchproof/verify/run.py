@@ -19,9 +19,10 @@ import numpy as np
 
 from patchproof.claims import wilson
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.read import Photo, list_photos, pictures_in, read_photo
+from patchproof.photo.read import list_photos, pictures_in, read_photo
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
+from patchproof.verify.camera import view_of
 from patchproof.verify.classify import check_primary, predict, squares_of, target_indices
 from patchproof.verify.ledger import Ledger, ledger_of, usable
 from patchproof.verify.measure import Measured, measure
@@ -34,6 +35,7 @@ from patchproof.verify.verdict import Verdict, compare, effect_of, judge
 from patchproof.workers import open_workers
 
 if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
     from patchproof.channel.printer import Printer
     from patchproof.classifier import Classifier
 
@@ -49,7 +51,8 @@ def gather_evidence(
     printer: Printer | None = None,
     scan_dpi: float | None = None,
     controls: str | Path | None = None,
-    camera_focal_px: float | None = None,
+    camera: Camera | None = None,
+    card: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     jobs: int = 1,
     cluster: str | None = None,
@@ -58,15 +61,15 @@ def gather_evidence(
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
     `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
-    `camera_focal_px` replaces the EXIF focal length. `ledger_photos` of the photographs at most, spread evenly, go into
-    the gap ledger (0: no ledger). `progress` is called with (done, all). Photographs are measured by `jobs` local
-    processes or by a Dask cluster's workers.
+    `camera` replaces the EXIF focal length and takes out the lens; `card` looks for a bank card in its outline.
+    `ledger_photos` of the photographs at most, spread evenly, go into the gap ledger (0: no ledger). `progress` is
+    called with (done, all). Photographs are measured by `jobs` local processes or by a Dask cluster's workers.
     """
     paths = list_photos(photos)
     control_paths = _list_controls(controls) if controls is not None else {}
     if manifest.promise:
         check_primary(models, manifest.promise)
-    task = _task(manifest, models, printer, scan_dpi, camera_focal_px, _spread(len(paths), ledger_photos))
+    task = _task(manifest, models, printer, scan_dpi, camera, card, _spread(len(paths), ledger_photos))
     total = len(paths) + sum(map(len, control_paths.values()))
     with open_workers(jobs, cluster) as workers:
         looks = workers.map(partial(_look, task), enumerate(paths), lambda done, _: progress(done, total))
@@ -110,7 +113,8 @@ class _Task:
     ranges: PromisedRanges
     sizes_px: tuple[int, ...]
     scan_dpi: float | None
-    focal_px: float | None
+    camera: Camera | None
+    card: bool
     ledger_px: int | None  # the primary network's input size, where there can be a ledger
     ledger: frozenset[int]  # numbers of the photographs that go into it
 
@@ -124,7 +128,7 @@ class _Looked:
     shot: Shot | None = None
 
 
-def _task(manifest, models, printer, scan_dpi, focal_px, ledger) -> _Task:
+def _task(manifest, models, printer, scan_dpi, camera, card, ledger) -> _Task:
     surface = surface_of(manifest)
     conditions = manifest.promise.conditions if manifest.promise else ()
     promised = None
@@ -138,7 +142,7 @@ def _task(manifest, models, printer, scan_dpi, focal_px, ledger) -> _Task:
     ledger_px = None
     if manifest.promise and promised is not None:
         ledger_px = next(m.input_px for m in models if m.name == manifest.promise.models[0].name)
-    return _Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, focal_px, ledger_px, ledger)
+    return _Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, camera, card, ledger_px, ledger)
 
 
 def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
@@ -155,10 +159,9 @@ def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
             advice=cannot.advice,
         )
         return _Looked(Measured(entry, False, {}), None)
-    if task.focal_px is not None:
-        photo = Photo(photo.srgb, task.focal_px, photo.path)
     try:
-        measured = measure(photo, path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
+        view = view_of(photo, task.camera)
+        measured = measure(view, path.name, task.surface, task.promised, task.ranges, task.scan_dpi, task.card)
     except (ArithmeticError, ValueError, LookupError, MemoryError, cv2.error) as error:
         # no photograph is known that does this; one that does must not cost the others
         advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
@@ -166,10 +169,10 @@ def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
         return _Looked(Measured(entry, False, {}), None)
     pictures = {}
     if number < WITH_PICTURES:
-        pictures = {"photo": thumbnail(photo.srgb, measured.entry, task.surface), **measured.pictures}
+        pictures = {"photo": thumbnail(view.photo.srgb, measured.entry, task.surface), **measured.pictures}
     shot, entry = None, measured.entry
     if number in task.ledger and task.ledger_px and measured.counted and usable(entry.status, entry.code):
-        shot = shot_of(photo.srgb, entry, measured.light, task.surface, task.ledger_px)
+        shot = shot_of(view.photo.srgb, entry, measured.light, task.surface, task.ledger_px)
     return _Looked(Measured(entry, measured.counted, pictures), squares_of(photo.srgb, task.sizes_px), shot)
 
 

@@ -1,0 +1,93 @@
+"""What is known of the camera that took a photograph: its pinhole matrix, and the picture as a pinhole has it.
+
+In: a photograph and, where there is one, a calibrated camera. Out: `View`. A camera file gives intrinsics and lens
+terms, and the picture is resampled as a pinhole would have taken it: homographies are then those of that picture. Else
+the matrix follows from EXIF's focal length with the principal point in the middle, or there is none. A photograph held
+upright by turning the camera fits the file turned by 90° clockwise, as most phones are held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from patchproof.channel import lens
+from patchproof.photo.read import Photo
+
+FILE_FOCAL_ERROR, EXIF_FOCAL_ERROR = 0.005, 0.04  # relative, 95 %: EXIF's is a whole number of mm, often nominal
+ANY_FOCAL_ERROR, USUAL_FOCAL = 0.6, 0.65  # of no file and no EXIF: a phone's main camera, in picture diagonals
+
+
+@dataclass(frozen=True)
+class View:
+    """A photograph with straight lines straight, its matrix (None: unknown), the focal length's relative 95 % error."""
+
+    photo: Photo
+    matrix_px: np.ndarray | None
+    focal_error: float
+    calibrated: bool
+
+    @property
+    def likely_matrix_px(self) -> np.ndarray:
+        """The matrix, or a phone's usual one."""
+        if self.matrix_px is not None:
+            return self.matrix_px
+        return _centered(USUAL_FOCAL * float(np.hypot(*self.photo.srgb.shape[:2])), self.photo)
+
+
+def view_of(photo: Photo, camera: lens.Camera | None) -> View:
+    """The photograph as the camera file has it; as EXIF has it where there is none, or it is another camera's."""
+    fitting = None if camera is None else _held(camera, photo)
+    if fitting is not None:
+        size_px = photo.srgb.shape[1], photo.srgb.shape[0]
+        matrix = lens.matrix_px(fitting, size_px) if size_px[0] != size_px[1] else None
+        if matrix is not None:
+            straight = Photo(_straightened(photo, fitting, matrix), float(matrix[0, 0]), photo.path)
+            return View(straight, matrix, FILE_FOCAL_ERROR, True)
+    if photo.focal_px is not None:
+        return View(photo, _centered(photo.focal_px, photo), EXIF_FOCAL_ERROR, False)
+    return View(photo, None, ANY_FOCAL_ERROR, False)
+
+
+def _centered(focal_px: float, photo: Photo) -> np.ndarray:
+    height, width = photo.srgb.shape[:2]
+    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
+
+
+def _held(camera: lens.Camera, photo: Photo) -> lens.Camera | None:
+    """The camera as it was held for this photograph; None where it cannot have taken a picture of this shape."""
+    height, width = photo.srgb.shape[:2]
+    for held in (camera, _turned(camera)):
+        if abs(width * held.image_px[1] / (height * held.image_px[0]) - 1) <= lens.ASPECT_TOLERANCE:
+            return held
+    return None
+
+
+def _turned(camera: lens.Camera) -> lens.Camera:
+    """The same camera whose pictures are turned by 90° clockwise: (x, y) becomes (height - y, x)."""
+    width, height = camera.image_px
+    return camera.model_copy(
+        update={
+            "image_px": (height, width),
+            "fx": camera.fy,
+            "fy": camera.fx,
+            "cx": height - camera.cy,
+            "cy": camera.cx,
+            "p1": camera.p2,
+            "p2": -camera.p1,
+        }
+    )
+
+
+def _straightened(photo: Photo, camera: lens.Camera, matrix: np.ndarray) -> np.ndarray:
+    """The picture through a pinhole of the same matrix."""
+    if not camera.bends:
+        return photo.srgb
+    size_px = photo.srgb.shape[1], photo.srgb.shape[0]
+    index = matrix.copy()
+    index[:2, 2] -= 0.5  # OpenCV counts from pixel centers
+    terms = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    maps = cv2.initUndistortRectifyMap(index, terms, None, index, size_px, cv2.CV_32FC1)
+    return cv2.remap(photo.srgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

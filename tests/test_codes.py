@@ -1,0 +1,83 @@
+"""Every code of a photograph: the last figure that passes, the first that does not, and advice for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from patchproof.photo.detect import Found
+from patchproof.photo.edges import Borders
+from patchproof.photo.rectify import PageFit
+from patchproof.verify import measure
+from patchproof.verify.results import PhotoEntry
+from patchproof.verify.surface import surface_of
+from test_photo_synthetic import PIECE_IDS, make_manifest
+from test_verify_run import measured, shot
+
+SURFACE = surface_of(make_manifest())
+GOOD = dict(tilt_deg=10.0, blur_px=1.0, px_per_mm=2.0, residual_mm=0.05, corner_uncertainty_mm=0.05)
+
+
+def trouble(markers=8, module_px=4.0, **figures):
+    """What `measure` says of these figures, of a 100 mm design."""
+    entry = PhotoEntry(file="a", status="judged", **(GOOD | figures))
+    borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, module_px, True)
+    found = Found({i: borders for i in PIECE_IDS[:markers]}, (), ())
+    fit = PageFit(np.eye(3), np.eye(8), 0.1, 0.05, PIECE_IDS[:markers])
+    return measure._trouble(entry, fit, found, SURFACE)
+
+
+@pytest.mark.parametrize(
+    ("code", "good", "bad"),
+    [
+        ("tilted", {"tilt_deg": 77.9}, {"tilt_deg": 78.1}),
+        ("blurred", {"blur_px": 1.99}, {"blur_px": 2.01}),  # half a module of 4 px
+        ("too_small", {"px_per_mm": 0.241}, {"px_per_mm": 0.239}),  # 24 px across 100 mm
+        ("too_small", {"corner_uncertainty_mm": 2.99}, {"corner_uncertainty_mm": 3.01}),
+        ("curled", {"residual_mm": 0.99}, {"residual_mm": 1.01}),
+    ],
+)
+def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
+    assert trouble(**good) is None
+    cannot = trouble(**bad)
+    assert cannot.code == code and len(cannot.advice) > 15
+    assert cannot.figure is not None and cannot.threshold is not None
+
+
+@pytest.mark.parametrize(
+    ("scale", "code"), [(0.9905, None), (0.9895, "scale_off"), (1.0095, None), (1.0105, "scale_off")]
+)
+def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
+    entry = measure._with_scale(PhotoEntry(file="a", status="measured"), scale, 1.0)
+    assert (entry.status, entry.code, entry.scale_x) == ("measured", code, scale)
+    assert code is None or "100 %" in entry.advice
+
+
+def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
+    borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, 4.0, True)
+    for foreign, doubled, code in (
+        ((7,), (), None),
+        ((7, 8), (), "several"),
+        ((), (100,), None),
+        ((), (100, 101), "several"),
+    ):
+        found = Found({i: borders for i in PIECE_IDS}, foreign, doubled)
+        monkeypatch.setattr(measure, "find_sheet", lambda *_, found=found: found)
+        if code is None:
+            assert measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)[0] is found
+        else:
+            with pytest.raises(measure.CannotJudge, match="several_sheets: more than one sheet"):
+                measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)
+
+
+@pytest.mark.parametrize("flip", [np.fliplr, np.flipud])
+def test_a_mirrored_photo_or_print_is_known_whichever_way_it_is_held(flip):
+    entry = measured(np.ascontiguousarray(flip(shot()))).entry
+    assert (entry.status, entry.code) == ("rejected", "mirrored") and "mirror" in entry.advice
+
+
+def test_half_of_the_design_may_be_clipped():
+    # a design of codes up to 236 in light of 0.8 stays below white; doubled, most of it does not
+    assert measured(shot(light=0.8)).entry.code is None
+    entry = measured(shot(light=2.0)).entry
+    assert entry.code == "clipped" and entry.figure > entry.threshold == measure.MOST_CLIPPED
