@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from patchproof.color import lab_from_linear, tinted_white
 from patchproof.scene.conditions import draw, with_poses_of
 from patchproof.settings import SceneSettings, validated
 
@@ -77,6 +78,9 @@ EVERYTHING = SETTINGS.model_copy(
             update={"point": (0.2, 0.9), "sh2": (0.1, 0.4), "gloss": (0.01, 0.1), "shininess": (10.0, 90.0)}
         ),
         "camera": SETTINGS.camera.model_copy(update={"motion_px": (0.0, 12.0), "vignetting": (0.0, 0.4)}),
+        "printer": SETTINGS.printer.model_copy(
+            update={"paper_white": (0.92, 1.03), "paper_b": (-8, 7), "misregistration_mm": (0, 0.3), "scale": (0.95, 1)}
+        ),
     }
 )
 ADDED = (
@@ -98,8 +102,25 @@ def test_lamp_gloss_motion_and_vignetting_fill_their_ranges():
 
 def test_terms_that_are_on_leave_the_other_draws_as_they_were():
     on, off = draw(EVERYTHING, "promise", 50, 3), draw(SETTINGS, "promise", 50, 3)
-    for name in ("azimuth_deg", "ambient", "background", "print_draw", "jpeg", "noise_seed"):
+    for name in ("azimuth_deg", "ambient", "background", "dot_gain", "black", "jpeg", "noise_seed"):
         np.testing.assert_array_equal(getattr(on, name), getattr(off, name))
+
+
+def test_paper_misregistration_and_scale_fill_their_ranges_and_are_off_by_default():
+    drawn, off = draw(EVERYTHING, "promise", 2000, 0), draw(SETTINGS, "promise", 50, 0)
+    length = np.linalg.norm(drawn.misregistration_mm, axis=2)
+    np.testing.assert_allclose(length[:, 0], length[:, 1])  # both planes as far, each in its own direction
+    assert 0.95 <= drawn.printed_scale.min() < 0.951 and 0.999 < drawn.printed_scale.max() <= 1
+    assert 0 <= length.min() < 0.001 and 0.299 < length.max() < 0.3001
+    red, blue = np.arctan2(drawn.misregistration_mm[..., 1], drawn.misregistration_mm[..., 0]).T
+    assert abs(np.corrcoef(red, blue)[0, 1]) < 0.07 and np.abs(drawn.misregistration_mm.mean(0)).max() < 0.01
+    assert not off.misregistration_mm.any() and (off.paper == 1).all() and (off.printed_scale == 1).all()
+
+
+def test_tinted_paper_has_the_lab_color_it_is_asked_for():
+    white = tinted_white(np.array([1.0, 1.0, 0.5]), np.array([-8.0, 7.0, 0.0]))
+    np.testing.assert_allclose(lab_from_linear(white)[:2], [[100, 0, -8], [100, 0, 7]], atol=2e-4)
+    np.testing.assert_allclose(white[2], 0.5, atol=1e-6)
 
 
 def test_coefficients_of_uneven_light_are_independent_standard_normals():
@@ -119,7 +140,7 @@ def test_no_two_columns_move_together():
 def test_poses_are_kept_while_the_rest_is_drawn_anew():
     poses, new = draw(EVERYTHING, "train", 12, 0), draw(EVERYTHING, "train", 12, 0, start=12)
     kept = with_poses_of(new, poses)
-    pose = {"azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background"}
+    pose = {"azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background", "printed_scale"}
     for field in fields(kept):
         source, other = (poses, new) if field.name in pose else (new, poses)
         np.testing.assert_array_equal(getattr(kept, field.name), getattr(source, field.name))

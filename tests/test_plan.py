@@ -78,7 +78,7 @@ def plan(tmp_path_factory) -> Plan:
 
 def test_a_plan_is_short_and_survives_json(plan):
     lines = plan_lines(plan)
-    assert len(lines) < 45 and max(map(len, lines)) < 250
+    assert len(lines) < 45 and max(map(len, lines)) < 300
     assert Plan.model_validate_json(plan.model_dump_json()) == plan
     assert plan.surface.family == "card" and plan.draft.steps == 3 and plan.cost is None and plan.warnings
     assert sum(line.startswith("  ") for line in lines) > 15
@@ -101,6 +101,9 @@ def test_terms_that_are_off_are_named_with_the_key_that_turns_them_on(plan):
         "vignetting": "camera.vignetting",
         "motion blur": "camera.motion_px",
         "lens distortion": "camera.file",
+        "paper white": "printer.paper_white",
+        "misregistration": "printer.misregistration_mm",
+        "print scale": "printer.scale",
     }
     (line,) = (line for line in plan_lines(plan) if line.startswith("  off: "))
     assert all(key in line for key in off.values())

@@ -22,7 +22,7 @@ from patchproof.channel.printer import (
     vary,
 )
 from patchproof.color import ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
-from patchproof.settings import Refused, shipped
+from patchproof.settings import PrinterSettings, Refused, shipped
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no ICC profiles")
@@ -270,16 +270,17 @@ def test_broken_files_are_refused_in_one_sentence(tmp_path, break_it):
 # ------------------------------------------------------------------------------------------------ from print to print
 
 
-def test_the_middle_draw_changes_nothing_and_paper_stays_white():
+def test_no_change_leaves_colors_and_paper_stays_white():
     light = torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(vary(light, torch.full((3,), 0.5)), light)
+    torch.testing.assert_close(vary(light, torch.zeros(3)), light)
     draws = torch.rand(4, 3, generator=torch.Generator().manual_seed(2))
     torch.testing.assert_close(vary(torch.ones(4, 3), draws), torch.ones(4, 3))
 
 
 def test_variation_has_the_size_of_print_to_print_differences():
     seen = colors_of(load_printer("coated").apply(image(random_8bit())))
-    draws = torch.rand(64, 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    draws = torch.rand(64, 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1
+    draws *= torch.tensor([PrinterSettings().dot_gain[1], PrinterSettings().density[1], PrinterSettings().black[1]])
     varied = lab_from_linear(vary(torch.tensor(linear_from_srgb(seen)), draws).numpy())
     error = ciede2000(varied, lab_from_srgb(seen)[None])
     assert 0.5 < error.mean() < 2 and error.max() < 6
@@ -287,7 +288,7 @@ def test_variation_has_the_size_of_print_to_print_differences():
 
 def test_variation_by_hand():
     half_covered = torch.full((3, 3), 0.5)
-    gained, dense, lifted = vary(half_covered, 0.5 + 0.5 * torch.eye(3)).mean(1).tolist()
+    gained, dense, lifted = vary(half_covered, torch.diag(torch.tensor([0.04, 0.05, 0.004]))).mean(1).tolist()
     assert gained == pytest.approx(0.46)  # coverage 50 % grows by the dot gain of 4 points
     assert dense == pytest.approx(0.5**1.05) and lifted == pytest.approx(0.502)
 
@@ -303,5 +304,5 @@ def test_variation_has_finite_true_gradients():
     draw = torch.tensor([[0.1, 0.9, 0.7]], dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda x: vary(x, draw), (light,))
     ends = torch.tensor([0.0, 1.0])[:, None].expand(2, 3).clone().requires_grad_(True)
-    vary(ends, torch.tensor([0.1, 0.1, 0.9])).sum().backward()
+    vary(ends, torch.tensor([-0.04, -0.05, 0.004])).sum().backward()
     assert torch.isfinite(ends.grad).all()

@@ -65,6 +65,15 @@ def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarr
     return normalized(matrix_px @ pose[:3, [0, 1, 3]])
 
 
+def scaled_about(middle, scale: float) -> np.ndarray:
+    """(D+1)×(D+1): everything `scale` times as far from `middle` (D values)."""
+    middle = np.asarray(middle, float)
+    matrix = np.eye(len(middle) + 1)
+    matrix[:-1, :-1] *= scale
+    matrix[:-1, -1] = (1 - scale) * middle
+    return matrix
+
+
 def normalized(homography) -> np.ndarray:
     """The same homography with its last entry 1, or with unit norm where that entry vanishes."""
     homography = np.asarray(homography, float)

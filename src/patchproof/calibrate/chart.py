@@ -25,9 +25,6 @@ from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.ladder import Choice, Map, choose, difference, rungs
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import (
-    BLACK_LIFT,
-    DENSITY,
-    DOT_GAIN,
     Printer,
     load_printer,
     node_colors,
@@ -163,6 +160,9 @@ def combine(readings: Sequence[np.ndarray], robust: bool = True) -> np.ndarray:
     return np.where(missing, np.nan, middle)
 
 
+_PRINT_CHANGE = (0.04, 0.05, 0.004)  # dot gain, density and black differ by about as much from print to print
+
+
 def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
     """What N×3 light of several prints differs by, as standard deviations; None of a single print.
 
@@ -179,12 +179,12 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
     for one in prints:
         target = srgb_from_linear(one[known])
 
-        def rest(draw: np.ndarray, target: np.ndarray = target) -> np.ndarray:
-            return (srgb_from_linear(vary(middle, torch.tensor(draw)).numpy()) - target).ravel()
+        def rest(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
+            return (srgb_from_linear(vary(middle, torch.tensor(change)).numpy()) - target).ravel()
 
-        found.append(2 * least_squares(rest, np.full(3, 0.5)).x - 1)
+        found.append(least_squares(rest, np.zeros(3), x_scale=_PRINT_CHANGE).x)
         away.append(difference(target, srgb_from_linear(mean[known])).mean())
-    gain, density, lift = np.std(found, axis=0, ddof=1) * [DOT_GAIN, DENSITY, BLACK_LIFT]
+    gain, density, lift = np.std(found, axis=0, ddof=1)
     figures = {"delta_e00": np.mean(away), "dot_gain_sd": gain, "density_sd": density, "black_lift_sd": lift}
     return {"prints": len(prints), **{key: round(float(value), 4) for key, value in figures.items()}}
 

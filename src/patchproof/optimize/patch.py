@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from patchproof.channel.printer import Printer
-from patchproof.optimize.goals import total_variation
+from patchproof.optimize.goals import non_printability, total_variation
 from patchproof.optimize.pixels import as_pixels
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.scene import Scene
@@ -37,6 +37,7 @@ class Patch:
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
+    printable: Tensor | None = None  # P×3 colors that stand for the printer's, where the settings ask for NPS
 
     def start(self) -> Tensor:
         """A mid-gray design."""
@@ -44,16 +45,20 @@ class Patch:
         return torch.full((3, height, width), 0.5, device=self.device)
 
     def clipped(self, design: Tensor) -> Tensor:
-        """The nearest design that can be printed."""
+        """The nearest design that can be printed; with `in_gamut`, that the printer shows as it is asked to."""
+        if self.scene.settings.optimize.in_gamut:
+            return self.printer.into_gamut(design[None])[0]
         return design.clamp(0, 1)
 
     def penalty(self, design: Tensor) -> Tensor | float:
-        """What the scene's settings charge a design for: total variation, and colors that the printer misses."""
+        """What the scene's settings charge a design for: total variation, colors that the printer misses, NPS."""
         settings = self.scene.settings.optimize
         cost = settings.tv * total_variation(design) if settings.tv else 0.0
         if settings.gamut:
             # ΔE00 / 100: one unit of loss for black in place of white
             cost = cost + settings.gamut * self.printer.gamut_distance(design[None]).mean() / 100
+        if settings.nps:
+            cost = cost + settings.nps * non_printability(design, self.printable)
         return cost
 
     def pixels(self, design: Tensor) -> np.ndarray:

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import torch
 
-from patchproof.channel.printer import Printer, load_printer
+from patchproof.channel.printer import IN_GAMUT, Printer, load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.optimize.goals import printable_colors
 from patchproof.optimize.patch import Patch
 from patchproof.optimize.texture import Texture
 from patchproof.render.photograph import Shown
@@ -75,12 +76,17 @@ def set_problem(scene: Scene, device: str = "cpu", models: tuple[str, ...] | Non
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
+    if settings.optimize.in_gamut and not printer.holds_gray:
+        got = f"{printer.name}, which does not even show middle gray so"
+        do = "leave optimize.in_gamut out: pictures are made through the printer's table anyway"
+        raise Refused(f"a printer that shows colors as they are sent within ΔE00 {IN_GAMUT:g}", got, do)
     stage = set_stage(scene, device)
     if scene.piece is None:
         subject = Texture(scene, stage.device)
     else:
         network_px = max(classifier.input_px for classifier in classifiers)
-        subject = Patch(scene, printer, scene.design_px(network_px), stage.device)
+        printable = printable_colors(printer).to(stage.device) if settings.optimize.nps else None
+        subject = Patch(scene, printer, scene.design_px(network_px), stage.device, printable)
     return Problem(scene, stage, printer, classifiers, indices, subject)
 
 

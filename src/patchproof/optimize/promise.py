@@ -151,7 +151,7 @@ def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionCl
 
 def _contrasts(problem: Problem, conditions: Conditions) -> np.ndarray:
     """Paper white minus printed black in the photograph's linear light."""
-    exposed = problem.scene.white_light(conditions) * 2**conditions.exposure_ev
+    exposed = problem.scene.white_light(conditions) * conditions.paper[:, 1] * 2**conditions.exposure_ev
     black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
     return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,11 +24,11 @@ from patchproof.channel.camera import (
     noisy,
 )
 from patchproof.channel.lens import distorted
-from patchproof.channel.printer import vary
+from patchproof.channel.printer import misregistered, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, light_texels
-from patchproof.render.texture import look_up, texel_table
+from patchproof.render.texture import Footprint, look_up, on_copies, texel_table
 from patchproof.render.views import Seen, see
 from patchproof.scene.conditions import Conditions
 
@@ -112,13 +113,30 @@ def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: 
 
 def _piece_light(seen: Seen, picture: PiecePicture) -> Tensor:
     """The light P×3 that the piece's pixels send to the camera."""
-    texels = picture.srgb if seen.reduced else linear_from_srgb(picture.srgb)
-    reflectance = look_up(seen.piece.texels, texel_table([texels], wrap=False))
+    drawn, view = seen.conditions, seen.piece.view
+    footprints, srgb = seen.piece.texels, [picture.srgb]
+    if drawn.misregistration_mm.any():
+        footprints, srgb = _misregistered(seen, picture)
+    table = torch.cat([texel_table([one if seen.reduced else linear_from_srgb(one)], wrap=False) for one in srgb])
+    reflectance = look_up(footprints, table)
     if seen.reduced:
         reflectance = linear_from_srgb(reflectance)
-    draws = torch.as_tensor(seen.conditions.print_draw).to(reflectance)
-    light = vary(reflectance, draws.index_select(0, seen.piece.view)) * seen.piece_white
+    change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
+    paper = torch.as_tensor(drawn.paper).to(reflectance)
+    light = vary(reflectance, change.index_select(0, view)) * paper.index_select(0, view) * seen.piece_white
     return light if seen.piece_gloss is None else light + seen.piece_gloss
+
+
+def _misregistered(seen: Seen, picture: PiecePicture) -> tuple[Footprint, list[Tensor]]:
+    """Each view's own print of the picture, and footprints on all of them."""
+    x0, y0, x1, y1 = picture.box_px
+    width_mm, height_mm = seen.stage.piece.size_mm
+    shifts = torch.as_tensor(seen.conditions.misregistration_mm).to(picture.srgb)
+    shifts = shifts * shifts.new_tensor([(x1 - x0) / width_mm, (y1 - y0) / height_mm])
+    prints = [misregistered(picture.srgb, shift) for shift in shifts]
+    height, width = picture.srgb.shape[:2]
+    texels = sum((max(width >> k, 1) + 1) * (max(height >> k, 1) + 1) for k in range(max(width, height).bit_length()))
+    return on_copies(seen.piece.texels, seen.piece.view * texels), prints
 
 
 def _pasted(seen: Seen, image: Tensor, light: Tensor) -> Tensor:

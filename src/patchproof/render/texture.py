@@ -13,7 +13,7 @@ out on purpose: weights other than the pixel's own square.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -148,6 +148,15 @@ def joined(parts: list[tuple[Tensor, Footprint]], fragments: int) -> Footprint:
         for group in part.groups
     )
     return Footprint(tuple(groups), fragments)
+
+
+def on_copies(seen: Footprint, offset: Tensor) -> Footprint:
+    """The same footprints on copies of their textures that begin `offset` texels on, P of them."""
+    groups = []
+    for group in seen.groups:
+        own = offset if group.fragment is None else offset.index_select(0, group.fragment)
+        groups.append(replace(group, texel=group.texel + own[:, None]))
+    return Footprint(tuple(groups), seen.fragments)
 
 
 def _length(vectors: Tensor) -> Tensor:

@@ -152,7 +152,8 @@ def see(
 
     def drawn(surface: ObjectSurface | PieceSurface, samples: int) -> Fragments:
         fine = np.diag([samples, samples, 1]) @ matrix
-        cameras = _cameras(stage, poses, fine, (frame_px[0] * samples, frame_px[1] * samples))
+        own = poses if surface is stage.object else scene.camera_from_print(conditions)
+        cameras = _cameras(stage, own, fine, (frame_px[0] * samples, frame_px[1] * samples))
         return rasterize(surface.vertices, surface.faces, cameras, near_mm)
 
     fine = drawn(stage.object, supersample)

@@ -12,12 +12,14 @@ Source of EoT: Athalye et al., Synthesizing Robust Adversarial Examples, ICML 20
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
 
-from patchproof.settings import SceneSettings
+from patchproof.color import tinted_white
+from patchproof.settings import PrinterSettings, SceneSettings
 
 Stream = Literal["train", "select", "promise", "reprint", "evaluate"]
 _STREAMS = ("train", "select", "promise", "reprint", "evaluate")
@@ -49,7 +51,9 @@ class Conditions:
     blur_px: np.ndarray  # Gaussian sigma at the photograph's full size
     noise: np.ndarray  # standard deviation at white, in linear light, at full size
     jpeg: np.ndarray  # quality
-    print_draw: np.ndarray  # N×3 in [0, 1): print-to-print variation
+    dot_gain: np.ndarray  # these three as in `channel.printer.vary`
+    density: np.ndarray
+    black: np.ndarray
     noise_seed: np.ndarray  # int64
     point: np.ndarray  # a lamp's light on the patch's middle where it faces the lamp
     point_azimuth_deg: np.ndarray
@@ -62,6 +66,9 @@ class Conditions:
     motion_px: np.ndarray  # length at the photograph's full size
     motion_deg: np.ndarray  # in [0, 180), counter-clockwise from the picture's x
     vignetting: np.ndarray  # share of the light lost in the photograph's corners
+    paper: np.ndarray  # N×3 light of bare paper, beside the sheet that the light is measured by
+    misregistration_mm: np.ndarray  # N×2×2: how far the planes of red and blue are moved on paper, right and down
+    printed_scale: np.ndarray  # the piece's size over the sheet's own
 
     def __len__(self) -> int:
         return len(self.azimuth_deg)
@@ -71,8 +78,10 @@ class Conditions:
         return replace(self, **{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
-_POSES = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background")
+_POSES = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background", "printed_scale")
 _DIMENSIONS = 43
+# What prints may do beyond varying has draws of its own, independent in every stream: scenes without it keep theirs.
+_PRINT_DIMENSIONS = 6
 # Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
 _NORMAL_MARGIN = 1e-3
 
@@ -81,7 +90,9 @@ def draw(settings: SceneSettings, stream: Stream, n: int, seed: int, start: int 
     """Draws `start` to `start + n` of a stream."""
     number = _STREAMS.index(stream)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, number])))
-    return _from_unit(settings, _unit(stream, rng, start + n)[start:], seed * len(_STREAMS) + number, start)
+    print_rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, number, 1])))
+    u = np.concatenate([_unit(stream, rng, start + n), print_rng.random((start + n, _PRINT_DIMENSIONS))], 1)
+    return _from_unit(settings, u[start:], seed * len(_STREAMS) + number, start)
 
 
 def with_poses_of(conditions: Conditions, poses: Conditions) -> Conditions:
@@ -122,15 +133,29 @@ def _from_unit(settings: SceneSettings, u: np.ndarray, salt: int, start: int) ->
     gains = np.exp(np.stack([red, np.zeros_like(red), blue], 1))
     blur, noise = within(camera.blur_px), within(camera.noise)
     jpeg = np.round(within(camera.jpeg)).astype(np.int64)
-    printed = np.stack([next(column) for _ in range(3)], 1)
+    printed = [within(r) for r in (settings.printer.dot_gain, settings.printer.density, settings.printer.black)]
     # each view's noise is its own, whatever batch it is rendered in
     noise_seed = (salt * 1_000_003 + start + np.arange(len(u))).astype(np.int64)
     point = [within(r) for r in (light.point, LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, light.point_distance_mm)]
     uneven = [within(light.sh2), _normal(np.stack([next(column) for _ in range(8)], 1))]
     gloss = [within(light.gloss), within(light.shininess)]
     motion = [within(camera.motion_px), within((0.0, 180.0))]
-    everyday = (*pose, offset, *lights, background, exposure, gains, blur, noise, jpeg, printed, noise_seed)
-    return Conditions(*everyday, *point, *uneven, *gloss, *motion, within(camera.vignetting))
+    everyday = (*pose, offset, *lights, background, exposure, gains, blur, noise, jpeg, *printed, noise_seed)
+    rest = within(camera.vignetting), *_printed(settings.printer, column)
+    return Conditions(*everyday, *point, *uneven, *gloss, *motion, *rest)
+
+
+def _printed(printer: PrinterSettings, column: Iterator[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Paper, misregistration in any direction, and scale."""
+
+    def within(low_high) -> np.ndarray:
+        low, high = low_high
+        return low + (high - low) * next(column)
+
+    paper = tinted_white(within(printer.paper_white), within(printer.paper_b))
+    shift, directions = within(printer.misregistration_mm), np.stack([next(column), next(column)], 1) * 2 * np.pi
+    moved = shift[:, None, None] * np.stack([np.cos(directions), np.sin(directions)], -1)
+    return paper, moved, within(printer.scale)
 
 
 def _normal(u: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from patchproof.geometry import local_scale
+from patchproof.geometry import local_scale, scaled_about
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import Refused, SceneSettings
@@ -117,6 +117,12 @@ def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.n
     if size_px[0] == size_px[1]:
         return photo_from(photo_px, size_px)
     return np.diag([size_px[0] / photo_px[0], size_px[1] / photo_px[1], 1.0])
+
+
+def prints(piece: Piece, conditions: Conditions) -> np.ndarray:
+    """N×3×3 from the sheet's millimetres to those of a print of another size about the same middle."""
+    middle = np.array(piece.size_mm) / 2
+    return np.stack([scaled_about(middle, scale) for scale in conditions.printed_scale])
 
 
 def turned(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:

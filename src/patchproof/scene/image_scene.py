@@ -94,7 +94,7 @@ class ImageScene:
             room = side - _extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * room
             matrices.append(to_size @ flat.turned(roll, scale, middle - piece_mm / 2, piece_mm / 2))
-        return np.stack(matrices)
+        return np.stack(matrices) @ flat.prints(self.piece, conditions)
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×H×W×3 uint8 sRGB: the images, some with a box of random values."""

@@ -62,6 +62,13 @@ class MeshScene:
         """N×4×4 poses of the drawn cameras."""
         return camera_poses(self.settings, self.mesh, self.frame, self.middle_mm, conditions)
 
+    def camera_from_print(self, conditions: Conditions) -> np.ndarray:
+        """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as large as it was
+        printed: all about the piece's middle is scaled, which keeps a card in its plane.
+        """
+        scales = [geometry.scaled_about(self.middle_mm, scale) for scale in conditions.printed_scale]
+        return self.camera_from_world(conditions) @ np.stack(scales)
+
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
         """3×3 pinhole matrix of the scene's camera for a picture of this size."""
         if self.camera is not None:
@@ -71,7 +78,7 @@ class MeshScene:
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimetres to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
         matrix, plane = self.matrix_px(size_px), self.placement.world_from_piece
-        return np.stack([geometry.plane_homography(matrix, pose, plane) for pose in self.camera_from_world(conditions)])
+        return np.stack([geometry.plane_homography(matrix, pose, plane) for pose in self.camera_from_print(conditions)])
 
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
         """N angles of the camera to the right of the piece's middle, beyond 90 where its face is turned away."""

@@ -83,9 +83,9 @@ class PhotoScene:
         """N×3×3 from piece millimetres to pixels."""
         to_size = flat.size_from_photo(self.photo_px, size_px)
         matrices = self._view_from_photo(conditions)
-        return np.stack(
-            [to_size @ m @ p.photo_from_piece for m, p in zip(matrices, self._chosen(conditions), strict=True)]
-        )
+        printed = flat.prints(self.piece, conditions)
+        both = zip(matrices, self._chosen(conditions), printed, strict=True)
+        return np.stack([to_size @ matrix @ photo.photo_from_piece @ scale for matrix, photo, scale in both])
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×H×W×3 uint8 sRGB: the photographs, turned, zoomed and shifted, with the blank sheet still on them."""

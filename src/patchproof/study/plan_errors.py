@@ -192,6 +192,7 @@ class Album:
             for setup in (self.base, *setups):
                 conditions = setup.conditions[rows]
                 same = setup.stage is self.base.stage and setup.supersample == self.base.supersample
+                same = same and (conditions.printed_scale == base.conditions.printed_scale).all()
                 seen = relit(base, conditions) if same else self._seen(setup, conditions)
                 parts.append(self._pictures(seen, setup))
             stack.append(torch.stack(parts))

@@ -61,7 +61,12 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
     if scene.piece is not None:
         terms += (
             Term("printer's colors", "printer.profile", partial(_without_printer, problem, design)),
-            Term("print variation", "", partial(_set, name="print_draw", value=0.5)),
+            Term("dot gain", "printer.dot_gain", partial(_set, name="dot_gain")),
+            Term("ink density", "printer.density", partial(_set, name="density")),
+            Term("printed black", "printer.black", partial(_set, name="black")),
+            Term("paper white", "printer.paper_white", partial(_set, name="paper", value=1.0)),
+            Term("misregistration", "printer.misregistration_mm", partial(_set, name="misregistration_mm")),
+            Term("print scale", "printer.scale", partial(_set, name="printed_scale", value=1.0)),
         )
     terms += _camera_terms()
     if isinstance(scene, MeshScene):

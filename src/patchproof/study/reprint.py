@@ -198,7 +198,7 @@ def save_photo(picture: torch.Tensor, scene: Scene, quality: int, path: Path) ->
 def _truth(scene: Scene, manifest: Manifest | None, conditions: Conditions, print_scale) -> dict:
     """Where the page's millimetres fall in this photograph, and what it was taken under."""
     drawn = {field.name: np.asarray(getattr(conditions, field.name)[0]).tolist() for field in fields(conditions)}
-    drawn["print_scale"] = list(print_scale)
+    drawn["print_scale"] = [scale * float(conditions.printed_scale[0]) for scale in print_scale]
     if manifest is None:
         return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
     surface, homography = surface_of(manifest), _homography(scene, manifest, conditions)
@@ -230,7 +230,7 @@ def _seen_at(scene: Scene, manifest: Manifest, conditions: Conditions, page_mm: 
     homography, photo_px = _homography(scene, manifest, conditions), scene.settings.camera.photo_px
     if homography is not None:
         return geometry.apply_homography(homography, page_mm)
-    pose, world = scene.camera_from_world(conditions)[0], scene.placement.world(page_mm - manifest.cut_mm[:2])
+    pose, world = scene.camera_from_print(conditions)[0], scene.placement.world(page_mm - manifest.cut_mm[:2])
     image = (world @ pose[:3, :3].T + pose[:3, 3]) @ scene.matrix_px(photo_px).T
     points = image[:, :2] / image[:, 2:]
     return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
