@@ -13,8 +13,10 @@ Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 CONFIDENCE = 0.95
+LEAST_CLUSTERS = 5
 
 
 def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -70,6 +72,24 @@ def independent_difference(
     difference = rate_a - rate_b
     low = difference - math.hypot(rate_a - low_a, high_b - rate_b)
     return difference, (low, difference + math.hypot(high_a - rate_a, rate_b - low_b))
+
+
+def clustered_mean(
+    values: Sequence[float], confidence: float = CONFIDENCE, draws: int = 10_000
+) -> tuple[float, tuple[float, float]]:
+    """Mean of one figure per cluster with a percentile bootstrap over clusters: what is alike within a cluster (seeds
+    and conditions of one object before one network) is not evidence of its own. The same values give the same
+    interval. Needs LEAST_CLUSTERS: of fewer it would claim far too much (of one, certainty), and of ten it covers
+    about nine times in ten.
+    """
+    import numpy as np
+
+    if len(values) < LEAST_CLUSTERS:
+        raise ValueError(f"expected at least {LEAST_CLUSTERS} clusters, got {len(values)}")
+    values = np.asarray(values, float)
+    picked = np.random.Generator(np.random.PCG64(0)).integers(0, len(values), (draws, len(values)))
+    low, high = np.quantile(values[picked].mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(values.mean()), (float(low), float(high))
 
 
 def mcnemar_p(a: list[bool], b: list[bool]) -> float:

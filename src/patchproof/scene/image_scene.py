@@ -158,6 +158,21 @@ def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> 
     return _shares(settings, conditions) * min(settings.camera.photo_px) / max(piece.design_rect_mm[2:])
 
 
+def labels_of(folder: Path, table: Path) -> list[str]:
+    """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
+    found = list(dict.fromkeys(label for name, label in _rows(table) if (folder / name).is_file()))
+    if not found:
+        raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
+    return found
+
+
+def largest_share(design_mm: tuple[float, float], roll_deg: tuple[float, float]) -> float:
+    """The largest `view.patch_share` at which the piece, with its smallest frame, fits into the square at all angles
+    (in whole thousandths).
+    """
+    return int(1000 * max(design_mm) / _least_mm(design_mm) / _widest(roll_deg)) / 1000
+
+
 def erase(picture: np.ndarray, seed: int) -> None:
     """Random Erasing of a uint8 H×W×3 picture in place: a box of its centered square takes random values, the same box
     and values at every size, and in photograph and square.
@@ -244,8 +259,8 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
         raise Refused("view.patch_share above 0", f"{low:g}", "give a share that can be seen")
     design_mm = (patch.width_mm, patch.height_mm)
     # a square of this side fits into the picture at every drawn size and angle
-    fits_mm = max(design_mm) / high / max(_extent(np.ones(2), roll)[0] for roll in np.linspace(*settings.view.roll_deg))
-    least_mm = max(design_mm) + 2 * frame_mm(SMALLEST_MARKER_MM)
+    fits_mm = max(design_mm) / high / _widest(settings.view.roll_deg)
+    least_mm = _least_mm(design_mm)
     if least_mm > fits_mm:
         raise Refused(
             "a piece that fits into the picture's centered square at the largest view.patch_share",
@@ -257,6 +272,15 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
     needed_mm = min(needed_mm, _LARGEST_MARKER * max(design_mm))
     largest_mm = tuple(min(side, fits_mm) for side in largest_piece_mm(load_template(settings.sheet.template)))
     return lay_out_piece(design_mm, marker_size_mm(needed_mm, design_mm, largest_mm), identity, "design")
+
+
+def _least_mm(design_mm: tuple[float, float]) -> float:
+    return max(design_mm) + 2 * frame_mm(SMALLEST_MARKER_MM)
+
+
+def _widest(roll_deg: tuple[float, float]) -> float:
+    """How wide a square of side 1 gets when it is turned."""
+    return max(_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))
 
 
 def _shares(settings: SceneSettings, conditions: Conditions) -> np.ndarray:

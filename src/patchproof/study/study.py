@@ -29,7 +29,11 @@ from patchproof.settings import Refused, Strict, nearest, read_toml, validated
 from patchproof.workers import Workers, one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is, imported when asked for
-STUDIES: dict[str, str] = {"gamut": "patchproof.study.gamut"}
+STUDIES: dict[str, str] = {
+    "gamut": "patchproof.study.gamut",
+    "patch2d": "patchproof.study.patch2d",
+    "patch3d": "patchproof.study.patch3d",
+}
 _LIBRARIES = ("patchproof", "torch", "numpy")
 _NAME = re.compile(r"[\w=+.,-]{1,120}")
 
