@@ -143,6 +143,8 @@ def evaluate(
     n: Annotated[int, typer.Option(min=1, help="Fresh conditions.")] = 400,
     seed: Seed = None,
     device: Device = "cpu",
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers."""
     from patchproof.optimize.evaluate import evaluate_run
@@ -155,6 +157,8 @@ def evaluate(
             n=n,
             seed=seed,
             device=device,
+            jobs=jobs,
+            cluster=cluster,
             on_view=lambda done, total: bar("evaluate", done, total),
         )
     _say(*evaluation_lines(result), f"written: {run / 'evaluate.json'}")
@@ -213,6 +217,8 @@ def reprint(
     card: Annotated[
         bool, typer.Option("--card", help="Photograph the uncut page with a bank card on it instead.")
     ] = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
@@ -253,6 +259,8 @@ def reprint(
                 printer=printer,
                 print_scale=scale,
                 control=control.value if control else None,
+                jobs=jobs,
+                cluster=cluster,
                 overwrite=overwrite,
                 on_photo=lambda done, total: bar("photograph", done, total),
             )
