@@ -5,9 +5,9 @@ each within ε of its original in every pixel after rounding. The step runs down
 printed, the paper's Θ + α∇L would go up it), through the same centered square that classifiers see; what lies outside
 of the square stays as it is. The loss of several networks is their mean.
 
-    pgd    x ← Π(x - α sign ∇L), α = ε/4, or 1/255 without ε
+    pgd    x ← Π(x - α sign ∇L), α = ε/4
     fgsm   the same with α = ε/steps: iterated FGSM, which ends where FGSM would if the gradient stayed
-    adam   Adam on the pixels, then Π
+    adam   Adam on the pixels at rate ε/4, then Π
 
 Gradients are scaled per photograph (attacks.steering), so that steps go on where a float32 softmax is saturated. Π
 keeps the ε-ball (none where it is unbounded) and [0, 1].
@@ -30,8 +30,9 @@ from patchproof.classifier.view import center_square
 from patchproof.optimize.attacks import Loss, cross_entropy, steering
 
 Method = Literal["pgd", "fgsm", "adam"]
-UNBOUNDED_STEP = 1 / 255  # one code value, the smallest that survives a PNG by itself
-ADAM_RATE = 0.01
+# Without ε. On ten photographs and a MobileNetV1 0.25, 50 to 100 steps, PGD of 0.01 (20 steps) left of them: with sign
+# steps of 1/255 none, of 0.03 three, of 0.1 none (they no longer settle); with Adam at 0.1 eight to nine.
+UNBOUNDED_STEP, UNBOUNDED_RATE = 0.03, 0.1
 
 
 def harden(
@@ -51,8 +52,8 @@ def harden(
     start = [_tensor(photo) for photo in photos]
     truth = [torch.tensor(one) for one in labels]
     pixels = [one.clone().requires_grad_(True) for one in start]
-    adam = torch.optim.Adam(pixels, lr=step_size or ADAM_RATE) if method == "adam" else None
     step = step_size or _step(method, epsilon, steps)
+    adam = torch.optim.Adam(pixels, lr=step) if method == "adam" else None
     for _ in range(steps):
         gradients = torch.autograd.grad(_steering(pixels, truth, classifiers, loss), pixels)
         with torch.no_grad():
@@ -90,7 +91,7 @@ def _steering(
 
 def _step(method: Method, epsilon: float | None, steps: int) -> float:
     if epsilon is None:
-        return UNBOUNDED_STEP
+        return UNBOUNDED_RATE if method == "adam" else UNBOUNDED_STEP
     return epsilon / steps if method == "fgsm" else epsilon / 4
 
 
