@@ -192,8 +192,8 @@ def figures(settings: HardenSettings, results: Sequence[Result]) -> list[Drawing
             for axes, attack in zip(panels, settings.attacks, strict=True):
                 _draw_panel(axes, settings, results, name, attack)
         grid[0, 0].legend(frameon=False, fontsize=7)
-        figure.supxlabel("ε of the attack")
-        figure.supylabel("share recognized")
+        figure.supxlabel("ε of the attack", fontsize=9)
+        figure.supylabel("share recognized", fontsize=9)
 
     if not settings.attacks or not settings.attack_epsilons:
         return []
@@ -368,7 +368,8 @@ def _accuracy_rows(settings, results, variant, photos, name: str) -> list[tuple]
         ]
         words = CLEAN if condition[0] == CLEAN else _condition(*condition)
         row = (words, rate(old), rate(new), difference(new, old), ", ".join(flagged))
-        rows.append((_short(name), *_words(variant), *row))
+        group, *how = _words(variant)
+        rows.append((_short(name), "itself" if variant["models"] == [name] else group, *how, *row))
     return rows if files else []
 
 
