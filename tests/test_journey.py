@@ -193,6 +193,18 @@ def test_evaluate_writes_fresh_rates(journey):
     assert result["n"] == 40 and set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "grey", "noise"}
 
 
+def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):
+    pdf, run = journey / "sheet.pdf", journey / "run"
+    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--out", tmp_path / "photos", "--jobs", 2) == 0
+    for path in (journey / "photos").iterdir():
+        assert (tmp_path / "photos" / path.name).read_bytes() == path.read_bytes()
+    written = []
+    for jobs in (1, 2):
+        assert command("evaluate", run, "--n", 20, "--jobs", jobs) == 0
+        written.append((run / "evaluate.json").read_bytes())
+    assert written[0] == written[1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

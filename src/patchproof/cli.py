@@ -55,6 +55,14 @@ class Shown(str, Enum):
     noise = "noise"
 
 
+class Hardening(str, Enum):
+    """Ways to step towards the true class."""
+
+    pgd = "pgd"
+    fgsm = "fgsm"
+    adam = "adam"
+
+
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, typer.Option(help="cpu or cuda.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
@@ -135,6 +143,8 @@ def evaluate(
     n: Annotated[int, typer.Option(min=1, help="Fresh conditions.")] = 400,
     seed: Seed = None,
     device: Device = "cpu",
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers."""
     from patchproof.optimize.evaluate import evaluate_run
@@ -147,6 +157,8 @@ def evaluate(
             n=n,
             seed=seed,
             device=device,
+            jobs=jobs,
+            cluster=cluster,
             on_view=lambda done, total: bar("evaluate", done, total),
         )
     _say(*evaluation_lines(result), f"written: {run / 'evaluate.json'}")
@@ -205,6 +217,8 @@ def reprint(
     card: Annotated[
         bool, typer.Option("--card", help="Photograph the uncut page with a bank card on it instead.")
     ] = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
@@ -245,6 +259,8 @@ def reprint(
                 printer=printer,
                 print_scale=scale,
                 control=control.value if control else None,
+                jobs=jobs,
+                cluster=cluster,
                 overwrite=overwrite,
                 on_photo=lambda done, total: bar("photograph", done, total),
             )
@@ -353,6 +369,56 @@ def calibrate_camera_(
     with _progress() as bar:
         found = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
     _say(*calibration_lines(found), f"camera: {out}")
+
+
+@app.command()
+def harden(
+    images: Annotated[Path, typer.Argument(help="A folder of images.")],
+    labels: Annotated[Path, typer.Option(help="CSV: file name, label.")],
+    model: Annotated[str, typer.Option(help="Comma-separated classifiers to harden for, all together.")],
+    out: Annotated[Path, typer.Option(help="Folder for the PNGs and the tables.")],
+    method: Annotated[Hardening, typer.Option(help="How to step.")] = Hardening.pgd,
+    eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
+    steps: Annotated[int, typer.Option(min=1, help="Steps.")] = 100,
+    step_size: Annotated[float | None, typer.Option(help="In place of the method's own.")] = None,
+    judges: Annotated[str | None, typer.Option(help="Comma-separated classifiers that only judge.")] = None,
+    evaluate: Annotated[str, typer.Option(help="Attacks to withstand: fgsm, pgd.")] = "",
+    attack_eps: Annotated[str, typer.Option(help="Their ε.")] = "0.01,0.02,0.04",
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """Change labeled images so that classifiers recognize them better, and attack them."""
+    from patchproof.settings import validated
+    from patchproof.study.harden import HardenSettings, harden_images
+
+    given = {
+        "images": str(images),
+        "labels": str(labels),
+        "models": _names(model),
+        "together": True,
+        "judges": _names(judges) or (),
+        "methods": (method.value,),
+        "epsilons": (eps,),
+        "steps": steps,
+        "step_size": step_size,
+        "attacks": _names(evaluate),
+        "attack_epsilons": _names(attack_eps),
+    }
+    with _progress() as bar:
+        finished = harden_images(
+            validated(HardenSettings, given, "the options"),
+            out,
+            resume=resume,
+            overwrite=overwrite,
+            jobs=jobs,
+            cluster=cluster,
+            on_cell=lambda done, total: bar("harden", done, total),
+        )
+    _say_study(finished)
+    _say(f"images: {out}, tables: {out / 'harden.html'}")
+    raise typer.Exit(0 if finished.results else 1)
 
 
 @app.command()

@@ -202,7 +202,7 @@ def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     """The files whose label is the target's, in an order that depends on nothing but their names."""
     folder, table = (Path(expand(text, base)) for text in (settings.object.images, settings.object.labels))
-    rows = _rows(table)
+    rows = label_rows(table)
     target = settings.target
     wanted = {str(label).strip().casefold() for label in (target.label, *target.accept)}
     names = [name for name, label in rows if wanted & {label, *(part.strip() for part in label.split(","))}]
@@ -223,7 +223,7 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     return [folder / name for name in sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).digest())]
 
 
-def _rows(table: Path) -> list[tuple[str, str]]:
+def label_rows(table: Path) -> list[tuple[str, str]]:
     """(file name, label in small letters) of each line; commas after the first belong to the label."""
     if not table.is_file():
         raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,8 +24,8 @@ from PIL import Image
 from patchproof import geometry
 from patchproof.channel import lens
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.optimize.run import Run
-from patchproof.output import new_folder
+from patchproof.optimize.run import Run, load_run
+from patchproof.output import make_folder, new_folder
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
@@ -35,6 +37,7 @@ from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.study.sheet import sheet_of
 from patchproof.verify.surface import surface_of
+from patchproof.workers import open_workers, result_of
 
 # The print is rasterized this much finer than the closest view can see. Rasterizers of pages average code values: fine
 # patterns of strong colors came out 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
@@ -56,6 +59,8 @@ def reprint(
     print_scale: tuple[float, float] = (1.0, 1.0),
     control: str | None = None,
     overwrite: bool = False,
+    jobs: int = 1,
+    cluster: str | None = None,
     on_photo: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict:
     """Write n photographs and truth.json into the folder `out`; returns the truth.
@@ -63,7 +68,9 @@ def reprint(
     `control` hangs up that control's own sheet (mean, grey, noise) in place of the PDF's, or nothing (bare).
     """
     if control not in (None, "bare"):
-        with TemporaryDirectory() as folder:
+        # beside the photographs, where other machines may look, too
+        make_folder(Path(out).resolve().parent)
+        with TemporaryDirectory(dir=Path(out).resolve().parent, prefix=".control.") as folder:
             control_pdf = Path(folder) / "control.pdf"
             template = sheet_scene(pdf_path, run)[1].settings.sheet.template
             sheet_of(run, control_pdf, template=template, control=control)
@@ -76,21 +83,64 @@ def reprint(
                 printer=printer,
                 print_scale=print_scale,
                 overwrite=overwrite,
+                jobs=jobs,
+                cluster=cluster,
                 on_photo=on_photo,
             )
     bare = control == "bare"
     manifest, scene = sheet_scene(pdf_path, run)
     scene = scaled_print(scene, print_scale)
-    piece = None if bare else printed_piece(pdf_path, manifest, scene, printer_of(run, printer))
-    stage, conditions, truth = set_stage(scene), scene.draw("reprint", n, seed), {}
-    with new_folder(out, OWN, overwrite) as folder:
-        for i in range(n):
-            one, name = conditions[i : i + 1], f"photo_{i + 1:04d}.jpg"
-            take_photo(stage, piece, one, folder / name)
-            truth[name] = _truth(scene, None if bare else manifest, one, print_scale)
-            on_photo(i + 1, n)
+    conditions, truth = scene.draw("reprint", n, seed), {}
+    if jobs == 1 and cluster is None:
+        piece = None if bare else printed_piece(pdf_path, manifest, scene, printer_of(run, printer))
+        take = partial(_take, set_stage(scene), piece)
+    else:
+        take = partial(_take_there, _Hung(Path(pdf_path).resolve(), run.folder.resolve(), printer, print_scale, bare))
+    with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
+        each = [conditions[i : i + 1] for i in range(n)]
+        done = 0
+        for i, photo in workers.completed(take, each):
+            (folder / _photo_name(i)).write_bytes(result_of(photo))
+            done += 1
+            on_photo(done, n)
+        for i, one in enumerate(each):
+            truth[_photo_name(i)] = _truth(scene, None if bare else manifest, one, print_scale)
         write_json(folder / "truth.json", truth)
     return truth
+
+
+@dataclass(frozen=True)
+class _Hung:
+    """All that another process needs to set the stage for itself."""
+
+    pdf: Path
+    run_folder: Path
+    printer: str | None
+    print_scale: tuple[float, float]
+    bare: bool
+
+
+@lru_cache(maxsize=1)
+def _hung_up(hung: _Hung) -> tuple[Stage, PiecePicture | None]:
+    run = load_run(hung.run_folder)
+    manifest, scene = sheet_scene(hung.pdf, run)
+    scene = scaled_print(scene, hung.print_scale)
+    piece = None if hung.bare else printed_piece(hung.pdf, manifest, scene, printer_of(run, hung.printer))
+    return set_stage(scene), piece
+
+
+def _take_there(hung: _Hung, conditions: Conditions) -> bytes:
+    return _take(*_hung_up(hung), conditions)
+
+
+def _take(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
+    buffer = BytesIO()
+    take_photo(stage, piece, conditions, buffer)
+    return buffer.getvalue()
+
+
+def _photo_name(i: int) -> str:
+    return f"photo_{i + 1:04d}.jpg"
 
 
 def scan(
@@ -177,7 +227,7 @@ def scaled_print(scene: Scene, print_scale: tuple[float, float]) -> Scene:
     return replace(scene, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
 
 
-def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions, path: Path) -> None:
+def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions, path: Path | BytesIO) -> None:
     """One photograph as a JPEG file of the drawn quality with the camera's focal length in its EXIF data."""
     photo_px = stage.scene.settings.camera.photo_px
     with torch.no_grad():

@@ -31,6 +31,7 @@ from patchproof.workers import Workers, one_thread, open_workers, result_of
 # by name the module whose STUDY it is, imported when asked for
 STUDIES: dict[str, str] = {
     "gamut": "patchproof.study.gamut",
+    "harden": "patchproof.study.harden",
     "patch2d": "patchproof.study.patch2d",
     "patch3d": "patchproof.study.patch3d",
 }
