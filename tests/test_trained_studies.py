@@ -102,7 +102,7 @@ def test_a_design_that_did_not_move_gains_exactly_nothing(tmp_path):
     config = written(tmp_path, "carton", f'networks = ["builtin"]\nn = 8\nlights = 1\n{ways}')
     finished = run_study("transfer", config, tmp_path / "out")
     original, still = table(finished, "matrix")
-    assert still["way"] == "still" and still["gain in rate"].value == 0 and still["rate shows"] == "none shown"
+    assert still["way"] == "still" and still["gain in rate"].value == 0 and still["shows"] == "none shown"
     assert still["gain in confidence"] == Estimate(0, 0, 0, 8)
     assert original["confidence"] == still["confidence"]
     names = {path.name for path in (tmp_path / "out").rglob("*.*")}

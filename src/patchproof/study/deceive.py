@@ -40,7 +40,7 @@ from patchproof.study.trained import (
     train,
     trained_on,
 )
-from patchproof.study.turntable import contact_sheet, from_sides, pictures
+from patchproof.study.turntable import contact_sheet, pictures, sides
 
 CONTROLS = ("bare", "grey", "noise", "shuffled")
 _SHEET_PX, _SHEET_VIEWS = 160, 4
@@ -75,9 +75,7 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     things = shown_with_controls(problem, design, CONTROLS)
     found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))
     sheet = f"{cell.name}.sheet.png"
-    low, high = problem.scene.settings.view.azimuth_deg
-    sides = from_sides(problem, low + (high - low) * (np.arange(_SHEET_VIEWS) + 0.5) / _SHEET_VIEWS)
-    rows = [pictures(problem, one, sides, _SHEET_PX) for one in things.values()]
+    rows = [pictures(problem, one, sides(problem, _SHEET_VIEWS), _SHEET_PX) for one in things.values()]
     return {
         **found,
         "sheet": sheet,

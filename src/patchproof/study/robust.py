@@ -45,11 +45,11 @@ from patchproof.study.trained import (
 from patchproof.study.turntable import (
     attributions,
     contact_sheet,
-    from_sides,
     goal_log,
     heat,
     mean_color,
     pictures,
+    sides,
     turn,
 )
 
@@ -84,9 +84,8 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     design = train(training)
     things = {"start": subject.shown(subject.start()), "design": subject.shown(from_pixels(design, problem.device))}
     found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))
-    low, high = problem.scene.settings.view.azimuth_deg
-    sides = from_sides(problem, low + (high - low) * (np.arange(_SIDES) + 0.5) / _SIDES)
-    before, after = (pictures(problem, one, sides, training.training_px) for one in things.values())
+    views = sides(problem, _SIDES)
+    before, after = (pictures(problem, one, views, training.training_px) for one in things.values())
     attributed = attributions(training, before, after)
     change = goal_log(training, after) - goal_log(training, before)
     files = {
@@ -117,7 +116,7 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
             level = design.level(network)
             rates.append((*key, short_name(network), begun.level(network)[0], *level, gain, verdict(gain)))
     start = ("scene", "way", "class", "trained on")
-    head = (*start, "tested on", "gray", "design", "confidence", "gain", "rate shows")
+    head = (*start, "tested on", "gray", "design", "confidence", "gain", "shows")
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
     about += left_out_note(settings, results)
     colors = [(*key, *_color_row(_mean_codes(of_key))) for key, of_key in _by_design(results).items()]

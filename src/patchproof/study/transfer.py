@@ -21,6 +21,7 @@ from pydantic import Field
 
 from patchproof.optimize.promise import judged, shown_with_controls
 from patchproof.report.tables import Drawing, Estimate, Table, rate
+from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import (
     ORIGINAL,
@@ -40,7 +41,7 @@ from patchproof.study.trained import (
     trained_on,
     verdict,
 )
-from patchproof.study.turntable import contact_sheet, from_sides, pictures, three_views
+from patchproof.study.turntable import contact_sheet, pictures, sides, three_views
 
 _ALL, _WITHOUT = "all", "without_"
 _SHEET_PX = 224
@@ -76,13 +77,12 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
         things = shown_with_controls(problem, design, ())
         files[f"{cell.name}.{'glb' if problem.scene.piece is None else 'png'}"] = object_file(problem, design)
     found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))
-    if hasattr(problem.scene, "mesh"):  # views are poses round a mesh
+    found["sheet"] = f"{cell.name}.sheet.png"
+    files[found["sheet"]] = contact_sheet([pictures(problem, things["design"], sides(problem, 3), _SHEET_PX)])
+    if isinstance(problem.scene, MeshScene):
         views = three_views(problem, settings.lights)
         found["views"] = said(judged(problem, things, views))["hits"]
-        found["azimuths"] = [float(angle) for angle in views.azimuth_deg[:: settings.lights]]
-        sides = from_sides(problem, np.array(found["azimuths"]))
-        found["sheet"] = f"{cell.name}.sheet.png"
-        files[found["sheet"]] = contact_sheet([pictures(problem, things["design"], sides, _SHEET_PX)])
+        found["azimuths"] = views.azimuth_deg[:: settings.lights].tolist()
     return found | files
 
 
@@ -98,12 +98,15 @@ def _matrix(settings: TransferSettings, results: Sequence[Result]) -> Table:
         for row, cells_of_row in by_row.items():
             told = Told(cells_of_row, "design")
             for network in tested_in(cells_of_row):
-                gains = (None, None) if row == ORIGINAL else told.gain(original, network)
-                seen = "" if row == ORIGINAL else "yes" if network in cells_of_row[0].cell.values["trained"] else "no"
-                says = "" if row == ORIGINAL else verdict(gains[0])
-                rows.append((scene, way, row, short_name(network), seen, *told.level(network), *gains, says))
-    head = ("scene", "way", "trained on", "tested on", "seen", "rate", "confidence")
-    head = (*head, "gain in rate", "gain in confidence", "rate shows")
+                (level, sure), (gain, surer) = told.level(network), told.gain(original, network)
+                trained = network in cells_of_row[0].cell.values["trained"]
+                start = (scene, way, row, short_name(network))
+                if row == ORIGINAL:
+                    rows.append((*start, "", level, None, "", sure, None))
+                else:
+                    rows.append((*start, "yes" if trained else "no", level, gain, verdict(gain), sure, surer))
+    head = ("scene", "way", "trained on", "tested on", "seen", "rate", "gain in rate", "shows")
+    head = (*head, "confidence", "gain in confidence")
     about = (
         f"Rates and mean confidences of the target over {settings.n} unseen conditions per seed"
         f" ({len(settings.seeds)} of them); gains are over the original on the same conditions, paired."
@@ -125,7 +128,7 @@ def _left_out(results: Sequence[Result]) -> list[Table]:
             single = _from_others(by_row, network)
             rows.append((scene, way, short_name(network), before, after, gain, confidence, single, verdict(gain)))
     head = ("scene", "way", "left out", "original", "ensemble of the others", "gain", "gain in confidence")
-    head = (*head, "mean rate of one other", "rate shows")
+    head = (*head, "mean rate of one other", "shows")
     about = "Each network judges a design that was trained on all others together; beside it, those trained on one."
     return [Table("left_out", "Networks left out", head, tuple(rows), about)] if rows else []
 
@@ -174,16 +177,15 @@ def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawi
                 "Rows: trained on. Columns: tested on. Below each rate, its gain over the original.",
             )
         )
-        if all("sheet" in cells_of_row[0].found for cells_of_row in by_row.values()):
-            found.append(
-                Drawing(
-                    f"sheet_{scene}_{way}",
-                    f"Designs: {scene}, {way}",
-                    lambda figure, by_row=by_row: _sheets(figure, by_row),
-                    (6.5, 1.75 * len(by_row)),
-                    "The three fixed views in even light; the first seed.",
-                )
+        found.append(
+            Drawing(
+                f"sheet_{scene}_{way}",
+                f"Designs: {scene}, {way}",
+                lambda figure, by_row=by_row: _sheets(figure, by_row),
+                (6.5, 1.75 * len(by_row)),
+                "Three views in even light; the first seed.",
             )
+        )
     return found
 
 

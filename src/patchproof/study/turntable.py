@@ -20,6 +20,7 @@ from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import Shown, expose, shade
 from patchproof.report.images import png
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
 
 _PATH_STEPS = 24  # of the integral; builtin's attributions then add up to within a few percent
 
@@ -46,13 +47,19 @@ def from_sides(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
     )
 
 
-def three_views(problem: Problem, lights: int) -> Conditions:
-    """Three fixed views (a sixth, a half and five sixths of the way through the scene's azimuths), each in `lights`
-    drawn lights, backgrounds and cameras; 3 · lights conditions, view by view.
-    """
+def sides(problem: Problem, count: int) -> Conditions:
+    """Views for a contact sheet: evenly through the scene's azimuths, or draws where there is no mesh to go round."""
+    if not isinstance(problem.scene, MeshScene):
+        return problem.scene.draw("evaluate", count)
     low, high = problem.scene.settings.view.azimuth_deg
-    azimuths = low + (high - low) * np.array([1, 3, 5]) / 6
-    poses = from_sides(problem, np.repeat(azimuths, lights))
+    return from_sides(problem, low + (high - low) * (np.arange(count) + 0.5) / count)
+
+
+def three_views(problem: Problem, lights: int) -> Conditions:
+    """Three fixed views round a mesh (see `sides`), each in `lights` drawn lights, backgrounds and cameras; 3 · lights
+    conditions, view by view.
+    """
+    poses = sides(problem, 3)[np.repeat(np.arange(3), lights)]
     drawn = problem.scene.draw("evaluate", 3 * lights)
     names = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset")
     return replace(drawn, **{name: getattr(poses, name) for name in names})
