@@ -19,3 +19,13 @@ class RedAgainstBlue(torch.nn.Module):
 
 def red_against_blue():
     return RedAgainstBlue()
+
+
+class BlueAgainstRed(RedAgainstBlue):
+    """The same picture read the other way round: what one calls red, this one calls blue."""
+
+    labels = ("blue", "red")
+
+
+def blue_against_red():
+    return BlueAgainstRed()

@@ -10,7 +10,7 @@ looked at once, after the design is frozen.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ from patchproof.claims import paired_difference, wilson
 from patchproof.color import linear_from_srgb
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import Problem
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.sheet.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
@@ -43,15 +43,32 @@ def try_out(
     problem: Problem, design: np.ndarray, conditions: Conditions, progress: Callable[[int], None] = lambda n: None
 ) -> Outcomes:
     """Show the design and its controls under every condition to every classifier."""
+    return judged(problem, shown_with_controls(problem, design, CONTROLS), conditions, progress)
+
+
+def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Shown]:
+    """What shows under "design" and under each control's name."""
     subject, device = problem.subject, problem.device
-    pixels = {"design": design} | {kind: subject.control(kind, design) for kind in CONTROLS if kind != "bare"}
+    pixels = {"design": design} | {kind: subject.control(kind, design) for kind in controls if kind != "bare"}
     with torch.no_grad():
         shown = {kind: subject.shown(from_pixels(one, device), kind) for kind, one in pixels.items()}
-        parts: dict[str, list] = {kind: [] for kind in ("design", *CONTROLS)}
+    return {kind: shown.get(kind) for kind in ("design", *controls)}
+
+
+def judged(
+    problem: Problem,
+    shown: Mapping[str, Shown],
+    conditions: Conditions,
+    progress: Callable[[int], None] = lambda n: None,
+) -> Outcomes:
+    """Show each thing (None is the bare object) under every condition to every classifier."""
+    first_shown = next((one for one in shown.values() if one is not None), None)
+    parts: dict[str, list] = {kind: [] for kind in shown}
+    with torch.no_grad():
         for first in range(0, len(conditions), CHUNK):
             part = conditions[first : first + CHUNK]
-            seen = problem.see(shown["design"], part, problem.figure_px)
-            for kind, one in (shown | {"bare": None}).items():
+            seen = problem.see(first_shown, part, problem.figure_px)
+            for kind, one in shown.items():
                 parts[kind].append(_judge(problem, expose(seen, one)))
             progress(len(part))
     joined = {kind: np.concatenate(part, -1) for kind, part in parts.items()}  # 2×M×N

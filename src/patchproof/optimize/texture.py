@@ -19,7 +19,7 @@ from torch import Tensor
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.render.photograph import ObjectTextures
 from patchproof.scene.mesh_scene import MeshScene
-from patchproof.sheet.piece import control_design
+from patchproof.sheet.piece import CELLS, control_design
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +60,29 @@ class Texture:
         return as_pixels(design)
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
-        """The same texels in one mean color, gray, or noise of 16 cells along each texture's shorter side."""
+        """The same texels in one mean color, gray, or noise of 16 cells along each texture's shorter side; or
+        "shuffled": the design's own, such cells in another order.
+        """
+        if kind == "shuffled":
+            return self._shuffled(pixels)
         if kind != "noise":
             return control_design(kind, pixels, self.scene.sheet_id)
         textures = [np.zeros((*mask.shape, 3), np.uint8) for mask in self.scene.canvas.mask]
         return self.texels([control_design(kind, texture, self.scene.sheet_id) for texture in textures])
+
+    def _shuffled(self, pixels: np.ndarray) -> np.ndarray:
+        """Each texture's texels moved cell by cell; cells that a mask cuts push the next ones along."""
+        rng = np.random.default_rng(int(self.scene.sheet_id, 36))
+        result, first = pixels.copy(), 0
+        for mask in self.scene.canvas.mask:
+            rows, columns = np.nonzero(mask)
+            cell = max(min(mask.shape) / CELLS, 1)
+            number = (rows / cell).astype(int) * mask.shape[1] + (columns / cell).astype(int)
+            place = rng.permutation(number.max(initial=0) + 1)[number]
+            part = result[0, first : first + len(rows)]
+            part[np.argsort(number, kind="stable")] = part[np.argsort(place, kind="stable")]
+            first += len(rows)
+        return result
 
     def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -67,6 +68,17 @@ def difference(a: list[bool], b: list[bool]) -> Estimate | None:
         return None
     value, (low, high) = paired_difference(a, b)
     return Estimate(value, low, high, len(a))
+
+
+def mean(values: list[float]) -> Estimate | None:
+    """The mean with Student's interval; None of fewer than two values."""
+    from scipy.stats import t as student
+
+    if len(values) < 2:
+        return None
+    value, error = statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(values))
+    half = float(student.ppf(0.975, len(values) - 1)) * error
+    return Estimate(value, value - half, value + half, len(values))
 
 
 def csv_text(table: Table) -> str:

@@ -30,10 +30,15 @@ from patchproof.workers import Workers, one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is, imported when asked for
 STUDIES: dict[str, str] = {
+STUDIES: dict[str, str] = {
+    "deceive": "patchproof.study.deceive",
     "gamut": "patchproof.study.gamut",
     "harden": "patchproof.study.harden",
     "patch2d": "patchproof.study.patch2d",
     "patch3d": "patchproof.study.patch3d",
+    "robust": "patchproof.study.robust",
+    "transfer": "patchproof.study.transfer",
+}
 }
 _LIBRARIES = ("patchproof", "torch", "numpy")
 _NAME = re.compile(r"[\w=+.,-]{1,120}")

@@ -1,0 +1,119 @@
+"""The object all round and from three sides: pictures to look at, mean colors, and what a network looks at.
+
+In: a problem and what shows. Out: contact sheets as PNG bytes, a mean color, attributions. Turntable views have even
+light and a still camera; they are for eyes and are never counted as a rate. Attributions are integrated gradients
+(Sundararajan et al., ICML 2017, equation 1) from the original's picture to the design's: they add up to the change of
+the log of the target's confidence, so that they say what of the change did it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.color import srgb_from_linear
+from patchproof.optimize.goals import target_loss
+from patchproof.optimize.problem import Problem
+from patchproof.render.photograph import Shown, expose, shade
+from patchproof.report.images import png
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
+
+_PATH_STEPS = 24  # of the integral; builtin's attributions then add up to within a few percent
+
+
+def from_sides(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
+    """Views from these azimuths at the middle of the scene's other ranges, in even light, before one background."""
+    drawn = problem.scene.draw("evaluate", 1)[np.zeros(len(azimuth_deg), int)]
+    view, even = problem.scene.settings.view, np.zeros(len(azimuth_deg))
+    still = {name: even for name in ("roll_deg", "directional", "exposure_ev", "blur_px", "noise", "motion_px")}
+    return replace(
+        drawn,
+        **still,
+        azimuth_deg=np.asarray(azimuth_deg, float),
+        elevation_deg=even + np.mean(view.elevation_deg),
+        distance_mm=even + np.mean(view.distance_mm),
+        look_at_offset=np.zeros((len(even), 3)),
+        ambient=even + 1.0,
+        white_balance=np.ones((len(even), 3)),
+        jpeg=np.full(len(even), 95),
+        point=even,
+        sh2=even,
+        gloss=even,
+        vignetting=even,
+    )
+
+
+def sides(problem: Problem, count: int) -> Conditions:
+    """Views for a contact sheet: evenly through the scene's azimuths, or draws where there is no mesh to go round."""
+    if not isinstance(problem.scene, MeshScene):
+        return problem.scene.draw("evaluate", count)
+    low, high = problem.scene.settings.view.azimuth_deg
+    return from_sides(problem, low + (high - low) * (np.arange(count) + 0.5) / count)
+
+
+def three_views(problem: Problem, lights: int) -> Conditions:
+    """Three fixed views round a mesh (see `sides`), each in `lights` drawn lights, backgrounds and cameras; 3 · lights
+    conditions, view by view.
+    """
+    poses = sides(problem, 3)[np.repeat(np.arange(3), lights)]
+    drawn = problem.scene.draw("evaluate", 3 * lights)
+    names = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset")
+    return replace(drawn, **{name: getattr(poses, name) for name in names})
+
+
+def turn(problem: Problem, shown: Shown, views: int, side_px: int) -> Tensor:
+    """N×3×S×S pictures of a full turn."""
+    return pictures(problem, shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
+
+
+def pictures(problem: Problem, shown: Shown, conditions: Conditions, side_px: int) -> Tensor:
+    """N×3×S×S photographs of one thing."""
+    with torch.no_grad():
+        return expose(problem.see(shown, conditions, side_px), shown)
+
+
+def contact_sheet(rows: list[Tensor]) -> bytes:
+    """Pictures N×3×S×S, one row each, as one PNG."""
+    lines = [torch.cat(list(row), 2) for row in rows]
+    return png((torch.cat(lines, 1).clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy())
+
+
+def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
+    """sRGB codes of the mean light of the object's pixels over a full turn in even white light."""
+    seen = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
+    with torch.no_grad():
+        light = shade(seen, shown).permute(0, 2, 3, 1).reshape(-1, 3)[seen.object.pixel]
+    codes = srgb_from_linear(light.double().mean(0)) * 255
+    return tuple(int(code) for code in codes.round().clamp(0, 255))
+
+
+def attributions(problem: Problem, before: Tensor, after: Tensor) -> Tensor:
+    """N×H×W: how much each pixel's change from `before` to `after` added to the mean log of the target's confidence
+    (for `deceive`, of its complement) over the problem's networks; their sum is its change.
+    """
+    total = torch.zeros_like(before)
+    for step in range(_PATH_STEPS):
+        between = torch.lerp(before, after, (step + 0.5) / _PATH_STEPS).requires_grad_()
+        (gradient,) = torch.autograd.grad(goal_log(problem, between).sum(), between)
+        total += gradient / _PATH_STEPS
+    return (total * (after - before)).sum(1)
+
+
+def goal_log(problem: Problem, photos: Tensor) -> Tensor:
+    """N: the mean over networks of the log of what the goal wants."""
+    goal = problem.scene.settings.target.goal
+    both = zip(problem.classifiers, problem.indices, strict=True)
+    return torch.stack([-target_loss(one.logits(photos), indices, goal) for one, indices in both]).mean(0)
+
+
+def heat(values: Tensor) -> Tensor:
+    """Attributions N×H×W as N×3×H×W: red helped, blue hurt, white did nothing; one scale per picture."""
+    import matplotlib
+
+    top = values.abs().flatten(1).quantile(0.995, 1)[:, None, None].clamp_min(1e-12)
+    colors = matplotlib.colormaps["RdBu_r"]((0.5 + 0.5 * values / top).clamp(0, 1).numpy())
+    return torch.tensor(colors[..., :3], dtype=torch.float32).permute(0, 3, 1, 2)

@@ -1,0 +1,246 @@
+"""Studies of trained designs on networks whose answers are known, and on the built-in one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof.optimize import loop, run
+from patchproof.optimize.evaluate import evaluate_run
+from patchproof.optimize.problem import set_problem
+from patchproof.optimize.run import optimize_scene
+from patchproof.report.tables import Estimate, mean
+from patchproof.scene.scene import load_scene
+from patchproof.settings import Refused, validated
+from patchproof.study import deceive, transfer
+from patchproof.study.study import Cell, Result, run_study
+from patchproof.study.trained import Told, TrainedSettings, cell_of, networks_of, scenes_of, short_name, verdict
+from patchproof.study.turntable import attributions, from_sides, goal_log, mean_color, three_views
+from test_textures_optimized import scene_file
+
+RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(loop, "SELECT_EVERY", 4)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 2)
+
+
+def written(folder: Path, label="red", config="", kind="texture"):
+    """A scene of painted boxes, their whole texture free, and a config that names it; the config's path."""
+    path = scene_file(folder, kind)
+    text = path.read_text().replace('label = "carton"', f'label = "{label}"').replace("epsilon = 0.1\n", "")
+    path.write_text(text.replace("steps = 4", "steps = 8"))
+    (folder / "study.toml").write_text(f'scenes = ["{path.name}"]\n{config}', encoding="utf-8")
+    return folder / "study.toml"
+
+
+def table(finished, name):
+    (found,) = (one for one in finished.tables if one.name == name)
+    return [dict(zip(found.head, row, strict=True)) for row in found.rows]
+
+
+def test_a_design_helps_the_network_that_agrees_and_harms_the_one_that_reads_the_opposite(tmp_path):
+    config = written(tmp_path, config=f'networks = ["{RED}", "{BLUE}"]\nn = 24\nlights = 2\n')
+    finished = run_study("transfer", config, tmp_path / "out")
+    assert not finished.failed
+    rows = {
+        (row["trained on"].split(".")[-1], row["tested on"].split(".")[-1]): row for row in table(finished, "matrix")
+    }
+    red, blue = "red_against_blue", "blue_against_red"
+    assert set(rows) == {(row, network) for row in ("original", red, blue, "all") for network in (red, blue)}
+    for mine, other in ((red, blue), (blue, red)):
+        assert rows[mine, mine]["rate"].value == 1 and rows[mine, mine]["seen"] == "yes"
+        assert rows[mine, other]["rate"].value == 0 and rows[mine, other]["seen"] == "no"
+        assert rows[mine, other]["gain in confidence"].high < 0 < rows[mine, mine]["gain in confidence"].low
+    before = [rows["original", network]["rate"].value for network in (red, blue)]
+    assert sum(before) == 1
+    views = table(finished, "views")
+    assert {row["design"].n for row in views} == {2} and {row["azimuth (deg)"] for row in views} > {0.0}
+    assert not any(one.name == "left_out" for one in finished.tables)  # one network would be left: a row already
+
+
+def test_networks_left_out_get_a_table_of_their_own(tmp_path):
+    config = written(tmp_path, config=f'networks = ["{RED}", "{BLUE}", "builtin"]\nn = 2\n')
+    settings = transfer.TransferSettings(scenes=("texture.toml",), networks=(RED, BLUE, "builtin"), n=2)
+    cells = transfer.cells(settings, config.parent)
+    assert [one.values["row"].replace("fake_networks.", "") for one in cells] == [
+        "original",
+        "red_against_blue",
+        "blue_against_red",
+        "builtin",
+        "without_red_against_blue",
+        "without_blue_against_red",
+        "without_builtin",
+        "all",
+    ]
+    hits = {"original": "0000", "builtin": "0001", "red_against_blue": "0011", "without_blue_against_red": "1111"}
+    results = [
+        Result(
+            one, {"hits": {"design": [hits.get(row, "0000")] * 3}, "confidence": {"design": [[0.5] * 4] * 3}}, tmp_path
+        )
+        for one in cells
+        if (row := one.values["row"].replace("fake_networks.", "")) != "all"
+    ]
+    tables = {one.name: one for one in transfer.tables(settings, results)}
+    rows = {row[2]: row for row in tables["left_out"].rows}
+    name = short_name(BLUE)
+    # 4 of 4 against 0 of 4; the others' designs alone: 1 and 2 of 4
+    assert rows[name][3].value == 0 and rows[name][4].value == 1 and rows[name][5].value == 1
+    assert rows[name][7] == pytest.approx(0.375) and rows[name][8] == "gain"
+    assert rows["builtin"][5].value == 0 and rows["builtin"][8] == "none shown"
+
+
+def test_a_design_that_did_not_move_gains_exactly_nothing(tmp_path):
+    ways = '[ways.still]\noptimize = {optimizer = "sign", step_size = 1e-6}\n'
+    config = written(tmp_path, "carton", f'networks = ["builtin"]\nn = 8\nlights = 1\n{ways}')
+    finished = run_study("transfer", config, tmp_path / "out")
+    original, still = table(finished, "matrix")
+    assert still["way"] == "still" and still["gain in rate"].value == 0 and still["shows"] == "none shown"
+    assert still["gain in confidence"] == Estimate(0, 0, 0, 8)
+    assert original["confidence"] == still["confidence"]
+    names = {path.name for path in (tmp_path / "out").rglob("*.*")}
+    assert {"texture.still.builtin.0.glb", "transfer_heat_texture_still.png", "transfer.html"} <= names
+
+
+def test_a_study_finds_what_optimize_and_evaluate_find(tmp_path):
+    config = written(tmp_path, "carton", 'networks = ["builtin"]\nn = 12\nlights = 1\nseeds = [3]\n')
+    finished = run_study("transfer", config, tmp_path / "out")
+    optimize_scene(tmp_path / "texture.toml", tmp_path / "run", seed=3)
+    found = evaluate_run(tmp_path / "run", n=12)["models"]["builtin"]
+    original, design = table(finished, "matrix")
+    assert design["rate"].value == found["rate"] and original["rate"].value == found["controls"]["bare"]["rate"]
+    # cells keep five digits
+    assert design["confidence"].value == pytest.approx(found["confidence"], abs=1e-5)
+    low, high = found["controls"]["bare"]["difference_interval"]
+    assert (design["gain in rate"].low, design["gain in rate"].high) == pytest.approx((low, high))
+    glb = (tmp_path / "out/files/texture.as_is.builtin.3.glb").read_bytes()
+    assert glb == (tmp_path / "run/object.glb").read_bytes()
+
+
+def test_deceptive_textures_stand_beside_controls(tmp_path):
+    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 16\n')
+    finished = run_study("deceive", config, tmp_path / "out")
+    rates, minus = table(finished, "rates"), table(finished, "differences")
+    assert [row["way"] for row in rates] == ["free", "within_8"]
+    assert rates[0]["design"].value == 0
+    for row, less in zip(rates, minus, strict=True):
+        for kind in deceive.CONTROLS:
+            assert less[f"minus {kind}"].value == pytest.approx(row["design"].value - row[kind].value)
+    with open(tmp_path / "out/cells/texture.within_8.fake_networks.red_against_blue.0.json") as file:
+        assert json.load(file)["cell"]["scene"]["target"]["goal"] == "deceive"
+    # the ball keeps the design near the original
+    assert rates[0]["confidence"].value < rates[1]["confidence"].value
+
+
+def test_each_class_asks_for_its_own_color(tmp_path):
+    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 8\nclasses = ["red", "blue"]\n')
+    finished = run_study("robust", config, tmp_path / "out")
+    assert not finished.failed
+    red, blue = table(finished, "colors")
+    assert red["red"] > red["blue"] + 20 and blue["blue"] > blue["red"] + 20
+    assert red["mean color"] == "#{:02x}{:02x}{:02x}".format(*(red[word] for word in ("red", "green", "blue")))
+    assert all(row["design"].value == 1 for row in table(finished, "rates"))
+    for row in table(finished, "attributions"):
+        assert row["change"] > 0.1 and row["sum of attributions"] == pytest.approx(row["change"], rel=0.02)
+    names = {path.name for path in (tmp_path / "out").glob("*.png")}
+    assert {"robust_colors.png", "robust_turn_texture_free.png", "robust_changed_texture_free.png"} == names
+
+
+def test_the_mean_color_of_an_object_of_one_color_is_that_color(tmp_path):
+    written(tmp_path, "carton")
+    problem = set_problem(load_scene(tmp_path / "texture.toml"))
+    design = torch.tensor([200, 100, 30]).view(3, 1, 1) / 255 * torch.ones_like(problem.subject.start())
+    assert mean_color(problem, problem.subject.shown(design), 4, 64) == (200, 100, 30)
+
+
+def test_attributions_add_up_to_the_change_and_are_zero_where_nothing_changed(tmp_path):
+    written(tmp_path, "carton")
+    problem = set_problem(load_scene(tmp_path / "texture.toml"))
+    before = torch.rand(2, 3, 96, 96, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.4
+    after = before.clone()
+    after[:, :, 30:60, 30:60] = torch.tensor([0.8, 0.6, 0.4]).view(3, 1, 1)
+    found = attributions(problem, before, after)
+    change = goal_log(problem, after) - goal_log(problem, before)
+    assert found.sum((1, 2)).tolist() == pytest.approx(change.tolist(), rel=0.05)
+    found[:, 30:60, 30:60] = 0
+    assert not found.any()
+
+
+def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
+    written(tmp_path, "carton")
+    problem = set_problem(load_scene(tmp_path / "texture.toml"))
+    views = three_views(problem, 4)
+    assert sorted(set(views.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
+    assert len(set(views.directional)) == 12 and len(set(views.distance_mm)) == 1
+    still = from_sides(problem, np.array([0.0, 90.0]))
+    assert not still.directional.any() and not still.noise.any() and (still.ambient == 1).all()
+
+
+def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
+    written(tmp_path, "carton")
+    scene = load_scene(tmp_path / "texture.toml")
+    subject = set_problem(scene).subject
+    design = np.random.default_rng(1).integers(0, 256, (1, subject.start().shape[2], 3), np.uint8)
+    shuffled = subject.control("shuffled", design)
+    assert np.array_equal(shuffled, subject.control("shuffled", design)) and not np.array_equal(shuffled, design)
+    first = 0
+    for mask, was, now in zip(scene.canvas.mask, subject.textures(design), subject.textures(shuffled), strict=True):
+        count = int(mask.sum())
+        parts = [np.sort(one[0, first : first + count].view("u1,u1,u1").ravel()) for one in (design, shuffled)]
+        assert np.array_equal(*parts)
+        if mask.all() and mask.shape == (32, 32):  # cells of 2 × 2
+            cells = [one.reshape(16, 2, 16, 2, 3).swapaxes(1, 2).reshape(256, 12) for one in (was, now)]
+            assert np.array_equal(*(np.unique(one, axis=0) for one in cells))
+        first += count
+
+
+def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_path):
+    config = written(tmp_path, config=f'networks = ["{RED}"]\n')
+    settings = TrainedSettings(scenes=("texture.toml",), networks=(RED,))
+    ((_, _, before),) = scenes_of(settings, config.parent)
+    scene = tmp_path / "texture.toml"
+    scene.write_text(scene.read_text().replace("distance_mm = [600", "distance_mm = [500"))
+    ((_, _, after),) = scenes_of(settings, config.parent)
+    cells = [cell_of(values, "row", (RED,), (RED,), 0) for values in (before, after)]
+    assert cells[0].name == cells[1].name and cells[0].values != cells[1].values
+    wrong = settings.model_copy(update={"ways": {"odd": {"optimize": {"stpes": 3}}}})
+    with pytest.raises(Refused, match=r'way odd, got "optimize\.stpes": did you mean "steps"'):
+        scenes_of(wrong, config.parent)
+
+
+def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path):
+    settings = TrainedSettings(
+        scenes=("a.toml",), networks=("builtin",), if_installed=("module:fake_networks.missing", RED)
+    )
+    assert networks_of(settings, tmp_path) == ("builtin", RED)
+    both = settings.model_copy(update={"networks": ("file:a/net.pt2", "file:b/net.pt2")})
+    with pytest.raises(Refused, match="different names"):
+        networks_of(both, tmp_path)
+    with pytest.raises(Refused, match=r"ways\.a b"):
+        validated(TrainedSettings, {"scenes": ["a"], "networks": ["b"], "ways": {"a b": {}}}, "config")
+
+
+def test_pairs_are_those_of_seeds_that_both_have():
+    def result(seed, hits):
+        values = {"seed": seed, "tested": ["net"]}
+        return Result(Cell("c", values), {"hits": {"x": [hits]}, "confidence": {"x": [[0.5] * len(hits)]}}, Path())
+
+    one = Told([result(0, "1100"), result(1, "1111")], "x")
+    other = Told([result(1, "0001"), result(2, "0000")], "x")
+    gain, _ = one.gain(other, "net")
+    assert gain.n == 4 and gain.value == 0.75 and one.level("net")[0].n == 8
+    assert one.gain(Told([], "x"), "net") == (None, None) and verdict(None) == "not measured"
+
+
+def test_means_have_students_interval():
+    # mean 0.5, standard error 0.5, t(1) at 97.5 % = 12.7062
+    found = mean([0.0, 1.0])
+    assert (found.low, found.high) == pytest.approx((0.5 - 6.3531, 0.5 + 6.3531), abs=1e-4)
+    assert mean([0.3]) is None
