@@ -2,7 +2,7 @@
 
 In: a problem whose settings ask for `mine` conditions to be tried. Out: the conditions of all training steps. Before
 the first step the clean object is shown under that many draws, forward only; every other training view then takes its
-pose and light from the worst quarter of them, its background, print and camera from its own draw. The rest stays as
+pose and light from the worst eighth of them, its background, print and camera from its own draw. The rest stays as
 drawn, so that what is easy is not forgotten.
 
 Which draws are worst depends on the scene and its seed alone, never on the design: a run that was stopped mines the
@@ -38,7 +38,7 @@ LIGHT = (
     "sh2",
     "sh2_coefficients",
 )
-WORST_SHARE = 0.25
+WORST_SHARE = 0.125
 _CHUNK = 16
 
 
@@ -50,6 +50,9 @@ def training_conditions(problem: Problem) -> Conditions:
     if not settings.mine:
         return drawn
     tried = drawn[count:]  # other draws than those that are trained on
+    tried = tried[_shows_what_is_trained(problem, tried)]
+    if not len(tried):
+        return drawn[:count]
     worst = hardest(clean_losses(problem, tried))
     return with_pose_and_light(drawn[:count], tried[worst])
 
@@ -69,8 +72,15 @@ def clean_losses(problem: Problem, conditions: Conditions) -> np.ndarray:
 
 
 def hardest(losses: np.ndarray) -> np.ndarray:
-    """Indices of the worst quarter, at least one, the worst first; equal losses in their order."""
+    """Indices of the worst eighth, at least one, the worst first; equal losses in their order."""
     return np.argsort(-losses, kind="stable")[: max(int(WORST_SHARE * len(losses)), 1)]
+
+
+def _shows_what_is_trained(problem: Problem, conditions: Conditions) -> np.ndarray:
+    """N bool: not from behind the patch, where the object may well fail, but no patch can help it."""
+    if problem.scene.piece is None:
+        return np.ones(len(conditions), bool)
+    return ~(np.abs(problem.scene.piece_azimuth_deg(conditions)) >= 90)  # unknown angles are of photographs of it
 
 
 def with_pose_and_light(conditions: Conditions, worst: Conditions) -> Conditions:

@@ -1,13 +1,14 @@
 """Study "mining": does training that mines the clean object's worst cases lift it there, at equal cost?
 
-In: scenes whose `optimize` settings say how a design is trained without mining, networks, seeds. Per cell a map of pose
-× light finds the tenth of its cells where the clean object fails most, on draws of the select stream with a seed of
-their own; then two designs are trained, one without mining and one with, the latter for as many steps fewer as its tries
-cost; both are measured in those cells, and over the whole ranges, on draws of the evaluate stream with another seed.
-Backgrounds, light and camera of the three never meet.
+In: scenes whose `optimize` settings say how a design is trained without mining, networks, seeds. Per cell a map of
+pose × light finds the tenth of its cells where the clean object fails most, on draws of the select stream with a seed
+of their own. Then two designs are trained, one without mining and one with, the latter for as many steps fewer as its
+tries cost; both are measured in those cells, and over the whole ranges, on draws of the evaluate stream with another
+seed. The map, training and measuring share no background, light or camera.
 
-Cost is counted in classifier passes: a view forward and backward is one, a view forward only a third, and that includes
-what selects a design. Differences are paired by condition; their intervals are of the designs that were trained.
+Cost is counted in classifier passes: a view forward and backward is one, a view forward only a third, and that
+includes what selects a design. Differences are paired by condition; their intervals are of the designs that were
+trained: another seed's may do better or worse.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from patchproof.study.stress_map import (
 )
 from patchproof.study.study import Cell, Result, Study
 
-FORWARD_ONLY = 1 / 3  # of the cost of forward and backward: the backward pass is two products where forward is one
+FORWARD, BOTH = 1, 3  # thirds of a pass: going back takes two products of matrices where going forward takes one
 _CHOOSING, _MEASURING = 1_000_003, 2_000_003  # added to seeds, so that a seed's draws are used once
 _THINGS = ("clean", "plain", "mined")
 
@@ -89,17 +90,20 @@ def run(settings: MiningSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def passes(settings: OptimizeSettings) -> float:
     """What a training costs, in classifier passes (forward and backward) per classifier."""
-    tried = settings.steps // SELECT_EVERY + (settings.steps % SELECT_EVERY > 0)
-    return settings.steps * settings.views + (tried * SELECT_VIEWS + settings.mine) * FORWARD_ONLY
+    return _thirds(settings) / BOTH
 
 
 def equal_steps(plain: OptimizeSettings, mine: int) -> int:
     """The most steps with which mined training costs no more than training without."""
-    budget = passes(plain)
     for count in range(plain.steps, 0, -1):
-        if passes(plain.model_copy(update={"steps": count, "mine": mine})) <= budget:
+        if _thirds(plain.model_copy(update={"steps": count, "mine": mine})) <= _thirds(plain):
             return count
     raise Refused(f"a training that costs more than {mine} tries", f"{plain.steps} steps", "raise steps or lower mine")
+
+
+def _thirds(settings: OptimizeSettings) -> int:
+    selections = -(-settings.steps // SELECT_EVERY)
+    return BOTH * settings.steps * settings.views + FORWARD * (selections * SELECT_VIEWS + settings.mine)
 
 
 def _trained(problem: Problem) -> Shown:

@@ -198,16 +198,21 @@ def worst_case(
     fresh = scene.draw("evaluate", settings.n, seed + _MEASURING)
     there = judge(problem, {"clean": None}, _with(fresh, best))["clean"]
     anywhere = judge(problem, {"clean": None}, fresh)["clean"]
-    drawn = scene.draw("select", 64, seed)
-    varied = [name for name in names if getattr(drawn, name).ndim == 1 and np.ptp(getattr(drawn, name)) > 0]
     return best, {
-        "condition": {name: float(best[name][0]) for name in varied},
+        "condition": {name: float(best[name][0]) for name in _varied(scene.draw("select", 64, seed), names)},
         "losses": course,
         "hits": bits(there.recognized),
         "confidence": float(there.confidence.mean()),
         "hits_anywhere": bits(anywhere.recognized),
         "confidence_anywhere": float(anywhere.confidence.mean()),
     }
+
+
+def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
+    """Fields of one figure whose range is more than a value; a lamp's only where there are lamps."""
+    lamps = drawn.point.max() > 0
+    figures = {name: getattr(drawn, name) for name in names if lamps or not name.startswith("point")}
+    return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
 
 
 def _each_with_all(rest: Conditions, tried: Mapping[str, np.ndarray], tries: int) -> Conditions:

@@ -84,7 +84,7 @@ class Said:
 def short_name(name: str) -> str:
     """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
     word = name.rpartition(":")[2]
-    return re.sub(r"[^\w+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
+    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
 
 
 def scene_cells(settings: ScenesSettings, base: Path) -> list[Cell]:
@@ -144,7 +144,7 @@ def axes(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:
 
 
 def in_cell(conditions: Conditions, both: tuple[Axis, Axis], cell: tuple[int, int]) -> Conditions:
-    """`conditions` with pose and light moved into a cell (pose's number, light's), each to where it lay in its range."""
+    """`conditions` with pose and light moved into a cell (its numbers), each as far in as it lay in its range."""
     changed = {}
     for axis, number in zip(both, cell, strict=True):
         first, last, low, high = axis.edges[0], axis.edges[-1], axis.edges[number], axis.edges[number + 1]
