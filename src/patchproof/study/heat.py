@@ -30,8 +30,8 @@ def heat_map(
         _cells(plot, rates, worst)
         for axis, values in zip((plot.xaxis, plot.yaxis), axes["edges"], strict=True):
             axis.set_ticks([i - 0.5 for i in range(len(values))], [f"{value:.4g}" for value in values])
-        plot.set_xlabel(_said(axes["names"][0]))
-        plot.set_ylabel(_said(axes["names"][1]))
+        plot.set_xlabel(said(axes["names"][0]))
+        plot.set_ylabel(said(axes["names"][1]))
         plot.set_title(f"rate, n = {n} draws per cell; framed: the worst tenth")
 
     return Drawing(name, title, draw, _size(rates))
@@ -51,7 +51,7 @@ def position_map(
             axis.set_ticks(range(count), middles)
         plot.set_xlabel("middle of the square, from the left")
         plot.set_ylabel("from the top")
-        plot.set_title(f"rate under a black square of {share:.0%} of the side, n = {n}; framed: the worst")
+        plot.set_title(f"black square, {share:.0%} of the side; n = {n}")
 
     return Drawing(name, title, draw, _size(rates))
 
@@ -72,6 +72,14 @@ def picture_strip(name: str, title: str, path: Path, parts: Sequence[str]) -> Dr
     return Drawing(name, title, draw, (2.1 * len(parts), 2.4))
 
 
+def said(name: str) -> str:
+    """A condition's field as people read it: "azimuth (°)" for azimuth_deg."""
+    words, unit = name.split("_"), ""
+    if words[-1] in _UNITS:
+        unit = f" ({_UNITS[words.pop()]})"
+    return " ".join(words) + unit
+
+
 def _cells(plot, rates: Sequence[Sequence[float]], framed: Sequence[Sequence[int]]) -> None:
     from matplotlib.patches import Rectangle
 
@@ -88,10 +96,3 @@ def _cells(plot, rates: Sequence[Sequence[float]], framed: Sequence[Sequence[int
 
 def _size(rates: Sequence[Sequence[float]]) -> tuple[float, float]:
     return max(2.2 + 0.6 * len(rates), 5.5), max(1.6 + 0.42 * len(rates[0]), 3.2)
-
-
-def _said(name: str) -> str:
-    words, unit = name.split("_"), ""
-    if words[-1] in _UNITS:
-        unit = f" ({_UNITS[words.pop()]})"
-    return " ".join(words) + unit

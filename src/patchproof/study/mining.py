@@ -14,11 +14,8 @@ trained: another seed's may do better or worse.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from patchproof.optimize.loop import SELECT_EVERY, SELECT_VIEWS, start, steps
 from patchproof.optimize.pixels import from_pixels
@@ -29,7 +26,6 @@ from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings, Refused
 from patchproof.study.heat import heat_map
 from patchproof.study.stress_map import (
-    Axis,
     Count,
     MapSettings,
     ScenesSettings,
@@ -37,7 +33,7 @@ from patchproof.study.stress_map import (
     axes_said,
     bits,
     hits_of,
-    in_cell,
+    in_cells,
     judge,
     map_of,
     problem_of,
@@ -83,7 +79,7 @@ def run(settings: MiningSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "worst": [list(one) for one in worst],
         "steps": {"plain": plain.scene.settings.optimize.steps, "mined": steps_of_mined},
         "passes": {name: passes(one.scene.settings.optimize) for name, one in (("plain", plain), ("mined", mined))},
-        "in_worst": _hits(plain, things, _worst_draws(drawn, both, worst, settings.n)),
+        "in_worst": _hits(plain, things, in_cells(drawn[: settings.n * len(worst)], both, worst)),
         "over_all": _hits(plain, things, drawn[settings.n * len(worst) :]),
     }
 
@@ -112,13 +108,6 @@ def _trained(problem: Problem) -> Shown:
     for step in steps(problem, state):
         state = step.state
     return problem.subject.shown(from_pixels(problem.subject.pixels(state.best), problem.device))
-
-
-def _worst_draws(drawn: Conditions, both: tuple[Axis, Axis], worst: Sequence[tuple[int, int]], n: int) -> Conditions:
-    """`n` draws in each of the worst cells, no draw twice."""
-    parts = [in_cell(drawn[i * n : (i + 1) * n], both, cell) for i, cell in enumerate(worst)]
-    names = vars(parts[0])
-    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def _hits(problem: Problem, things: dict[str, Shown], conditions: Conditions) -> dict[str, str]:

@@ -28,7 +28,7 @@ from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table, difference, rate
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import Share, Strict
-from patchproof.study.heat import heat_map, picture_strip, position_map
+from patchproof.study.heat import heat_map, picture_strip, position_map, said
 from patchproof.study.stress_map import (
     CHUNK,
     Count,
@@ -38,7 +38,7 @@ from patchproof.study.stress_map import (
     axes_said,
     bits,
     hits_of,
-    in_cell,
+    in_cells,
     judge,
     map_of,
     problem_of,
@@ -107,14 +107,17 @@ def _mapped(problem: Problem, settings: MapSettings, seed: int) -> dict[str, Any
     both = axes(problem.scene.settings, settings)
     hits, confidence = map_of(problem, both, problem.scene.draw("select", settings.n, seed))
     worst = worst_cells(hits, confidence, problem.scene.settings.target.goal == "assist")
-    fresh = problem.scene.draw("evaluate", settings.n, seed + _MEASURING)
-    again = [judge(problem, {"clean": None}, in_cell(fresh, both, one))["clean"] for one in worst]
+    fresh = problem.scene.draw("evaluate", settings.n * len(worst), seed + _MEASURING)
+    there = judge(problem, {"clean": None}, in_cells(fresh, both, worst))["clean"]
+    anywhere = judge(problem, {"clean": None}, fresh)["clean"]
     return {
         "axes": axes_said(both),
         "hits": [[bits(cell) for cell in column] for column in hits],
         "confidence": confidence.mean(2).tolist(),
         "worst": [list(one) for one in worst],
-        "again": bits(np.concatenate([one.recognized for one in again])),
+        "worst_again": bits(there.recognized),
+        "anywhere_again": bits(anywhere.recognized),
+        "worst_confidence": float(there.confidence.mean()),
     }
 
 
@@ -240,7 +243,7 @@ def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, 
             "Worst cases of the clean object, measured on draws that did not choose them",
             (*who, "test", "found at", "rate", "rate anywhere", "difference", "confidence"),
             worst,
-            "A difference is paired by condition where the same draws were measured both ways, else left out.",
+            "Differences are paired by condition: the same draws with pose, light or square as found, and without.",
         ),
         Table(
             "maps",
@@ -259,7 +262,7 @@ def _who(one: Result) -> tuple:
 def _worst_rows(one: Result):
     for what in ("pose", "light"):
         found = one.found[what]
-        where = ", ".join(f"{name} {value:.4g}" for name, value in found["condition"].items())
+        where = ", ".join(f"{said(name)} {value:.4g}" for name, value in found["condition"].items())
         there, anywhere = hits_of(found["hits"]), hits_of(found["hits_anywhere"])
         rates = (rate(there), rate(anywhere), difference(there, anywhere))
         yield (*_who(one), f"worst {what}", where, *rates, found["confidence"])
@@ -268,9 +271,10 @@ def _worst_rows(one: Result):
     where = "column {}, row {} of the grid".format(*(number + 1 for number in hidden["worst"]))
     yield (*_who(one), "black square", where, rate(there), rate(anywhere), difference(there, anywhere), None)
     for found in one.found["maps"]:
-        where = f"{len(found['worst'])} worst cells of {' × '.join(found['axes']['names'])}"
-        everywhere = [hit for column in found["hits"] for cell in column for hit in hits_of(cell)]
-        yield (*_who(one), "map", where, rate(hits_of(found["again"])), float(np.mean(everywhere)), None, None)
+        where = f"{len(found['worst'])} worst cells of {' × '.join(map(said, found['axes']['names']))}"
+        there, anywhere = hits_of(found["worst_again"]), hits_of(found["anywhere_again"])
+        rates = (rate(there), rate(anywhere), difference(there, anywhere))
+        yield (*_who(one), "map", where, *rates, found["worst_confidence"])
 
 
 def _map_rows(one: Result, found: Mapping[str, Any]):

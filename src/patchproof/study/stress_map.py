@@ -153,6 +153,14 @@ def in_cell(conditions: Conditions, both: tuple[Axis, Axis], cell: tuple[int, in
     return replace(conditions, **changed)
 
 
+def in_cells(conditions: Conditions, both: tuple[Axis, Axis], cells: Sequence[tuple[int, int]]) -> Conditions:
+    """`conditions` moved into cells, an equal share of the rows into each, in order; no draw serves two cells."""
+    n = len(conditions) // len(cells)
+    parts = [in_cell(conditions[i * n : (i + 1) * n], both, cell) for i, cell in enumerate(cells)]
+    names = vars(parts[0])
+    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
 def judge(problem: Problem, things: Mapping[str, Shown], conditions: Conditions) -> dict[str, Said]:
     """What the problem's first network says of each thing (None: the bare object) under the same conditions."""
     parts: dict[str, list[np.ndarray]] = {name: [] for name in things}
