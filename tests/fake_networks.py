@@ -29,3 +29,19 @@ class BlueAgainstRed(RedAgainstBlue):
 
 def blue_against_red():
     return BlueAgainstRed()
+
+
+class Bright(torch.nn.Module):
+    """Two classes, "bright" and "dark": the picture's upper left quarter against a half, green counting most."""
+
+    input_px = 32
+    labels = ("bright", "dark")
+
+    def forward(self, photos):
+        red, green, blue = photos[:, :, :16, :16].mean((2, 3)).T
+        score = 20 * (0.3 * red + 0.6 * green + 0.1 * blue - 0.5)
+        return torch.stack([score, -score], 1)
+
+
+def bright():
+    return Bright()

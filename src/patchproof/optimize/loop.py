@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from patchproof.optimize.goals import target_loss
+from patchproof.optimize.mining import training_conditions
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import expose
@@ -67,7 +68,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
     """The steps from `state` (or from the start) to the last one that the scene's settings ask for."""
     state = start(problem) if state is None else state
     settings = problem.scene.settings.optimize
-    conditions = problem.scene.draw("train", settings.steps * settings.views)
+    conditions = training_conditions(problem)
     selection, pool = _selection(problem), None
     while state.number < settings.steps:
         first = state.number * settings.views

@@ -30,15 +30,15 @@ from patchproof.workers import Workers, one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is, imported when asked for
 STUDIES: dict[str, str] = {
-STUDIES: dict[str, str] = {
     "deceive": "patchproof.study.deceive",
     "gamut": "patchproof.study.gamut",
     "harden": "patchproof.study.harden",
+    "mining": "patchproof.study.mining",
     "patch2d": "patchproof.study.patch2d",
     "patch3d": "patchproof.study.patch3d",
     "robust": "patchproof.study.robust",
+    "stress": "patchproof.study.stress",
     "transfer": "patchproof.study.transfer",
-}
 }
 _LIBRARIES = ("patchproof", "torch", "numpy")
 _NAME = re.compile(r"[\w=+.,-]{1,120}")
