@@ -28,7 +28,7 @@ from patchproof.study.envelope_world import measured, open_world, recognized
 from patchproof.study.study import Cell, Study
 
 _SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
-Count = Annotated[int, Field(ge=4, le=4096)]
+Count = Annotated[int, Field(ge=1, le=4096)]
 Points = Annotated[int, Field(ge=3, le=33)]
 
 
@@ -46,7 +46,7 @@ class Map(Strict):
 
     x: str
     y: str
-    points: Points = 5
+    points: Points = 4
 
 
 class EnvelopeSettings(Strict):
@@ -57,10 +57,10 @@ class EnvelopeSettings(Strict):
     run: str
     seed: Annotated[int, Field(ge=0)] = 0
     n: Count = 64
-    photos: Count = 16
-    points: Points = 7
-    map_n: Count = 16
-    map_photos: Count = 4
+    photos: Count = 12
+    points: Points = 6
+    map_n: Count = 8
+    map_photos: Count = 3
     sweeps: tuple[Sweep, ...] | None = None
     maps: tuple[Map, ...] | None = None
     other_printer: str | None = None  # what `mismatch` counts from the run's own printer towards

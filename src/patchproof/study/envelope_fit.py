@@ -93,7 +93,7 @@ def monotone_p(rates: np.ndarray, drawn: np.ndarray) -> float:
 @lru_cache(maxsize=1)
 def _grid() -> tuple[np.ndarray, np.ndarray]:
     """Curves G×4 and the position at which each has lost half of what it has at 0."""
-    centers, widths = np.linspace(0, 1.2, 61), np.geomspace(0.01, 0.4, 6)
+    centers, widths = np.linspace(0, 1.2, 61), np.geomspace(0.002, 0.4, 7)
     tops, floors = np.sin(np.linspace(0.05, np.pi / 2 - 0.05, 15)) ** 2, np.array([0, 0.1, 0.25, 0.4, 0.6, 0.8])
     center, width, top, share = (a.ravel() for a in np.meshgrid(centers, widths, tops, floors, indexing="ij"))
     curves = np.stack([center, width, top, share * top], 1)

@@ -3,8 +3,8 @@
 In: a run and points (values of axes). Out: per point and condition whether the target was recognized, and the codes and
 corner errors of full photographs. The piece comes from the sheet's PDF, as in `reprint`. Recognition is judged at the
 promise's resolution, except where JPEG is varied: that is met at full size or not at all. Of a photograph that is to be
-measured only the window around the piece is rendered, at full resolution, and laid on its plain background: the rest
-costs most and shows no markers. Left out on purpose: what else in a photograph might look like a marker.
+measured only the window around the piece is rendered, at full resolution: the rest costs most and shows no markers.
+Left out on purpose: what else in a photograph might look like a marker.
 """
 
 from __future__ import annotations
@@ -145,10 +145,12 @@ def measured(world: World, points: Sequence[Point], conditions: Conditions) -> l
             frame = lambda point, drawn: _window(world, stages.at(point), drawn)  # noqa: E731
             views = _Views(world, conditions[[n]], n % 4, frame)
             for i in _by_cost(points):
-                picture = views.files(points[i])[0].permute(1, 2, 0)
-                part = (picture.numpy() * 255 + 0.5).astype(np.uint8)
+                srgb = (views.files(points[i])[0].permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
+                origin_px = views.frame.origin_px
+                if "curl" in points[i]:  # the middle of the picture says how rolled paper is seen
+                    srgb, origin_px = _on_plain_ground(srgb, origin_px, world.scene.settings.camera.photo_px), (0, 0)
                 drawn = conditions_at(world.scene, conditions[[n]], points[i])
-                out[i][n] = _measurement(world, stages.at(points[i]).scene, drawn, part, views.frame.origin_px)
+                out[i][n] = _measurement(world, stages.at(points[i]).scene, drawn, srgb, origin_px)
     return out
 
 
@@ -260,17 +262,22 @@ def _window(world: World, stage: Stage, conditions: Conditions) -> _Frame:
     return _Frame(window_stage(stage, origin, size), size, origin)
 
 
-def _measurement(world: World, scene: Scene, conditions: Conditions, part: np.ndarray, origin_px) -> Measurement:
-    """What the tool says of a photograph that shows `part` at `origin_px` of a plain background."""
-    whole_px, (x, y) = world.scene.settings.camera.photo_px, origin_px
-    srgb = np.full((whole_px[1], whole_px[0], 3), np.median(part, (0, 1)).astype(np.uint8))
+def _on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
+    """A photograph that shows `part` at `origin_px` and nothing else."""
+    srgb, (x, y) = np.full((whole_px[1], whole_px[0], 3), np.median(part, (0, 1)).astype(np.uint8)), origin_px
     srgb[y : y + part.shape[0], x : x + part.shape[1]] = part
+    return srgb
+
+
+def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px) -> Measurement:
+    """What the tool says of a part of a photograph whose corner lies at `origin_px`."""
+    whole_px = world.scene.settings.camera.photo_px
     focal_px = float(scene.matrix_px(whole_px)[0, 0]) if isinstance(scene, MeshScene) else None
     entry = measure(Photo(srgb, focal_px, Path("photo")), "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
     if entry.status == "measured" and entry.homography_px_from_mm is not None:
         corners = geometry.rect_corners(world.surface.rect_mm)
-        true_px = _seen_at(scene, conditions, corners - world.manifest.cut_mm[:2], whole_px)
+        true_px = _seen_at(scene, conditions, corners - world.manifest.cut_mm[:2], whole_px) - origin_px
         back = geometry.apply_homography(np.linalg.inv(np.array(entry.homography_px_from_mm)), true_px)
         error_mm = float(np.linalg.norm(back - corners, axis=1).max())
     return Measurement(entry.status, entry.code, error_mm)
