@@ -80,6 +80,31 @@ def place_bent(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg:
     return replace(laid, reason=reason)
 
 
+def curled(card: Placement, radius_mm: float) -> Placement:
+    """A flat card whose left and right edges curl off the object, on a cylinder that touches it along its middle.
+
+    Nothing is fitted to the surface, and nothing is refused: this is what badly glued paper does.
+    """
+    if not card.is_flat:
+        raise Refused("a flat card to curl", f"a piece on a {card.family}", "leave out bend")
+    across, into = card.world_from_piece[:3, [0, 2]].T
+    points, width = net(card.size_mm, _PIECE_NET) * [1, -1] + np.array(card.size_mm) / 2, card.size_mm[0]
+    scale = float(np.linalg.norm(across))  # a print may be larger than its millimetres say
+    turn = (points[:, :1] - width / 2) * scale / radius_mm
+    flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(turn), points[:, 1:]], 1)
+    lifted = radius_mm * (1 - np.cos(turn)) * into
+    normals = -np.sin(turn) * across / scale - np.cos(turn) * into
+    return replace(
+        card,
+        family="curled",
+        vertices_mm=card.world(flat) - lifted,
+        faces=_grid_faces(_PIECE_NET),
+        piece_mm=points,
+        normals=normals,
+        reason=f"curled to a radius of {radius_mm:.0f} mm",
+    )
+
+
 def _facing(frame: Frame, normal: np.ndarray, origin_mm: np.ndarray) -> Frame:
     """The frame turned to a normal, its up kept as well as it can be."""
     up = frame.up - (frame.up @ normal) * normal

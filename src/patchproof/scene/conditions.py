@@ -105,6 +105,12 @@ def with_poses_of(conditions: Conditions, poses: Conditions) -> Conditions:
     return replace(conditions, **{name: getattr(poses, name) for name in _POSES})
 
 
+def with_value(conditions: Conditions, name: str, value) -> Conditions:
+    """`conditions` with one of their arrays set to `value` (a number, or one per draw) and all others as drawn."""
+    drawn = getattr(conditions, name)
+    return replace(conditions, **{name: np.broadcast_to(np.asarray(value, drawn.dtype), drawn.shape).copy()})
+
+
 def _unit(stream: Stream, rng: np.random.Generator, n: int) -> np.ndarray:
     """n×D points of the unit cube; the first k do not depend on n."""
     if stream not in _SOBOL:

@@ -1,0 +1,114 @@
+"""Where a rate breaks: a falling curve fitted to counts at a few points, its breaking point, and doubt about both.
+
+In: what worked, conditions × points, and where in the sweep the points lie (0 easy, 1 hard). Out: `Break`. The curve is
+a logistic between two levels; its breaking point is where it has lost half of what it has at the easy end. Likelihood
+is maximized over a grid, which never fails to converge and shows where data leave the curve open: between two points of
+rate 1 and 0 the breaking point may lie anywhere, and the interval says so. All points share their conditions, and whole
+conditions are drawn anew for the bootstrap, so that what they have in common does not pass for precision.
+
+A curve that falls is fitted whatever the data do. Whether they contradict it is tested apart: the distance from the
+best falling rates against that of bootstrap samples moved to where the rates do fall.
+
+Sources: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 13.3 (percentiles), 16.2 (null made true);
+Robertson, Wright and Dykstra, Order Restricted Statistical Inference, 1988, 1.4 (min-max formula).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from patchproof.claims import wilson
+
+DRAWS = 200
+TOLERANCE = 0.1  # in log-likelihood: curves this near to the best are as good as it
+NOT_MONOTONE = 0.01  # three curves to a sweep are tested at once
+LEAST_AT_EASY_END = 0.05  # Wilson's lower end of the rate there, below which there is nothing to lose
+BEYOND = 2.0  # stands for a breaking point outside of the sweep
+
+
+@dataclass(frozen=True)
+class Break:
+    """Positions in the sweep, `BEYOND` where the curve holds to its hard end; None where nothing worked at the start.
+
+    `curve` is the best one at positions 0, 0.01, ... 1.
+    """
+
+    value: float | None
+    low: float | None
+    high: float | None
+    monotone_p: float
+    curve: tuple[float, ...]
+
+
+def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
+    """The breaking point of `worked` n×P at positions P in [0, 1]: the bootstrap's median with its 95 % interval."""
+    n = len(worked)
+    rng = np.random.default_rng([seed, n])
+    weights = rng.multinomial(n, np.full(n, 1 / n), DRAWS)
+    counts = weights @ worked.astype(float)
+    p = monotone_p(worked.mean(0), counts / n)
+    best = curve_at(_fit(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.linspace(0, 1, 101))
+    if wilson(int(worked[:, 0].sum()), n)[0] < LEAST_AT_EASY_END:
+        return Break(None, None, None, p, tuple(best.tolist()))
+    low, high, _ = _fit(counts, n, at)
+    middle = np.where(high < BEYOND, (low + high) / 2, low)
+    ends = [(middle, 0.5), (low, 0.025), (high, 0.975)]
+    return Break(*(float(np.quantile(v, q, method="inverted_cdf")) for v, q in ends), p, tuple(best.tolist()))
+
+
+def curve_at(curve: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Rates of the curve (center, width, level at the easy side, level at the hard side) at positions."""
+    from scipy.special import expit
+
+    center, width, top, floor = curve
+    return floor + (top - floor) * expit((center - at) / width)
+
+
+def falling(rates: np.ndarray) -> np.ndarray:
+    """The nearest rates (least squares) along the last axis that never rise."""
+    sums = np.concatenate([np.zeros((*rates.shape[:-1], 1)), rates.cumsum(-1)], -1)
+    points, out = rates.shape[-1], np.empty(rates.shape)
+    for j in range(points):
+        # min over starts up to j of the max over ends from j of the mean between
+        means = [
+            np.stack([(sums[..., k + 1] - sums[..., i]) / (k + 1 - i) for k in range(j, points)], -1).max(-1)
+            for i in range(j + 1)
+        ]
+        out[..., j] = np.stack(means, -1).min(-1)
+    return out
+
+
+def monotone_p(rates: np.ndarray, drawn: np.ndarray) -> float:
+    """How likely rates P that fall everywhere would look as unlike it as these; `drawn` B×P is their bootstrap."""
+    distance = lambda values: ((values - falling(values)) ** 2).sum(-1)  # noqa: E731
+    observed = distance(rates)
+    if observed <= 1e-12:
+        return 1.0
+    return float((1 + (distance(drawn - rates + falling(rates)) >= observed).sum()) / (1 + len(drawn)))
+
+
+@lru_cache(maxsize=1)
+def _grid() -> tuple[np.ndarray, np.ndarray]:
+    """Curves G×4 and the position at which each has lost half of what it has at 0."""
+    centers, widths = np.linspace(0, 1.2, 61), np.geomspace(0.002, 0.4, 7)
+    tops, floors = np.sin(np.linspace(0.05, np.pi / 2 - 0.05, 15)) ** 2, np.array([0, 0.1, 0.25, 0.4, 0.6, 0.8])
+    center, width, top, share = (a.ravel() for a in np.meshgrid(centers, widths, tops, floors, indexing="ij"))
+    curves = np.stack([center, width, top, share * top], 1)
+    half = (curve_at(curves.T, np.zeros(1)) / 2 - curves[:, 3]) / (top * (1 - share))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lost = center - width * np.log(half / (1 - half))
+    return curves, np.where((half > 0) & (lost <= 1), lost.clip(0), BEYOND)
+
+
+def _fit(counts: np.ndarray, n: int, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Per row of counts B×P: the lowest and the highest breaking point of the curves as good as the best, B×4 best."""
+    curves, lost = _grid()
+    rates = np.stack([curve_at(curves.T, np.full(1, x)) for x in at]).clip(1e-4, 1 - 1e-4)  # P×G
+    likelihood = counts @ np.log(rates) + (n - counts) @ np.log(1 - rates)
+    best = likelihood.max(1, keepdims=True)
+    good = likelihood >= best - TOLERANCE
+    low = np.where(good, lost, np.inf).min(1)
+    return low, np.where(good, lost, -np.inf).max(1), curves[likelihood.argmax(1)]

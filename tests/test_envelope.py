@@ -1,0 +1,168 @@
+"""The operating envelope of a small scene: axes do what they say, windows are the photographs, the study is written."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof import geometry
+from patchproof.optimize.run import optimize_scene
+from patchproof.render.photograph import photograph
+from patchproof.scene.conditions import with_value
+from patchproof.settings import Refused
+from patchproof.study.envelope import EnvelopeSettings, cells
+from patchproof.study.envelope_axes import AXES, conditions_at, placed_at
+from patchproof.study.envelope_world import (
+    _Stages,
+    _window,
+    measured,
+    open_world,
+    piece_at,
+    recognized,
+)
+from patchproof.study.study import run_study
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    import conftest
+
+    folder = tmp_path_factory.mktemp("envelope")
+    scene = conftest.SCENE.replace("steps = 3", "steps = 1").replace("views = 4", "views = 1")
+    (folder / "scene.toml").write_text(scene)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("patchproof.optimize.run.PROMISE_VIEWS", 8)
+        optimize_scene(folder / "scene.toml", folder / "run")
+    return open_world(folder / "run", None)
+
+
+def rows_of(path):
+    return list(csv.DictReader(path.read_text("utf-8").splitlines()))
+
+
+@pytest.fixture(scope="module")
+def drawn(world):
+    return world.scene.draw("evaluate", 4)
+
+
+def test_a_value_replaces_one_condition_and_leaves_the_others(drawn):
+    changed = with_value(drawn, "jpeg", 12.0)
+    assert changed.jpeg.tolist() == [12] * 4 and changed.jpeg.dtype == drawn.jpeg.dtype
+    assert replace(changed, jpeg=drawn.jpeg) is not None and np.array_equal(changed.blur_px, drawn.blur_px)
+    assert with_value(drawn, "blur_px", np.arange(4)).blur_px.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 88.0])
+def test_tilt_is_the_angle_from_the_patch_s_axis_and_keeps_its_direction(world, drawn, tilt_deg):
+    moved, frame = conditions_at(world.scene, drawn, {"tilt": tilt_deg}), world.scene.frame
+    before = geometry.orbit(drawn.azimuth_deg, drawn.elevation_deg, frame.normal, frame.up)
+    after = geometry.orbit(moved.azimuth_deg, moved.elevation_deg, frame.normal, frame.up)
+    assert np.degrees(np.arccos((after @ frame.normal).clip(-1, 1))) == pytest.approx(np.full(4, tilt_deg), abs=1e-5)
+    if tilt_deg:
+        sides = [np.arctan2(d @ frame.up, d @ frame.right) for d in (before, after)]
+        assert sides[0] == pytest.approx(sides[1])
+
+
+def test_curled_paper_keeps_its_lengths_and_its_middle(world):
+    flat, radius = world.scene.placement, 60.0
+    bent = placed_at(world.scene, {"curl": radius}).placement
+    assert bent.center_mm == pytest.approx(flat.center_mm, abs=0.05)
+    grid = bent.vertices_mm.reshape(33, 33, 3)
+    # chords of 32 arcs: 2 R sin(w / 64 R) each
+    chord = 2 * radius * np.sin(flat.size_mm[0] / 32 / 2 / radius)
+    assert np.linalg.norm(np.diff(grid, axis=1), axis=2) == pytest.approx(np.full((33, 32), chord))
+    height = (bent.vertices_mm - flat.center_mm) @ flat.normal
+    assert height.max() == pytest.approx(radius * (1 - np.cos(flat.size_mm[0] / 2 / radius))) and height.min() > -1e-9
+    with pytest.raises(Refused, match="a flat card to curl"):
+        placed_at(replace(world.scene, placement=bent), {"curl": 50.0})
+
+
+def test_gap_moves_the_piece_along_its_normal_and_size_shrinks_it(world):
+    flat = world.scene.placement
+    off = placed_at(world.scene, {"gap": 30.0}).placement
+    assert off.center_mm - flat.center_mm == pytest.approx(30 * flat.normal)
+    assert off.vertices_mm - flat.vertices_mm == pytest.approx(np.tile(30 * flat.normal, (4, 1)))
+    small = placed_at(world.scene, {"size": 0.5, "gap": 30.0}).placement
+    assert np.ptp(small.vertices_mm, axis=0).max() == pytest.approx(flat.size_mm[0] / 2)
+
+
+@pytest.mark.parametrize("quarters", [0.0, 1.0, 2.5, 4.0])
+def test_hidden_corners_cover_their_share_of_the_piece(world, quarters):
+    bare, hidden = (piece_at(world, {"hidden": q}, 1).srgb for q in (0.0, quarters))
+    assert float((hidden != bare).any(-1).float().mean()) == pytest.approx(quarters / 4, abs=0.01)
+
+
+def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world):
+    assert torch.equal(piece_at(world, {"mismatch": 0.0}, 0).srgb, piece_at(world, {}, 0).srgb)
+    other = world.other.apply(world.sent)[0].permute(1, 2, 0)
+    assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
+
+
+def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
+    one = with_value(with_value(drawn[:1], "noise", 0.0), "blur_px", 0.0)
+    stage, shown = _Stages(world).at({}), piece_at(world, {}, 0)
+    frame = _window(world, stage, one)
+    (x, y), (width, height) = frame.origin_px, frame.size_px
+    assert width * height < 800 * 600 / 2 and x % 16 == y % 16 == 0
+    whole = photograph(stage, shown, one, (800, 600), jpeg=False)[..., y : y + height, x : x + width]
+    part = photograph(frame.stage, shown, one, frame.size_px, jpeg=False)
+    assert float((whole - part).abs().max()) < 1e-3
+
+
+def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world, drawn):
+    points = [{}, {"tilt": 86.0}, {"blur": 12.0}, {"hidden": 4.0}]
+    plain, tilted, blurred, hidden = measured(world, points, drawn[:2])
+    assert all(one.status == "measured" and one.error_mm < 0.3 for one in plain)
+    for row in (tilted, blurred, hidden):
+        assert all(one.status != "measured" and one.code for one in row)
+    assert {one.code for one in hidden} == {"too_few_markers"}
+
+
+def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn):
+    points = [{"blur": 20.0}, {}, {"distance": 4000.0}, {"blur": 3.0}]
+    together = recognized(world, points, drawn)
+    alone = np.concatenate([recognized(world, [point], drawn) for point in points])
+    assert np.array_equal(together, alone)
+
+
+def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
+    config = tmp_path / "envelope.toml"
+    config.write_text(
+        f'run = "{world.run.folder}"\nn = 4\nphotos = 2\nmap_n = 4\nmap_photos = 1\n'
+        'sweeps = [{axis = "blur", easy = 0.5, hard = 16, points = 3}]\n'
+        'maps = [{x = "hidden", y = "mismatch", points = 3}]\n'
+    )
+    finished = run_study("envelope", config, tmp_path / "out")
+    assert not finished.failed
+    assert [table.name for table in finished.tables] == ["breaks", "beyond", "sweeps", "maps"]
+    rows = rows_of(tmp_path / "out/envelope_sweeps.csv")
+    assert [float(row["value"]) for row in rows] == pytest.approx([0.5, 8**0.5, 16])
+    assert float(rows[0]["measured"]) == 1 and float(rows[2]["measured"]) == 0
+    (broken,) = rows_of(tmp_path / "out/envelope_breaks.csv")
+    assert 0.5 <= float(broken["measured_low"]) <= float(broken["measured"]) <= float(broken["measured_high"]) <= 16
+    assert len(rows_of(tmp_path / "out/envelope_maps.csv")) == 9
+    assert (tmp_path / "out/envelope_page.png").is_file() and (tmp_path / "out/envelope_curves.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"sweeps": ({"axis": "tlit"},)}, 'did you mean "tilt"'),
+        ({"sweeps": ({"axis": "blur", "easy": 0.0},)}, "above 0"),
+        ({"maps": ({"x": "blur", "y": "blur"},)}, "two different axes"),
+    ],
+)
+def test_axes_and_ends_that_make_no_sense_are_refused(world, changed, match):
+    settings = EnvelopeSettings.model_validate({"run": str(world.run.folder)} | changed)
+    with pytest.raises(Refused, match=match):
+        cells(settings, world.run.folder)
+
+
+def test_every_axis_has_a_sweep_and_every_default_map_its_axes(world):
+    named = [cell.name for cell in cells(EnvelopeSettings(run="run"), world.run.folder.parent)]
+    assert [name for name in named if name.startswith("sweep-")] == [f"sweep-{name}" for name in AXES]
+    assert len(named) == len(AXES) + 6
