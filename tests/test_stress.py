@@ -41,6 +41,7 @@ SCENE = {
     "camera": {"photo_px": [96, 96]},
     "optimize": {"steps": 6, "views": 2},
 }
+PRINTED = {"kind": "patch", "width_mm": 90, "height_mm": 90}
 BRIGHT = {"label": "bright", "models": ["module:fake_networks.bright"]}
 
 
@@ -117,12 +118,12 @@ def test_the_worst_eighth_by_hand():
 
 
 def test_a_step_of_mined_training_depends_on_state_and_number_alone(tmp_path):
-    whole = list(steps(problem_with(tmp_path, optimize={"mine": 8})))
+    whole = list(steps(problem_with(tmp_path, patch=PRINTED, optimize={"mine": 8})))
     middle: State = whole[2].state
-    again = list(steps(problem_with(tmp_path, optimize={"mine": 8}), middle))
+    again = list(steps(problem_with(tmp_path, patch=PRINTED, optimize={"mine": 8}), middle))
     assert [step.state.number for step in again] == [4, 5, 6]
     assert torch.equal(again[-1].state.design, whole[-1].state.design) and again[-1].loss == whole[-1].loss
-    plain = list(steps(problem_with(tmp_path)))
+    plain = list(steps(problem_with(tmp_path, patch=PRINTED)))
     assert not torch.equal(plain[-1].state.design, whole[-1].state.design)
 
 
@@ -131,7 +132,7 @@ class Killed(Exception):
 
 
 def test_a_mined_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
-    scene = toml(tmp_path / "scene.toml", optimize={"mine": 8, "steps": 5})
+    scene = toml(tmp_path / "scene.toml", patch=PRINTED, optimize={"mine": 8, "steps": 5})
 
     def kill(step, total):
         if step.state.number == 3:
@@ -141,7 +142,7 @@ def test_a_mined_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_
     with pytest.raises(Killed):
         optimize_scene(scene, tmp_path / "cut", on_step=kill)
     optimize_scene(scene, tmp_path / "cut", resume=True)
-    for name in ("object.glb", "steps.jsonl", "checkpoint.safetensors", "views.png", "run.json"):
+    for name in ("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png", "run.json"):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes(), name
 
 
@@ -281,7 +282,7 @@ def test_the_stress_study_leaves_tables_maps_and_a_page_twice_alike(tmp_path):
 def test_the_mining_study_compares_at_equal_cost_on_the_same_conditions(tmp_path, monkeypatch):
     monkeypatch.setattr(mining, "SELECT_EVERY", 2)
     monkeypatch.setattr(mining, "SELECT_VIEWS", 4)
-    toml(tmp_path / "scene.toml")
+    toml(tmp_path / "scene.toml", patch=PRINTED)
     (tmp_path / "mining.toml").write_text(MINING)
     finished = run_study("mining", tmp_path / "mining.toml", tmp_path / "out")
     assert not finished.failed

@@ -160,7 +160,7 @@ def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> 
 
 def labels_of(folder: Path, table: Path) -> list[str]:
     """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
-    found = list(dict.fromkeys(label for name, label in _rows(table) if (folder / name).is_file()))
+    found = list(dict.fromkeys(label for name, label in label_rows(table) if (folder / name).is_file()))
     if not found:
         raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
     return found

@@ -40,6 +40,7 @@ from patchproof.sheet.raster import piece_pixels
 from patchproof.study.envelope_axes import GEOMETRY, Point, conditions_at, placed_at
 from patchproof.study.reprint import DPI_RANGE, OVERSAMPLING
 from patchproof.study.sheet import sheet_of
+from patchproof.verify.camera import view_of
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import PromisedRanges
 from patchproof.verify.surface import Surface, surface_of
@@ -273,7 +274,9 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     """What the tool says of a part of a photograph whose corner lies at `origin_px`."""
     whole_px = world.scene.settings.camera.photo_px
     focal_px = float(scene.matrix_px(whole_px)[0, 0]) if isinstance(scene, MeshScene) else None
-    entry = measure(Photo(srgb, focal_px, Path("photo")), "photo", world.surface, None, PromisedRanges({})).entry
+    entry = measure(
+        view_of(Photo(srgb, focal_px, Path("photo")), None), "photo", world.surface, None, PromisedRanges({})
+    ).entry
     error_mm = None
     if entry.status == "measured" and entry.homography_px_from_mm is not None:
         corners = geometry.rect_corners(world.surface.rect_mm)
