@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,8 +18,9 @@ from patchproof.report.plots import ledger_plot
 from patchproof.sheet.manifest import Manifest
 from patchproof.verify.ledger import _ledger, shapley
 from patchproof.verify.print_fit import fit_print
+from patchproof.verify.reproject import deblurred
 from patchproof.verify.run import gather_evidence
-from patchproof.verify.surface import surface_of
+from patchproof.verify.surface import piece_picture, promised_of, surface_of
 from test_photo_synthetic import CONDITION, make_manifest, page_raster, photograph, save, view
 
 SIZE, PHOTOS = (640, 480), 5
@@ -64,12 +66,14 @@ def test_the_print_is_read_from_swatches_and_needs_eight_of_them():
     corners = np.array(list(product((0.02, 1.0), repeat=3)) + [(g, g, g) for g in (0.1, 0.3, 0.6)])
     faded = 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)
     seen = np.stack([faded, faded, np.full_like(faded, np.nan)])
-    printed = fit_print(list(seen), corners)
+    ink = np.full(3, 0.02)
+    printed = fit_print(list(seen), corners, ink)
+    assert printed(np.stack([ink, np.ones(3)])) == pytest.approx(np.stack([ink, np.ones(3)]), abs=0.01)
     assert printed(corners) == pytest.approx(faded, abs=0.02)
     assert printed(promised[None]) == pytest.approx(promised[None], abs=0.03)
     few = faded.copy()
     few[7:] = np.nan
-    assert fit_print([few], corners) is None
+    assert fit_print([few], corners, ink) is None
 
 
 @functools.cache
@@ -161,3 +165,31 @@ def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
     found = pattern_light(srgb, homography, on_piece, surface.dictionary, 0.9 * sigma)
     assert found.paper == pytest.approx(0.75, abs=tolerance + 0.02) and found.ink == pytest.approx(0, abs=tolerance)
     assert found.blur_px == pytest.approx(sigma, abs=0.2)
+    assert found.agreement > 0.9
+    turned = homography @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
+    lost = pattern_light(srgb, turned, on_piece, surface.dictionary, 0.9 * sigma)
+    assert lost is None or lost.agreement < 0.6
+
+
+def test_the_piece_is_drawn_as_the_page_shows_it():
+    surface = surface_of(sheet())
+    promised = promised_of(sheet(), surface, identity_printer())
+    drawn = piece_picture(surface, promised.design, promised.swatches, promised.ink)
+    x, y, w, h = (round(v * 10) for v in surface.piece_mm)
+    page = cv2.resize(
+        page_raster(sheet(), True)[y : y + h, x : x + w], drawn.shape[1::-1], interpolation=cv2.INTER_AREA
+    )
+    assert np.abs(drawn - page).mean() < 0.02
+
+
+def test_blur_is_taken_back_as_far_as_noise_allows():
+    rng = np.random.default_rng(0)
+    sharp = cv2.resize(rng.uniform(0.2, 0.8, (24, 24, 3)).astype(np.float32), (144, 144), interpolation=cv2.INTER_CUBIC)
+    soft = cv2.GaussianBlur(sharp, (0, 0), 2.5)
+    noisy = soft + rng.normal(0, 0.005, soft.shape).astype(np.float32)
+    inner = np.s_[12:-12, 12:-12]
+    left = np.abs(deblurred(noisy, 2.5, 0.3, 0.005) - sharp)[inner].mean()
+    assert left < 0.4 * np.abs(soft - sharp)[inner].mean()
+    # the other way it is a blur, and nothing changes where nothing should
+    assert deblurred(sharp, 0.0, 2.5, 0.0)[inner] == pytest.approx(soft[inner], abs=1e-5)
+    assert np.abs(deblurred(sharp, 1.0, 1.0, 0.0) - sharp).max() < 1e-6

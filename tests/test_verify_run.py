@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
+from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.read import Photo
 from patchproof.settings import Refused
 from patchproof.verify.camera import view_of
@@ -18,7 +20,7 @@ from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges
 from patchproof.verify.run import gather_evidence
 from patchproof.verify.surface import promised_of, surface_of
-from test_photo_synthetic import make_manifest, page_raster, photograph, save, view
+from test_photo_synthetic import COLORS, make_manifest, page_raster, photograph, save, view
 
 
 def promise(conditions=()):
@@ -74,6 +76,32 @@ def test_light_and_white_balance_are_no_color_difference_but_another_design_is()
     assert tinted == pytest.approx(plain, abs=0.5)
     faded = np.clip(make_manifest().design.pixels() * 0.5 + 90, 0, 255).astype(np.uint8)
     assert measured(shot(), manifest=make_manifest(design=faded)).entry.delta_e00_mean > plain + 5
+
+
+def test_each_swatch_is_compared_with_its_promise():
+    entry = measured(shot(jpeg=90)).entry
+    assert [s.srgb for s in entry.swatches] == COLORS
+    assert max(s.delta_e00 for s in entry.swatches) < 3
+    assert entry.swatches[0].promised == pytest.approx(entry.swatches[0].seen, abs=0.05)
+    wrong = make_manifest()
+    chart = (wrong.chart[0].model_copy(update={"srgb": (0.5, 0.0, 0.0)}), *wrong.chart[1:])  # printed black
+    deltas = [s.delta_e00 for s in measured(shot(), manifest=wrong.model_copy(update={"chart": chart})).entry.swatches]
+    assert np.argmax(deltas) == 0 and deltas[0] > 10
+
+
+def test_gloss_on_the_design_is_left_out_and_counted():
+    plain = measured(shot(light=0.5)).entry
+    assert plain.glossy_share == 0 and plain.clipped_share == 0
+    srgb = shot(light=0.5)
+    spot = cv2.warpPerspective(
+        np.pad(np.full((30, 30), 0.25, np.float32), ((115, 152), (90, 90))),
+        np.array(plain.homography_px_from_mm),
+        srgb.shape[1::-1],
+    )
+    shiny = srgb_from_linear(linear_from_srgb(srgb / 255) + spot[..., None]) * 255
+    entry = measured(np.clip(shiny + 0.5, 0, 255).astype(np.uint8)).entry
+    assert entry.glossy_share == pytest.approx(0.09, abs=0.03) and entry.code is None
+    assert entry.delta_e00_mean == pytest.approx(plain.delta_e00_mean, abs=0.5)
 
 
 def test_without_swatches_paper_and_ink_fix_the_color():

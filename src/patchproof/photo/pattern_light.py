@@ -27,11 +27,15 @@ _BLURS = np.linspace(0.8, 1.5, 15)  # times the blur that borders show, which fa
 
 @dataclass(frozen=True)
 class PatternLight:
-    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that explains the cells best."""
+    """Linear light (3,) of paper and ink, and the Gaussian blur in pixels that explains the cells best.
+
+    `agreement` is the correlation of the cells' light with what is printed there; 1 where the homography is right.
+    """
 
     paper: np.ndarray
     ink: np.ndarray
     blur_px: float
+    agreement: float
 
 
 def pattern_light(
@@ -56,11 +60,12 @@ def pattern_light(
     for blur in blur_px * _BLURS:
         pattern = np.concatenate([_blurred(cells, blur / module)[usable] for cells, module, usable in markers])
         if pattern.std() > 0.02:
-            fits.append((*_regressed(pattern, light), blur))
+            agreement = float(np.corrcoef(pattern, light.mean(1))[0, 1])
+            fits.append((*_regressed(pattern, light), blur, agreement))
     if not fits:
         return None
-    _, paper, ink, blur = min(fits, key=lambda fit: fit[0])
-    return PatternLight(np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur))
+    _, paper, ink, blur, agreement = min(fits, key=lambda fit: fit[0])
+    return PatternLight(np.minimum(paper, 1.2), np.maximum(ink, 0), float(blur), agreement)
 
 
 def _regressed(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@
 
 In: `Shot`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in confidence
 (for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over photographs. Each
-photograph is classified with its design re-projected under all combinations of four effects on or off (`reproject`),
+photograph is classified with its piece re-projected under all combinations of four effects on or off (`reproject`),
 and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person Games, 1953):
 
     share_k = Σ_{S ∌ k} |S|! (n - |S| - 1)! / n! · (v(S) - v(S ∪ {k}))
@@ -32,7 +32,7 @@ from patchproof.sheet.manifest import Manifest
 from patchproof.verify.print_fit import fit_print
 from patchproof.verify.reproject import Reference, Shot, design_fit, light_fit, squares_with
 from patchproof.verify.results import Ledger, LedgerShare
-from patchproof.verify.surface import Promised, Surface, reduced
+from patchproof.verify.surface import Promised, Surface, piece_picture, reduced
 
 if TYPE_CHECKING:
     from patchproof.classifier import Classifier
@@ -64,12 +64,13 @@ def ledger_of(
     if not shots or not conditions or promised.design is None:
         return None
     undo = [light_fit(shot, promised) for shot in shots]
-    printed = fit_print([fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)], promised.swatches)
-    looks = _looks(manifest, promised, printed)
+    relative = [fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)]
+    printed = fit_print(relative, promised.swatches, promised.ink)
+    looks = _looks(manifest, surface, promised, printed)
     values = []
     for shot, fit, reference in zip(shots, undo, _references(conditions, shots, manifest, promised), strict=True):
-        design_light = fit if printed is not None else design_fit(shot, promised, surface)
-        squares = squares_with(shot, looks, surface.rect_mm, fit, design_light, reference)
+        print_light = fit if printed is not None else design_fit(shot, promised, surface)
+        squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
         values.append(_confidences(squares, model, indices))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
     seen = np.array([confidence[shot.file] for shot in shots])
@@ -118,10 +119,14 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
     return names[top] if clear and names[top] != PHOTO else None
 
 
-def _looks(manifest: Manifest, promised: Promised, printed) -> dict[tuple[bool, ...], np.ndarray]:
-    """The design's light by (gamut, print), or by (gamut, False) alone where the print is not known."""
-    ideal = reduced(linear_from_srgb(manifest.design.pixels() / 255.0).astype(np.float32))
-    looks = {(False, False): ideal, (True, False): promised.design}
+def _looks(manifest: Manifest, surface: Surface, promised: Promised, printed) -> dict[tuple[bool, ...], np.ndarray]:
+    """The piece's light by (gamut, print), or by (gamut, False) alone where the print is not known."""
+    design = reduced(linear_from_srgb(manifest.design.pixels() / 255.0).astype(np.float32))
+    sent = piece_picture(surface, design, linear_from_srgb(surface.swatches_srgb), np.zeros(3))
+    looks = {
+        (False, False): sent,
+        (True, False): piece_picture(surface, promised.design, promised.swatches, promised.ink),
+    }
     if printed is not None:
         looks |= {(gamut, True): printed(look) for (gamut, _), look in list(looks.items())}
     return looks

@@ -20,8 +20,13 @@ from patchproof.photo.colorfit import LEAST_SWATCHES
 _SMOOTHING = 1e-3  # keeps reading errors of half a code value from bending the spline
 
 
-def fit_print(relative: Sequence[np.ndarray], promised: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Linear light `... × 3` as printed from linear light as promised; `relative` N×3 per photo, NaN where unread."""
+def fit_print(
+    relative: Sequence[np.ndarray], promised: np.ndarray, ink: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Linear light `... × 3` as printed from linear light as promised; `relative` N×3 per photo, NaN where unread.
+
+    Paper and marker `ink` keep their light: that they do is how light is told from print.
+    """
     from scipy.interpolate import RBFInterpolator
 
     if not len(promised) or not relative:
@@ -32,8 +37,9 @@ def fit_print(relative: Sequence[np.ndarray], promised: np.ndarray) -> Callable[
     readable = np.isfinite(pooled).all(1)
     if readable.sum() < LEAST_SWATCHES:
         return None
-    sent = srgb_from_linear(promised[readable])
-    seen = srgb_from_linear(np.clip(pooled[readable], 0, 1))
+    fixed = np.stack([np.ones(3), ink])
+    sent = srgb_from_linear(np.concatenate([promised[readable], fixed]))
+    seen = srgb_from_linear(np.clip(np.concatenate([pooled[readable], fixed]), 0, 1))
     try:
         difference = RBFInterpolator(sent, seen - sent, kernel="thin_plate_spline", degree=1, smoothing=_SMOOTHING)
     except np.linalg.LinAlgError:  # swatches in one plane of the color cube

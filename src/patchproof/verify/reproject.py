@@ -1,14 +1,13 @@
-"""The digital design put back into its photograph, with each effect of print, light and camera switched on or off.
+"""The digital piece put back into its photograph, with each effect of print, light and camera switched on or off.
 
-In: a `Shot` (the centered square of a photograph as a network nearly sees it, and what was measured in it), the design
+In: a `Shot` (the centered square of a photograph as a network nearly sees it, and what was measured in it), the piece
 as it could have been printed, and a `Reference`: light and blur of one of the promise's own conditions. Out: the
-square with the design's pixels replaced. Outside of the design everything stays as photographed; the light, which falls
-on all of it, is undone everywhere. Work is done at three times the network's size at most: finer detail is averaged
-away before the network sees it.
+square with the piece replaced, frame and all. Light and blur fall on the surroundings, too: there they are undone as
+far as noise allows (Wiener's filter for the known blur). Work is done at three times the network's size at most: finer
+detail is averaged away before the network sees it.
 
-Left out on purpose: the blur of what surrounds the design cannot be undone and stays; JPEG, whose blocks are smaller
-than a network's pixel in a photograph of usual size; shadows, glare and uneven light, which the ledger counts as not
-explained.
+Left out on purpose: JPEG, whose blocks are smaller than a network's pixel in a photograph of usual size; shadows, glare
+and uneven light, which the ledger counts as not explained.
 """
 
 from __future__ import annotations
@@ -32,9 +31,8 @@ FINER = 3  # times the network's input size
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
 _CELLS = 16  # of the design, along its shorter side, where its own colors stand in for swatches
 _NOT_BLURRED_PX = 0.1
-# JPEG halves the resolution of color: read up to their borders, swatches came out up to 17 code values off and a right
-# print cost 5 points; with this much more blur in mind, up to 5 and mostly under 1
-_CHROMA_PX = 1.0
+_LEAST_AGREEMENT = 0.6  # of marker cells with the print, where right homographies reach 0.9 and more
+_LEAST_NOISE = 0.004  # of linear light: code values and JPEG
 _SUPERSAMPLE = 2
 _LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
 
@@ -66,8 +64,11 @@ class Reference:
     noise: float
 
 
-def shot_of(srgb: np.ndarray, entry: PhotoEntry, light: FrameLight, surface: Surface, input_px: int) -> Shot:
-    """What the ledger keeps of an uint8 photograph whose entry has a homography and a blur."""
+def shot_of(srgb: np.ndarray, entry: PhotoEntry, light: FrameLight, surface: Surface, input_px: int) -> Shot | None:
+    """What the ledger keeps of an uint8 photograph whose entry has a homography and a blur.
+
+    None where the markers do not lie where the homography says: few blurred corners can turn it far away.
+    """
     height, width = srgb.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
@@ -83,8 +84,10 @@ def shot_of(srgb: np.ndarray, entry: PhotoEntry, light: FrameLight, surface: Sur
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     unmixed = pattern_light(srgb, homography, on_piece, surface.dictionary, entry.blur_px)
     if unmixed is not None:
+        if unmixed.agreement < _LEAST_AGREEMENT:
+            return None
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
-    swatches = seen_swatches(part, _LINEAR[part], part_from_mm, surface, blur_px + _CHROMA_PX)
+    swatches = seen_swatches(part, _LINEAR[part], part_from_mm, surface, blur_px, light.paper)
     square = np.ascontiguousarray(square)
     return Shot(entry.file, square, to_square @ homography, light, blur_px * scale, noise_of(square), swatches, scale)
 
@@ -112,7 +115,11 @@ def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:
     seen = rectify(_LINEAR[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
     expected = cv2.resize(promised.design, seen.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
     inner = np.s_[1:-1, 1:-1]  # the rim has the white of the frame in it
-    fit = affine12(seen[inner].reshape(-1, 3), expected[inner].reshape(-1, 3))
+    frame = [[shot.light.paper, shot.light.ink], [np.ones(3), promised.ink]]  # which is put back, too
+    sides = [
+        np.concatenate([a[inner].reshape(-1, 3), *[f] * _CELLS]) for a, f in zip((seen, expected), frame, strict=True)
+    ]
+    fit = affine12(*sides)
     return fit or light_fit(shot, promised)
 
 
@@ -121,20 +128,23 @@ def squares_with(
     looks: Mapping[tuple[bool, bool], np.ndarray],
     rect_mm: tuple[float, float, float, float],
     undo: ColorFit,
-    design_light: ColorFit,
+    print_light: ColorFit,
     reference: Reference,
 ) -> dict[tuple[bool, bool, bool, bool], np.ndarray]:
     """Float32 sRGB squares W×W×3 by (gamut, print, light, blur).
 
-    `looks` are the design's media-relative linear light by (gamut, print). `undo` takes photographed light to
-    media-relative; the inverse of `design_light` is what the photograph's light makes of a look.
+    `looks` are the media-relative linear light of the piece at `rect_mm` by (gamut, print). `undo` takes photographed
+    light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
     """
     box = _box(shot, rect_mm)
-    shown = {True: _LINEAR[shot.square]}
-    shown[False] = np.clip(reference.white * undo.apply(shown[True]), 0, 1).astype(np.float32)
-    around = {light: srgb_from_linear(picture) for light, picture in shown.items()}
+    seen = _LINEAR[shot.square]
+    around = {}
+    for blur, picture in ((True, seen), (False, deblurred(seen, shot.blur_px, reference.blur_px, shot.noise))):
+        around[True, blur] = picture
+        around[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
+    coded = {key: srgb_from_linear(picture) for key, picture in around.items()}
     grain = np.random.default_rng(0).standard_normal((*box.shape, 3), np.float32)
-    lit = {True: _inverse(design_light), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
+    lit = {True: _inverse(print_light), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
     out = {}
     for (gamut, printed), look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
@@ -143,15 +153,35 @@ def squares_with(
             share = layer[..., 3:]
             for light, matrix in lit.items():
                 color = layer[..., :3] @ matrix[:, :3].T + share * matrix[:, 3]
-                mixed = color + (1 - share) * shown[light][box.slices]
+                mixed = color + (1 - share) * around[light, blur][box.slices]
                 # what the photograph's noise is at the reference's light, and the other way round
                 level = float(np.clip(np.mean(mixed), 0, 1))
                 noise = shot.noise if blur else reference.noise * np.sqrt(level + _READ_SHARE_SQUARE)
                 mixed = mixed + share * noise * grain
-                picture = around[light].copy()
+                picture = coded[light, blur].copy()
                 picture[box.slices] = srgb_from_linear(np.clip(mixed, 0, 1))
                 out[gamut, printed, light, blur] = picture
     return out
+
+
+def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) -> np.ndarray:
+    """Linear light H×W×3 whose Gaussian blur is brought from one sigma to another, by Wiener's filter.
+
+    Power is taken to fall with the square of frequency, as it does in pictures of nearly everything (Field, Relations
+    between the statistics of natural images and the response properties of cortical cells, JOSA A 4, 1987).
+    """
+    if from_px <= to_px:
+        return _blurred(linear, float(np.sqrt(to_px**2 - from_px**2)))
+    margin = int(np.ceil(6 * from_px))
+    wide = cv2.copyMakeBorder(linear, *[margin] * 4, cv2.BORDER_REFLECT)
+    height, width = wide.shape[:2]
+    square = np.fft.fftfreq(height)[:, None] ** 2 + np.fft.rfftfreq(width) ** 2  # cycles per pixel, squared
+    power = np.maximum(linear.var(), 1e-4) / (2 * np.pi * np.log(min(height, width) / 2))
+    transfer = np.exp(-2 * np.pi**2 * from_px**2 * square)
+    wanted = np.exp(-2 * np.pi**2 * to_px**2 * square)
+    gain = wanted * transfer / (transfer**2 + max(noise, _LEAST_NOISE) ** 2 * square / power)
+    back = np.fft.irfft2(np.fft.rfft2(wide, axes=(0, 1)) * gain[..., None], (height, width), axes=(0, 1))
+    return np.clip(back[margin:-margin, margin:-margin], 0, 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -173,7 +203,7 @@ class _Box:
 
 
 def _box(shot: Shot, rect_mm) -> _Box:
-    """The part of the square that holds the design and what blur carries beyond it."""
+    """The part of the square that holds the piece and what blur carries beyond it."""
     from patchproof.geometry import apply_homography, rect_corners
 
     quad, side = apply_homography(shot.px_from_mm, rect_corners(rect_mm)), shot.square.shape[0]

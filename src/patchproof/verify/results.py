@@ -28,6 +28,15 @@ class Prediction(Strict):
     recognized: bool
 
 
+class SwatchSeen(Strict):
+    """One swatch that was readable: sRGB as sent, as the promise's printer has it and as seen after the color fit."""
+
+    srgb: Row
+    promised: Row
+    seen: Row
+    delta_e00: Finite
+
+
 class PhotoEntry(Strict):
     """One photograph; a rejected one is not counted."""
 
@@ -54,6 +63,9 @@ class PhotoEntry(Strict):
     delta_e00_mean: Finite | None = None
     delta_e00_p95: Finite | None = None
     color_fit: str | None = None
+    clipped_share: Finite | None = None  # of the design
+    glossy_share: Finite | None = None
+    swatches: tuple[SwatchSeen, ...] = ()
     homography_px_from_mm: tuple[Row, Row, Row] | None = None
     predictions: dict[str, Prediction] = Field(default_factory=dict)
 

@@ -14,10 +14,12 @@ import numpy as np
 
 from patchproof.color import linear_from_srgb
 from patchproof.geometry import rect_corners
+from patchproof.photo.detect import cells_of
 from patchproof.photo.label import Label, label_of
 from patchproof.sheet.manifest import Manifest
 
 _LARGEST_PX = 512  # of the design as it is compared; photographs never resolve more
+_LARGEST_PIECE_PX = 1024  # of the piece as it is put back
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,33 @@ def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
     if manifest.design:
         design = reduced(printed(manifest.design.pixels() / 255.0).astype(np.float32))
     return Promised(design, swatches[:-1], swatches[-1])
+
+
+def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, ink: np.ndarray) -> np.ndarray:
+    """The whole piece, frame and all, as float32 linear light H×W×3 over `piece_mm`: white paper and what is on it.
+
+    Scissors, folds and what a shop adds beside the frame are left out. Edges fall on whole pixels.
+    """
+    x, y, w, h = surface.piece_mm
+    px_per_mm = min(design.shape[1] / surface.rect_mm[2], _LARGEST_PIECE_PX / max(w, h))
+    picture = np.ones((max(1, round(h * px_per_mm)), max(1, round(w * px_per_mm)), 3), np.float32)
+
+    def paste(rect, pixels: np.ndarray, how: int) -> None:
+        corners = (np.array(rect_corners(rect))[[0, 2]] - (x, y)) * px_per_mm
+        (x0, y0), (x1, y1) = np.clip(np.rint(corners), 0, picture.shape[1::-1]).astype(int)
+        if x1 > x0 and y1 > y0:
+            size = int(x1 - x0), int(y1 - y0)
+            picture[y0:y1, x0:x1] = cv2.resize(pixels.astype(np.float32), size, interpolation=how)
+
+    ids = sorted(surface.piece_ids)
+    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, surface.dictionary))
+    for i, cells in zip(ids, cells_of(printed, ids) if ids else (), strict=True):
+        low, high = surface.corners_mm[i].min(0), surface.corners_mm[i].max(0)
+        paste((*low, *(high - low)), ink + cells[..., None] * (1 - ink), cv2.INTER_NEAREST)
+    for rect, color in zip(surface.swatch_rects_mm, swatches, strict=True):
+        paste(rect, color[None, None], cv2.INTER_NEAREST)
+    paste(surface.rect_mm, design, cv2.INTER_AREA)
+    return picture
 
 
 def reduced(linear: np.ndarray) -> np.ndarray:
