@@ -2,7 +2,7 @@
 
 In: a problem whose settings ask for `mine` tries. Out: the conditions of all training steps. Before the first step
 the clean object is shown in a quarter as many poses and lights, forward only, each before the same `BACKDROPS` draws of
-background, print and camera: alone, a draw's loss says more of its background than of its pose (of the worst eighth of
+background, print and camera: alone, a draw's loss says more of its background than of its pose (in one scene, of the worst eighth of
 256 single draws, 6 % lay in the worst tenth of pose × light). Every other training view then takes its pose and light
 from the worst eighth. The rest stays as drawn, so that what is easy is not forgotten.
 
