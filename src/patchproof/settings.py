@@ -226,7 +226,7 @@ class OptimizeSettings(Strict):
     steps: Annotated[int, Field(ge=1)] = 120
     views: Annotated[int, Field(ge=1)] = 12
     refresh: Annotated[int, Field(ge=1)] = 1  # steps for which views keep their poses, lit and printed anew
-    mine: Annotated[int, Field(ge=0)] = 0  # conditions tried beforehand: half of the views come from their worst
+    mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on come from the worst
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
     step_size: Positive = 0.1

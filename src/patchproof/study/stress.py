@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from patchproof.optimize.mining import LIGHT, POSE, clean_losses
+from patchproof.optimize.mining import LIGHT, POSE, clean_losses, each_before_all
 from patchproof.optimize.pixels import as_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import expose
@@ -189,14 +189,14 @@ def worst_case(
     rest = scene.draw("select", settings.draws, seed)
     for number in range(settings.rounds):
         drawn = scene.draw("select", settings.tries, seed, settings.draws + number * settings.tries)
-        tried = {name: getattr(drawn, name) for name in names}
-        if best is not None:
-            tried = {name: best[name] + 0.5**number * (values - best[name]) for name, values in tried.items()}
-        losses = clean_losses(problem, _each_with_all(rest, tried, settings.tries))
+        if best is not None:  # between two points of a box all lies within it
+            nearer = {name: best[name] + 0.5**number * (getattr(drawn, name) - best[name]) for name in names}
+            drawn = replace(drawn, **nearer)
+        losses = clean_losses(problem, each_before_all(drawn, rest, names))
         losses = losses.reshape(settings.tries, settings.draws).mean(1)
         if losses.max() > best_loss:
             best_loss, row = float(losses.max()), int(losses.argmax())
-            best = {name: values[row : row + 1] for name, values in tried.items()}
+            best = {name: getattr(drawn, name)[row : row + 1] for name in names}
         course.append(best_loss)
     fresh = scene.draw("evaluate", settings.n, seed + _MEASURING)
     there = judge(problem, {"clean": None}, _with(fresh, best))["clean"]
@@ -216,12 +216,6 @@ def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
     lamps = drawn.point.max() > 0
     figures = {name: getattr(drawn, name) for name in names if lamps or not name.startswith("point")}
     return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
-
-
-def _each_with_all(rest: Conditions, tried: Mapping[str, np.ndarray], tries: int) -> Conditions:
-    """tries × draws rows: every try with every draw of the rest."""
-    rows = np.tile(np.arange(len(rest)), tries)
-    return replace(rest[rows], **{name: values.repeat(len(rest), 0) for name, values in tried.items()})
 
 
 def _with(conditions: Conditions, values: Mapping[str, np.ndarray]) -> Conditions:
