@@ -29,7 +29,7 @@ from patchproof.settings import Refused, Strict, nearest, read_toml, validated
 from patchproof.workers import Workers, one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is, imported when asked for
-STUDIES: dict[str, str] = {}
+STUDIES: dict[str, str] = {"detection": "patchproof.study.detection"}
 _LIBRARIES = ("patchproof", "torch", "numpy")
 _NAME = re.compile(r"[\w=+.,-]{1,120}")
 
