@@ -158,12 +158,13 @@ def test_difference_maps_have_one_scale_and_show_what_was_not_measured():
 
 
 PROBE = """<script>
-const wide = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg") && e.getBoundingClientRect().right > innerWidth + 1);
-const small = [...document.querySelectorAll("main *")].filter(e => !e.closest("svg") && e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11);
-const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth));
-document.title = JSON.stringify({width: document.documentElement.scrollWidth, inner: innerWidth, wide: wide.map(e => e.tagName),
-  small: small.length, broken: broken.length, images: document.images.length, errors: window.troubles,
-  fetched: performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"))});
+const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg"));
+const wide = all.filter(e => e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName);
+const small = all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length;
+const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth)).length;
+const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"));
+document.title = JSON.stringify({wide, small, broken, fetched, width: document.documentElement.scrollWidth,
+  inner: innerWidth, images: document.images.length, errors: window.troubles});
 </script></body>"""
 EARLY = "<head><script>window.troubles = []; window.onerror = m => { window.troubles.push(String(m)) }</script>"
 

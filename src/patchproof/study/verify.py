@@ -94,9 +94,7 @@ def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
         check_folder(out, OWN if begun else (), overwrite=begun)
         return
     if begun and not overwrite and not (out / "report.json").is_file():
-        raise Refused(
-            "an empty or new folder", f"{out} with a verification not finished", "add --resume, or --overwrite"
-        )
+        raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
     check_folder(out, OWN, overwrite)
 
 
