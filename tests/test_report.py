@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import html
+import io
 import json
 import re
 import shutil
@@ -11,9 +14,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from patchproof.report.images import delta_map
+from patchproof.report.images import delta_map, save_pictures
+from patchproof.report.photo_table import photos_csv
 from patchproof.report.write import write_report
-from patchproof.verify.results import PhotoEntry, Prediction, Report, Summary
+from patchproof.verify.results import Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
 from test_photo_synthetic import make_manifest
 from test_verify_run import promise
 
@@ -24,16 +28,27 @@ def some_report(verdict="kept"):
         PhotoEntry(
             file=f"p{i}.jpg", status="measured", markers_found=8, residual_mm=0.02, px_per_mm=1.0 + i, tilt_deg=5.0 * i,
             contrast=0.7, blur_px=0.6, corner_uncertainty_mm=0.05, delta_e00_mean=2.0, delta_e00_p95=4.0,
-            color_fit="affine12", predictions={"net": seen},
+            color_fit="affine12", predictions={"net": seen}, sha256="f" * 64, scale_x=0.97, scale_y=0.971 + i / 1000,
         )
         for i in range(3)
     ]  # fmt: skip
     photos.append(PhotoEntry(file="bad.jpg", status="rejected", code="unreadable", advice="copy it again"))
     summary = Summary(
         photos=4, judged=3, measured=3, rate=1.0, interval=(0.44, 1.0), prediction_interval=(2, 3), verdict=verdict,
-        effect="not_tested", matched_rate=None,
+        effect="not_tested", matched_rate=None, reason="3 of 3 photographs were recognized.",
     )  # fmt: skip
-    return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary)
+    origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
+    controls = (Control("grey", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 0.5, False),)
+    return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
+
+
+def some_ledger():
+    steps = ("gamut", "print", "light_and_camera", "blur_and_noise", "photo")
+    shares = {
+        step: LedgerShare(share=share, interval=(share - 0.02, share + 0.02)).model_dump()
+        for step, share in zip(steps, (0.01, 0.2, 0.05, -0.02, 0.03), strict=True)
+    }
+    return {"shares": shares, "ideal": 0.9, "photo": 0.63, "photos": 12, "culprit": "print"}
 
 
 def pictures():
@@ -46,8 +61,9 @@ def written(out, verdict="kept"):
     rest = dict(azimuth_deg=None, contrast=None, blur_px=None, recognized=True)
     claims = [dict(px_per_mm=1.0 + i % 3, tilt_deg=float(i), **rest) for i in range(30)]
     manifest = make_manifest(promise(claims)).model_dump(mode="json")
-    notes = {"reason": "3 of 3 photographs were recognized.", "controls": []}
-    return write_report(some_report(verdict).model_dump(), manifest, pictures(), out, notes)
+    for file, kinds in pictures().items():
+        save_pictures(out / "pictures", file, kinds)
+    return write_report(some_report(verdict).model_dump(mode="json"), manifest, out, {"ledger": some_ledger()})
 
 
 class Tags(HTMLParser):
@@ -79,10 +95,16 @@ def test_the_page_says_what_the_report_says_and_escapes_it(tmp_path):
         "copy it again",
         "&lt;b&gt;bright",
         "not measured",
+        "3 of 3 photographs were recognized.",
+        "97.1, 97.3",
+        "e" * 64,
+        "f" * 64,
+        "numpy 1",
+        "+67 points",
     ):
         assert words in text
     assert "<b>bright" not in text and "Promise broken" not in text
-    assert text.count("<svg") == 2
+    assert text.count("<svg") == 4  # tilt, pixels per mm, print scale, ledger
 
 
 def test_json_is_the_report_and_nothing_else(tmp_path):
@@ -90,6 +112,28 @@ def test_json_is_the_report_and_nothing_else(tmp_path):
     assert json.loads((tmp_path / "report.json").read_text()) == json.loads(some_report().dump())
     assert (tmp_path / "report.json").read_text() == some_report().dump()
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir())[0] == "p0.jpg.delta_e00.png"
+
+
+def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(tmp_path):
+    written(tmp_path)
+    rows = list(csv.DictReader((tmp_path / "report.csv").open(encoding="utf-8")))
+    photos = some_report().photos
+    assert [row["file"] for row in rows] == [photo.file for photo in photos]
+    assert (
+        float(rows[2]["scale_y"]) == photos[2].scale_y and rows[3]["scale_y"] == "" and rows[3]["code"] == "unreadable"
+    )
+    assert rows[0]["net label"] == "<b>bright</b>" and float(rows[0]["net confidence"]) == 0.8
+    names = set(PhotoEntry.model_fields) - {"homography_px_from_mm", "predictions"}
+    assert (
+        names <= rows[0].keys()
+        and {f"homography_px_from_mm_{i}{j}" for i in range(3) for j in range(3)} <= rows[0].keys()
+    )
+
+
+def test_csv_holds_no_formula():
+    entry = PhotoEntry(file="=1+1.jpg", status="rejected", homography_px_from_mm=((1, 2, 3), (4, 5, 6), (7, 8, 9.5)))
+    (row,) = csv.DictReader(io.StringIO(photos_csv([entry.model_dump(mode="json")])))
+    assert row["file"] == "'=1+1.jpg" and row["homography_px_from_mm_22"] == "9.5"
 
 
 def test_the_same_report_has_the_same_bytes(tmp_path):
@@ -102,7 +146,7 @@ def test_a_sheet_without_a_promise_has_a_page_too(tmp_path):
         effect="not_tested", matched_rate=None,
     )  # fmt: skip
     report = Report(sheet_id="TESTSHEET0", photos=(), summary=summary)
-    page = write_report(report.model_dump(), make_manifest().model_dump(mode="json"), {}, tmp_path)
+    page = write_report(report.model_dump(mode="json"), make_manifest().model_dump(mode="json"), tmp_path)
     assert "Cannot tell" in page.read_text()
 
 
@@ -113,19 +157,28 @@ def test_difference_maps_have_one_scale_and_show_what_was_not_measured():
     assert colors[1, 1, 3] == 0 and colors[0, 0, 3] == 255
 
 
-def test_a_browser_shows_it_without_scrolling_sideways_on_a_phone(tmp_path):
+PROBE = """<script>
+const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg"));
+const wide = all.filter(e => e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName);
+const small = all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length;
+const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth)).length;
+const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"));
+document.title = JSON.stringify({wide, small, broken, fetched, width: document.documentElement.scrollWidth,
+  inner: innerWidth, images: document.images.length, errors: window.troubles});
+</script></body>"""
+EARLY = "<head><script>window.troubles = []; window.onerror = m => { window.troubles.push(String(m)) }</script>"
+
+
+def seen_in_browser(page, width_px, tmp_path):
+    """What a browser says of the page in a frame of that width, since a headless window is never narrower than 500."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium here to look at the page")
-    page = written(tmp_path)
-    probe = page.read_text().replace(
-        "</body>", "<script>document.title = 'w' + document.documentElement.scrollWidth</script></body>"
-    )
+    probe = page.read_text(encoding="utf-8").replace("<head>", EARLY, 1).replace("</body>", PROBE)
+    (tmp_path / "probe.html").write_text(probe, encoding="utf-8")
     frame = tmp_path / "frame.html"
-    (tmp_path / "probe.html").write_text(probe)
-    # a frame of 390 px, since a headless window is never narrower than 500
     frame.write_text(
-        "<iframe src='probe.html' width='390' height='800' style='border:0' onload='"
+        f"<iframe src='probe.html' width='{width_px}' height='800' style='border:0' onload='"
         "document.title = this.contentDocument ? this.contentDocument.title : 0'></iframe>"
     )
     flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
@@ -133,5 +186,22 @@ def test_a_browser_shows_it_without_scrolling_sideways_on_a_phone(tmp_path):
         f" --disable-component-update --disable-sync --allow-file-access-from-files --user-data-dir={tmp_path / 'u'}"
     )
     done = subprocess.run([browser, *flags.split(), "--dump-dom", frame.as_uri()], capture_output=True, timeout=60)
-    width = re.search(r"<title>w(\d+)</title>", done.stdout.decode())
-    assert width is not None and int(width[1]) <= 390
+    title = re.search(r"<title>(\{.*?\})</title>", done.stdout.decode())
+    assert title is not None, done.stderr.decode()[-500:]
+    return json.loads(html.unescape(title[1]))
+
+
+def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways_or_asking_anybody(tmp_path):
+    seen = seen_in_browser(written(tmp_path), 390, tmp_path)
+    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == []
+    assert seen["images"] == 5 and seen["broken"] == 0 and seen["small"] == 0
+    assert seen["errors"] == [] and seen["fetched"] == []
+
+
+def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(tmp_path):
+    page = written(tmp_path)
+    bad = "<div style='width:900px'>x</div><img src='gone.png'><script>nothing.at.all</script></main>"
+    page.write_text(page.read_text(encoding="utf-8").replace("</main>", bad), encoding="utf-8")
+    seen = seen_in_browser(page, 390, tmp_path)
+    assert seen["width"] > 390 and seen["wide"] == ["DIV"] and seen["broken"] == 1
+    assert len(seen["errors"]) == 1 and len(seen["fetched"]) == 1

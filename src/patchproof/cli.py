@@ -284,6 +284,7 @@ def verify(
     ledger: Annotated[int, typer.Option(min=0, help="Photographs in the gap ledger at most; 0 for none.")] = 24,
     jobs: Jobs = 1,
     cluster: Cluster = None,
+    resume: Resume = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure photographs of the print and judge them against the promise."""
@@ -306,6 +307,7 @@ def verify(
             camera=camera,
             jobs=jobs,
             cluster=cluster,
+            resume=resume,
             overwrite=overwrite,
             on_photo=lambda done, total: bar("verify", done, total),
         )

@@ -33,6 +33,13 @@ QUEUED = 1000  # items that a cluster is given at a time: enough to keep it busy
 _ANSWER_S = 10  # that a cluster's scheduler may take to answer
 
 
+class WorkerDied(Refused):
+    """One item's worker died at each try; the others' results stand."""
+
+    def __reduce__(self):
+        return WorkerDied, self._parts
+
+
 class Workers:
     """An open executor with what it needs to start anew; `open_workers` makes and closes it."""
 
@@ -97,7 +104,7 @@ class Workers:
                 return
         future: Future = Future()
         future.set_exception(
-            Refused("a worker that lives through its work", f"one that died {TRIES} times", "give it more memory")
+            WorkerDied("a worker that lives through its work", f"one that died {TRIES} times", "give it more memory")
         )
         yield suspect[0], future
 
@@ -138,7 +145,7 @@ def result_of(future: Future) -> Any:
     except Exception as error:
         if type(error).__name__ == "KilledWorker":  # of distributed, which need not be installed here
             do = "give workers more memory"
-            raise Refused("a worker that lives through its work", "several that died of it", do) from error
+            raise WorkerDied("a worker that lives through its work", "several that died of it", do) from error
         raise
 
 

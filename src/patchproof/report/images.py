@@ -8,11 +8,17 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
+from patchproof.output import make_folder
+
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another colour
+KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
 _JPEG_QUALITY = 82
+_PNG = b"\x89PNG"
 
 
 def jpeg(pixels: np.ndarray) -> bytes:
@@ -25,9 +31,32 @@ def png(pixels: np.ndarray) -> bytes:
     return _encoded(pixels, "PNG", {"optimize": True})
 
 
+def encoded(kinds: Mapping[str, np.ndarray]) -> dict[str, bytes]:
+    """A photograph's pictures by kind as JPEG, its `delta_e00` cells (NaN = not measured) as the PNG of a map."""
+    return {kind: png(delta_map(a)) if kind == "delta_e00" else jpeg(a) for kind, a in sorted(kinds.items())}
+
+
+def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
+    """Write the pictures of the photograph `file` as FILE.KIND.jpg or .png into `folder`, in place of earlier ones."""
+    make_folder(folder)
+    for path in _paths(folder, file):
+        path.unlink(missing_ok=True)
+    for kind, content in encoded(kinds).items():
+        (folder / f"{file}.{kind}.{'png' if content.startswith(_PNG) else 'jpg'}").write_bytes(content)
+
+
+def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
+    """The bytes of the photograph's pictures in `folder` by kind; those that are there."""
+    return {path.suffixes[-2][1:]: path.read_bytes() for path in _paths(folder, file) if path.is_file()}
+
+
+def _paths(folder: Path, file: str) -> list[Path]:
+    return [folder / f"{file}.{kind}.{suffix}" for kind in KINDS for suffix in ("jpg", "png")]
+
+
 def data_uri(content: bytes) -> str:
     """The bytes of a JPEG or PNG as something that `<img src>` takes."""
-    kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
+    kind = "png" if content.startswith(_PNG) else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 

@@ -27,12 +27,34 @@ def recognition_plot(
     return _svg(lambda axes: _draw(axes, x, y, px, py, label))
 
 
+def scale_plot(photos: Sequence[Mapping]) -> str | None:
+    """How large the print is, across and down, in photographs that show it; None where none does."""
+    scales = [(photo["scale_x"], photo["scale_y"]) for photo in photos if photo.get("scale_x") is not None]
+    return _svg(lambda axes: _draw_scales(axes, np.array(scales))) if scales else None
+
+
 def ledger_plot(ledger: Mapping) -> str:
     """The gap ledger as a waterfall from the ideal picture's confidence to the photographs', with 95 % intervals.
 
     `ledger` holds `shares` {step: {share, interval}}, `ideal` and `photo` (mean confidence), as the report's notes do.
     """
     return _svg(lambda axes: _draw_ledger(axes, ledger))
+
+
+def _draw_scales(axes, scales: np.ndarray) -> None:
+    axes.axhspan(0.99, 1.01, color=_YES, alpha=0.15, linewidth=0)
+    axes.axhline(1, color=_INK, linewidth=0.8)
+    number = np.arange(1, len(scales) + 1)
+    axes.plot(number, scales[:, 0], "o", color="#2457c5", markersize=5, label="across (x)")
+    axes.plot(number, scales[:, 1], "s", color="#b0713c", markersize=4, label="down (y)")
+    reach = max(0.02, 1.2 * float(np.abs(scales - 1).max()))
+    axes.set_ylim(1 - reach, 1 + reach)
+    axes.set_xlim(0.5, len(scales) + 0.5)
+    axes.set_xticks([])
+    axes.set_xlabel("photographs that show the print's size")
+    axes.set_ylabel("print scale")
+    axes.yaxis.label.set_color(_INK)
+    axes.legend(frameon=False, labelcolor=_INK)
 
 
 def _draw_ledger(axes, ledger: Mapping) -> None:

@@ -1,24 +1,22 @@
-"""Write a report: report.json as it is, report.html for people, and the pictures beside them.
+"""Write a report: report.json as it is, report.csv for spreadsheets, report.html for people.
 
-In: the report and its manifest as plain data, pictures as arrays by photo and kind. Out: a folder. The page needs
-nothing from outside of itself: styles are inline, pictures are data URIs, there is no script. The same input gives
-the same bytes.
+In: the report and its manifest as plain data, and the pictures that lie in the report's folder. Out: files there. The
+page needs nothing from outside of itself: styles are inline, pictures are data URIs, there is no script. The same
+input gives the same bytes.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from patchproof.output import make_folder, write_whole
+from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
+from patchproof.report.photo_table import photos_csv
+from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 
-from patchproof.report.images import DELTA_TOP, data_uri, delta_map, jpeg, png
-from patchproof.report.plots import ledger_plot, recognition_plot
-
-_LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 _WORDS = {
     "kept": ("Promise kept", "The photographs show what was promised before printing."),
     "broken": ("Promise broken", "The photographs show less than was promised before printing."),
@@ -34,29 +32,25 @@ _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimetre"
 
 
 def write_report(
-    report: Mapping[str, Any],
-    manifest: Mapping[str, Any],
-    pictures: Mapping[str, Mapping[str, np.ndarray]],
-    out_dir: str | Path,
-    notes: Mapping[str, Any] | None = None,
+    report: Mapping[str, Any], manifest: Mapping[str, Any], out_dir: str | Path, notes: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write report.json, report.html and pictures/ into `out_dir`; returns the page's path.
+    """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
 
-    `report` and `manifest` are `model_dump()`s. `pictures[file]` may hold `photo`, `seen`, `fitted`, `promised`
-    (uint8 sRGB) and `delta_e00` (float cells, NaN = not measured). `notes` may hold `reason` (one sentence) ,
-    `controls` (rows of the control photographs) and `ledger` (see `plots.ledger_plot`).
+    `report` and `manifest` are `model_dump()`s. Pictures are those of `images.save_pictures` in `out_dir`/pictures:
+    `photo`, `seen`, `fitted`, `promised` and `delta_e00`. `notes` may hold `ledger` (see `plots.ledger_plot`).
     """
     out = Path(out_dir)
-    (out / "pictures").mkdir(parents=True, exist_ok=True)
-    encoded = {file: _encode(kinds) for file, kinds in pictures.items()}
-    for file, kinds in encoded.items():
-        for kind, content in kinds.items():
-            suffix = "png" if content.startswith(b"\x89PNG") else "jpg"
-            (out / "pictures" / f"{file}.{kind}.{suffix}").write_bytes(content)
-    (out / "report.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    page = out / "report.html"
-    page.write_text(render(report, manifest, encoded, notes or {}), encoding="utf-8")
-    return page
+    make_folder(out)
+    pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
+    page = render(report, manifest, pictures, notes or {})
+    texts = {
+        "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
+        "report.csv": photos_csv(report["photos"]),
+        "report.html": page,
+    }
+    for name, text in texts.items():
+        write_whole(out / name, lambda path, text=text: path.write_text(text, encoding="utf-8"))
+    return out / "report.html"
 
 
 def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], notes: Mapping) -> str:
@@ -80,9 +74,8 @@ def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str
         headline=headline,
         plain=plain,
         effect=_EFFECTS[report["summary"]["effect"]],
-        reason=notes.get("reason", ""),
-        bars=_bars(report["summary"], promise, notes.get("controls", ())),
-        controls=notes.get("controls", ()),
+        bars=_bars(report["summary"], promise, report["controls"]),
+        controls=report["controls"],
         ledger=notes.get("ledger"),
         waterfall=ledger_plot(notes["ledger"]) if notes.get("ledger") else "",
         plots=_plots(report, promise, primary),
@@ -90,7 +83,7 @@ def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str
         codes=_codes(report["photos"]),
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
-        versions=_versions(),
+        origin=report["origin"],
     )
 
 
@@ -99,10 +92,6 @@ def _words(verdict: str, promise: Mapping | None) -> tuple[str, str]:
     if verdict == "broken" and promise["target"]["goal"] == "deceive":
         plain = _BROKEN_DECEIVE
     return headline, plain
-
-
-def _encode(kinds: Mapping[str, np.ndarray]) -> dict[str, bytes]:
-    return {kind: png(delta_map(a)) if kind == "delta_e00" else jpeg(a) for kind, a in sorted(kinds.items())}
 
 
 def _bars(summary: Mapping, promise: Mapping | None, controls) -> list[dict]:
@@ -134,10 +123,10 @@ def _bar(name: str, rate: float | None, interval, kind: str) -> dict:
 
 
 def _plots(report: Mapping, promise: Mapping | None, primary: str | None) -> list[str]:
-    if not promise:
-        return []
     judged = [photo for photo in report["photos"] if photo["status"] != "rejected"]
-    drawn = [recognition_plot(judged, primary, name, label, promise["conditions"]) for name, label in _PLOTS]
+    drawn = [scale_plot(judged)]
+    if promise:
+        drawn[:0] = [recognition_plot(judged, primary, name, label, promise["conditions"]) for name, label in _PLOTS]
     return [svg for svg in drawn if svg]
 
 
@@ -151,16 +140,6 @@ def _codes(photos) -> list[tuple[str, int]]:
         if photo["code"]:
             counts[photo["code"]] = counts.get(photo["code"], 0) + 1
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-
-
-def _versions() -> list[tuple[str, str]]:
-    found = []
-    for name in _LIBRARIES:
-        try:
-            found.append((name, version(name)))
-        except PackageNotFoundError:  # run from a checkout, or another of OpenCV's four wheels
-            continue
-    return found
 
 
 def _percent(share: float | None) -> str:

@@ -31,6 +31,7 @@ from patchproof.workers import Workers, one_thread, open_workers, result_of
 # by name the module whose STUDY it is, imported when asked for
 STUDIES: dict[str, str] = {
     "deceive": "patchproof.study.deceive",
+    "detection": "patchproof.study.detection",
     "envelope": "patchproof.study.envelope",
     "gamut": "patchproof.study.gamut",
     "harden": "patchproof.study.harden",

@@ -1,27 +1,33 @@
 """Verify: photographs and a manifest in, a report out.
 
-In: a folder of photographs and SHEET.json. Out: REPORT/ with report.json, report.html and pictures. This joins what
-must not know each other: the judge, its networks and the page. The promise's primary network always judges, whatever
-others are named.
+In: a folder of photographs and SHEET.json. Out: REPORT/ with report.json, report.csv, report.html, pictures and
+photos.jsonl, one line per finished photograph, from which `resume` goes on. This joins what must not know each other:
+the judge, its networks and the page. The promise's primary network always judges, whatever others are named.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
-from patchproof.output import new_folder
+from patchproof.output import check_folder
+from patchproof.report.images import save_pictures
 from patchproof.report.write import write_report
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest, load_manifest
-from patchproof.verify.results import Evidence, Report
+from patchproof.verify.look import WITH_PICTURES
+from patchproof.verify.results import Evidence, Origin, Report
 from patchproof.verify.run import LEDGER_PHOTOS, gather_evidence
 
-OWN = ("report.json", "report.html", "photos.csv", "pictures")
+_JOURNAL = "photos.jsonl"
+OWN = ("report.json", "report.csv", "report.html", "pictures", _JOURNAL, ".*.part")
+_LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 
 
 def verify_photos(
@@ -38,44 +44,75 @@ def verify_photos(
     camera: str | None = None,
     jobs: int = 1,
     cluster: str | None = None,
+    resume: bool = False,
     overwrite: bool = False,
     on_photo: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
     """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
 
-    `card` looks for a bank card in its outline on the uncut page; `camera` is a camera file's name or path.
-    Model and printer names are looked up from the manifest's folder, then as the scene's were.
+    `card` looks for a bank card in its outline on the uncut page; `camera` is a camera file's name or path. Model and
+    printer names are looked up from the manifest's folder, then as the scene's were. `resume` goes on from what an
+    earlier run finished, whole or killed: only photographs that are new, or differ, are measured.
     """
-    manifest = load_manifest(sheet)
-    base = Path(sheet).resolve().parent
-    with new_folder(out, OWN, overwrite) as folder:
-        evidence = gather_evidence(
-            photos,
-            manifest,
-            models=[load_classifier(name, base) for name in _names(manifest, models)],
-            printer=load_printer(manifest.settings["printer"]["profile"], base)
-            if "printer" in manifest.settings
-            else None,
-            scan_dpi=scan_dpi,
-            controls=controls,
-            ledger_photos=ledger_photos,
-            camera=None if camera is None else load_camera(camera),
-            card=card,
-            jobs=jobs,
-            cluster=cluster,
-            progress=on_photo,
-        )
-        if ruler_mm is not None:
-            evidence = _with_ruler(evidence, manifest, ruler_mm)
-        report = evidence.report
-        write_report(
-            report.model_dump(mode="json"),
-            manifest.model_dump(mode="json"),
-            evidence.pictures,
-            folder,
-            evidence.notes(),
-        )
+    out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
+    _check_out(out, resume, overwrite)
+    networks = [load_classifier(name, base) for name in _names(manifest, models)]
+    printer = manifest.settings.get("printer")
+    evidence = gather_evidence(
+        photos,
+        manifest,
+        models=networks,
+        printer=None if printer is None else load_printer(printer["profile"], base),
+        scan_dpi=scan_dpi,
+        controls=controls,
+        ledger_photos=ledger_photos,
+        camera=None if camera is None else load_camera(camera),
+        card=card,
+        jobs=jobs,
+        cluster=cluster,
+        journal=out / _JOURNAL,
+        resume=resume,
+        on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
+        progress=on_photo,
+    )
+    if ruler_mm is not None:
+        evidence = _with_ruler(evidence, manifest, ruler_mm)
+    options = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "card": card or None, "camera": camera and Path(camera).name}
+    hashes = {"manifest": hashlib.sha256(Path(sheet).read_bytes()).hexdigest()}
+    hashes |= {f"network {network.name}": network.sha256 for network in networks}
+    origin = Origin(options=options | {"ledger_photos": ledger_photos}, sha256=hashes, versions=_versions())
+    report = evidence.report.model_copy(update={"origin": origin})
+    _drop_pictures(out / "pictures", {photo.file for photo in report.photos[:WITH_PICTURES]})
+    write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, evidence.notes())
     return report
+
+
+def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
+    """Refuse a folder with files in it, unless they are ours and to be gone on from, or replaced."""
+    begun = (out / _JOURNAL).is_file()
+    if resume:
+        check_folder(out, OWN if begun else (), overwrite=begun)
+        return
+    if begun and not overwrite and not (out / "report.json").is_file():
+        raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
+    check_folder(out, OWN, overwrite)
+
+
+def _drop_pictures(folder: Path, files: set[str]) -> None:
+    """Remove pictures of photographs that this report does not show."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name.rsplit(".", 2)[0] not in files:
+            path.unlink()
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # run from a checkout, or another of OpenCV's four wheels
+            continue
+    return found
 
 
 def _names(manifest: Manifest, models: tuple[str, ...] | None) -> tuple[str, ...]:

@@ -7,10 +7,9 @@ except in page checks.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import Field
 
 from patchproof.settings import Finite, Strict
@@ -42,6 +41,7 @@ class PhotoEntry(Strict):
 
     file: str
     status: Status
+    sha256: str | None = None  # of the file's bytes
     code: str | None = None
     figure: Finite | None = None
     threshold: Finite | None = None
@@ -112,19 +112,8 @@ class Summary(Strict):
     matched_rate: Finite | None
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
+    reason: str = ""  # for the verdict, in a sentence
     models: dict[str, ModelRate] = Field(default_factory=dict)
-
-
-class Report(Strict):
-    """A whole report.json."""
-
-    sheet_id: str
-    photos: tuple[PhotoEntry, ...]
-    summary: Summary
-
-    def dump(self) -> str:
-        """Its JSON text: the same report gives the same bytes."""
-        return json.dumps(self.model_dump(), indent=1, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True)
@@ -142,19 +131,37 @@ class Control:
     shown: bool | None = None
 
 
+class Origin(Strict):
+    """What a report rests on besides the photographs: options as given, SHA-256 by name, versions by library."""
+
+    options: dict[str, Any] = Field(default_factory=dict)
+    sha256: dict[str, str | None] = Field(default_factory=dict)
+    versions: dict[str, str] = Field(default_factory=dict)
+
+
+class Report(Strict):
+    """A whole report.json."""
+
+    sheet_id: str
+    photos: tuple[PhotoEntry, ...]
+    summary: Summary
+    controls: tuple[Control, ...] = ()
+    origin: Origin = Origin()
+
+    def dump(self) -> str:
+        """Its JSON text: the same report gives the same bytes."""
+        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """A report and what its page shows besides: pictures by file and kind, controls, the verdict's reason."""
+    """A report, and the ledger with what its chart needs besides the shares."""
 
     report: Report
-    pictures: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    controls: tuple[Control, ...] = ()
-    reason: str = ""
     ledger: Ledger | None = None
 
     def notes(self) -> dict[str, Any]:
-        """The controls, the reason and the ledger as plain data, for the page."""
-        ledger = None
-        if self.ledger is not None:
-            ledger = vars(self.ledger) | {"shares": {k: v.model_dump() for k, v in self.ledger.shares.items()}}
-        return {"reason": self.reason, "controls": [vars(control) for control in self.controls], "ledger": ledger}
+        """The ledger as plain data, for the page."""
+        if self.ledger is None:
+            return {}
+        return {"ledger": vars(self.ledger) | {"shares": {k: v.model_dump() for k, v in self.ledger.shares.items()}}}

@@ -1,36 +1,32 @@
 """A folder of photographs against a manifest: every photograph listed, one bad file never stops the batch.
 
 In: photographs, a manifest, networks, and where there are any photographs of controls. Out: `Evidence`: the report
-and its pictures. Photographs are taken in the order of their names; sidecar files and anything that is no picture by
-its suffix are never opened. Each is measured on its own (over processes when `jobs` > 1) and leaves small squares
-behind, which the networks then see in batches.
+and what its page shows besides. Photographs are taken in the order of their names; sidecar files and anything that is
+no picture by its suffix are never opened. Each is measured on its own (over processes when `jobs` > 1), classified at
+once and let go, so that memory does not grow with their number; with a journal, what is finished survives a kill.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from patchproof.claims import wilson
-from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.read import list_photos, pictures_in, read_photo
+from patchproof.photo.read import list_photos, pictures_in
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
-from patchproof.verify.camera import view_of
-from patchproof.verify.classify import check_primary, predict, squares_of, target_indices
-from patchproof.verify.ledger import Ledger, ledger_of, usable
-from patchproof.verify.measure import Measured, measure
-from patchproof.verify.pictures import thumbnail
-from patchproof.verify.ranges import PromisedRanges, matched_rate, promised_ranges
-from patchproof.verify.reproject import Shot, shot_of
-from patchproof.verify.results import Control, Evidence, ModelRate, PhotoEntry, Report, Summary
-from patchproof.verify.surface import Promised, Surface, promised_of, surface_of
+from patchproof.verify.classify import check_primary, predict, target_indices
+from patchproof.verify.journal import Journal, settings_key
+from patchproof.verify.ledger import Ledger, ledger_of
+from patchproof.verify.look import Glanced, Task, glance_at_all, in_ledger, look_at_all, set_task, shot_again
+from patchproof.verify.ranges import matched_rate
+from patchproof.verify.reproject import Shot
+from patchproof.verify.results import Control, Evidence, ModelRate, Prediction, Report, Summary
 from patchproof.verify.verdict import Verdict, compare, effect_of, judge
 from patchproof.workers import open_workers
 
@@ -40,7 +36,6 @@ if TYPE_CHECKING:
     from patchproof.classifier import Classifier
 
 LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
-WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 
 
 def gather_evidence(
@@ -56,33 +51,43 @@ def gather_evidence(
     ledger_photos: int = LEDGER_PHOTOS,
     jobs: int = 1,
     cluster: str | None = None,
+    journal: Path | None = None,
+    resume: bool = False,
+    on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Evidence:
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
     `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
     `camera` replaces the EXIF focal length and takes out the lens; `card` looks for a bank card in its outline.
-    `ledger_photos` of the photographs at most, spread evenly, go into the gap ledger (0: no ledger). `progress` is
-    called with (done, all). Photographs are measured by `jobs` local processes or by a Dask cluster's workers.
+    `ledger_photos` of the photographs at most, spread evenly, go into the gap ledger (0: no ledger). Photographs are
+    measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is finished;
+    with `resume`, what it has of an earlier run is not done again. `on_pictures` gets the pictures of each photograph
+    that is (of the first `look.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where it was
+    measured); `progress` is called with (done, all).
     """
     paths = list_photos(photos)
     control_paths = _list_controls(controls) if controls is not None else {}
     if manifest.promise:
         check_primary(models, manifest.promise)
-    task = _task(manifest, models, printer, scan_dpi, camera, card, _spread(len(paths), ledger_photos))
-    total = len(paths) + sum(map(len, control_paths.values()))
-    with open_workers(jobs, cluster) as workers:
-        looks = workers.map(partial(_look, task), enumerate(paths), lambda done, _: progress(done, total))
-        control_looks, done = {}, len(paths)
-        for name, files in control_paths.items():
-            control_looks[name] = workers.map(
-                partial(_glance, task), files, lambda more, _, done=done: progress(done + more, total)
-            )
-            done += len(files)
     indices = {m.name: target_indices(m, manifest) for m in models} if manifest.promise else {}
-    entries = _with_predictions(looks, models, indices)
-    ledger = _ledger(task, manifest, models, indices, entries, looks)
-    return _evidence(manifest, models, indices, entries, looks, control_looks, ledger)
+    task = set_task(manifest, models, printer, scan_dpi, camera, card)
+    judge_all = partial(_predictions, models, indices)
+    total, done = len(paths) + sum(map(len, control_paths.values())), 0
+    options = {"scan_dpi": scan_dpi, "camera": camera and camera.model_dump(mode="json"), "card": card}
+    kept = Journal(journal, settings_key(manifest, models, printer, options), resume) if journal is not None else None
+    with closing(kept) if kept is not None else nullcontext(), open_workers(jobs, cluster) as workers:
+        step = lambda more: progress(done + more, total)  # noqa: E731
+        seen = look_at_all(task, paths, judge_all, workers, kept, on_pictures, step)
+        glances: dict[str, list[Glanced]] = {}
+        for name, files in control_paths.items():
+            done = len(paths) + sum(map(len, glances.values()))
+            glances[name] = glance_at_all(task, name, files, judge_all, workers, kept, step)
+        chosen = [n for n in sorted(_spread(len(paths), ledger_photos)) if task.ledger_px and in_ledger(seen[n])]
+        shots = list(workers.map(partial(shot_again, task), [(paths[n], seen[n].entry, seen[n].light) for n in chosen]))
+    entries = [one.entry for one in seen]
+    ledger = _ledger(task, manifest, models, indices, entries, shots)
+    return _evidence(manifest, models, indices, entries, [one.counted for one in seen], glances, ledger)
 
 
 def _spread(count: int, most: int) -> frozenset[int]:
@@ -104,101 +109,15 @@ def _list_controls(folder: str | Path) -> dict[str, list[Path]]:
     return inside
 
 
-@dataclass(frozen=True)
-class _Task:
-    """All that one photograph is measured against; small enough to be sent to another process."""
-
-    surface: Surface
-    promised: Promised | None
-    ranges: PromisedRanges
-    sizes_px: tuple[int, ...]
-    scan_dpi: float | None
-    camera: Camera | None
-    card: bool
-    ledger_px: int | None  # the primary network's input size, where there can be a ledger
-    ledger: frozenset[int]  # numbers of the photographs that go into it
+def _predictions(models, indices, squares: Mapping[int, np.ndarray]) -> dict[str, Prediction]:
+    """What every network says of one photograph; nothing where the sheet promises nothing."""
+    if not indices:
+        return {}
+    return {model.name: predict(model, indices[model.name], squares[model.input_px]) for model in models}
 
 
-@dataclass(frozen=True)
-class _Looked:
-    """What is kept of one photograph once it has been seen."""
-
-    measured: Measured
-    squares: dict[int, np.ndarray] | None
-    shot: Shot | None = None
-
-
-def _task(manifest, models, printer, scan_dpi, camera, card, ledger) -> _Task:
-    surface = surface_of(manifest)
-    conditions = manifest.promise.conditions if manifest.promise else ()
-    promised = None
-    if manifest.design:
-        if printer is None:
-            from patchproof.channel.printer import load_printer
-
-            printer = load_printer(manifest.settings.get("printer", {}).get("profile", "coated"))
-        promised = promised_of(manifest, surface, printer)
-    sizes = tuple(sorted({m.input_px for m in models})) if manifest.promise else ()
-    ledger_px = None
-    if manifest.promise and promised is not None:
-        ledger_px = next(m.input_px for m in models if m.name == manifest.promise.models[0].name)
-    return _Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, camera, card, ledger_px, ledger)
-
-
-def _look(task: _Task, numbered: tuple[int, Path]) -> _Looked:
-    number, path = numbered
-    try:
-        photo = read_photo(path)
-    except CannotJudge as cannot:
-        entry = PhotoEntry(
-            file=path.name,
-            status="rejected",
-            code=cannot.code,
-            figure=cannot.figure,
-            threshold=cannot.threshold,
-            advice=cannot.advice,
-        )
-        return _Looked(Measured(entry, False, {}), None)
-    try:
-        view = view_of(photo, task.camera)
-        measured = measure(view, path.name, task.surface, task.promised, task.ranges, task.scan_dpi, task.card)
-    except (ArithmeticError, ValueError, LookupError, MemoryError, cv2.error) as error:
-        # no photograph is known that does this; one that does must not cost the others
-        advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
-        entry = PhotoEntry(file=path.name, status="rejected", code="unreadable", advice=advice)
-        return _Looked(Measured(entry, False, {}), None)
-    pictures = {}
-    if number < WITH_PICTURES:
-        pictures = {"photo": thumbnail(view.photo.srgb, measured.entry, task.surface), **measured.pictures}
-    shot, entry = None, measured.entry
-    if number in task.ledger and task.ledger_px and measured.counted and usable(entry.status, entry.code):
-        shot = shot_of(view.photo.srgb, entry, measured.light, task.surface, task.ledger_px)
-    return _Looked(Measured(entry, measured.counted, pictures), squares_of(photo.srgb, task.sizes_px), shot)
-
-
-def _glance(task: _Task, path: Path) -> tuple[str, dict[int, np.ndarray] | None]:
-    """A control photograph: only what the networks see of it counts, since a bare object carries no marker."""
-    try:
-        return path.name, squares_of(read_photo(path).srgb, task.sizes_px)
-    except CannotJudge:
-        return path.name, None
-
-
-def _with_predictions(looks: Sequence[_Looked], models, indices) -> list[PhotoEntry]:
-    """The entries with what every network says of every readable photograph."""
-    readable = [n for n, look in enumerate(looks) if look.squares is not None]
-    predictions: list[dict] = [{} for _ in looks]
-    for model in models if indices else ():
-        squares = [looks[n].squares[model.input_px] for n in readable]
-        for n, prediction in zip(readable, predict(model, indices[model.name], squares), strict=True):
-            predictions[n][model.name] = prediction
-    return [
-        look.measured.entry.model_copy(update={"predictions": p}) for look, p in zip(looks, predictions, strict=True)
-    ]
-
-
-def _ledger(task: _Task, manifest, models, indices, entries, looks) -> Ledger | None:
-    shots = [look.shot for look in looks if look.shot is not None]
+def _ledger(task: Task, manifest, models, indices, entries, shots: Iterable[Shot | None]) -> Ledger | None:
+    shots = [shot for shot in shots if shot is not None]
     if not shots:
         return None
     model = next(m for m in models if m.name == manifest.promise.models[0].name)
@@ -206,8 +125,8 @@ def _ledger(task: _Task, manifest, models, indices, entries, looks) -> Ledger | 
     return ledger_of(shots, manifest, task.surface, task.promised, model, indices[model.name], confidence)
 
 
-def _evidence(manifest, models, indices, entries, looks, control_looks, ledger) -> Evidence:
-    counted = [e for e, look in zip(entries, looks, strict=True) if look.measured.counted]
+def _evidence(manifest, models, indices, entries, counts: Sequence[bool], glances, ledger) -> Evidence:
+    counted = [entry for entry, counts_too in zip(entries, counts, strict=True) if counts_too]
     verdict, effect, controls = Verdict("cannot_tell", None, "The sheet promises nothing."), "not_tested", ()
     rate, matched = ModelRate(rate=None, interval=None), None
     rates = {m.name: _rate([e.predictions[m.name].recognized for e in counted]) for m in models} if indices else {}
@@ -218,8 +137,7 @@ def _evidence(manifest, models, indices, entries, looks, control_looks, ledger) 
         goal = promise.target.goal
         verdict = judge(sum(results.values()), len(results), promise.rate, promise.n, goal, without)
         rate, matched = rates[primary], matched_rate((e for e in counted if e.status == "measured"), promise.conditions)
-        model = next(m for m in models if m.name == primary)
-        controls, effect = _compared(model, indices[primary], results, control_looks, goal)
+        controls, effect = _compared(primary, results, glances, goal)
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
@@ -232,11 +150,12 @@ def _evidence(manifest, models, indices, entries, looks, control_looks, ledger) 
         matched_rate=matched,
         ledger=ledger.shares if ledger else None,
         culprit=ledger.culprit if ledger else None,
+        reason=verdict.reason,
         models=rates,
     )
-    pictures = {look.measured.entry.file: look.measured.pictures for look in looks if look.measured.pictures}
-    report = Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary)
-    return Evidence(report, pictures, controls, verdict.reason, ledger)
+    return Evidence(
+        Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=controls), ledger
+    )
 
 
 def _rate(results: list[bool]) -> ModelRate:
@@ -245,13 +164,11 @@ def _rate(results: list[bool]) -> ModelRate:
     return ModelRate(rate=sum(results) / len(results), interval=wilson(sum(results), len(results)))
 
 
-def _compared(model, indices, results: dict[str, bool], control_looks, goal: str):
+def _compared(primary: str, results: dict[str, bool], glances: Mapping[str, Sequence[Glanced]], goal: str):
     """Controls with their comparison, and the effect that they show together."""
     controls, comparisons = [], []
-    for name, looked in control_looks.items():
-        readable = [(file, squares) for file, squares in looked if squares is not None]
-        said = predict(model, indices, [squares[model.input_px] for _, squares in readable])
-        seen = {file: p.recognized for (file, _), p in zip(readable, said, strict=True)}
+    for name, looked in glances.items():
+        seen = {one.file: one.predictions[primary].recognized for one in looked if one.predictions}
         comparison, k = compare(results, seen, goal), sum(seen.values())
         comparisons.append(comparison)
         control = Control(name, k, len(seen), wilson(k, len(seen)))

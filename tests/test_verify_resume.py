@@ -1,0 +1,188 @@
+"""Many photographs: what was finished survives a kill, memory does not grow, and no file stops the others."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import weakref
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from patchproof.channel.printer import identity_printer
+from patchproof.classifier import Classifier
+from patchproof.photo.read import read_photo
+from patchproof.settings import Refused
+from patchproof.sheet.manifest import dump_manifest
+from patchproof.study.verify import verify_photos
+from patchproof.verify import look
+from patchproof.verify.journal import Journal
+from patchproof.verify.run import gather_evidence
+from patchproof.workers import WorkerDied
+from test_photo_synthetic import make_manifest, save
+from test_verify_run import NET, promise, shot
+
+WRITTEN = ("report.json", "report.csv", "report.html", "photos.jsonl")
+KILLED = """
+import os, signal, sys
+from patchproof.study.verify import verify_photos
+die = lambda done, total: done == 3 and os.kill(os.getpid(), signal.SIGKILL)
+verify_photos(sys.argv[1], sys.argv[2], sys.argv[3], on_photo=die)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    photos = tmp_path_factory.mktemp("photos")
+    for i in range(5):
+        save(shot(8 * i - 20, 500 + 20 * i, seed=i, noise=0.003), photos / f"b{i}.jpg")
+    (photos / "a.JPG").write_text("no picture")
+    return photos
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory) -> Path:
+    """A sheet that promises something of the built-in network."""
+    from patchproof.classifier.load import load_classifier
+
+    said = promise()
+    network = load_classifier("builtin", Path("."))
+    said["models"][0] |= {"name": "builtin", "sha256": network.sha256}
+    said["target"] |= {"label": network.labels[0]}
+    said["conditions"] = [
+        dict(px_per_mm=s, tilt_deg=t, azimuth_deg=a, contrast=0.8, blur_px=0.5, recognized=True)
+        for s, t, a in ((0.2, 0.0, -80.0), (9.0, 70.0, 80.0))
+    ]
+    path = tmp_path_factory.mktemp("sheet") / "sheet.json"
+    path.write_text(dump_manifest(make_manifest(said)), encoding="utf-8")
+    return path
+
+
+def test_a_kill_costs_what_was_in_work_and_not_the_report(folder, sheet, tmp_path):
+    verify_photos(folder, sheet, tmp_path / "whole")
+    killed, out = [sys.executable, "-c", KILLED, str(folder), str(sheet), str(tmp_path / "killed")], tmp_path / "killed"
+    assert subprocess.run(killed, check=False).returncode == -signal.SIGKILL
+    assert len((out / "photos.jsonl").read_text().splitlines()) == 3 and not (out / "report.json").exists()
+    with pytest.raises(Refused, match="unfinished verification: add --resume"):
+        verify_photos(folder, sheet, out)
+    with open(out / "photos.jsonl", "a") as file:
+        file.write('{"file": "b4.jpg", "sha')  # a line that the kill cut short
+    verify_photos(folder, sheet, out, resume=True)
+    for name in WRITTEN:
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    pictures = {p.name: p.read_bytes() for p in (out / "pictures").iterdir()}
+    assert pictures == {p.name: p.read_bytes() for p in (tmp_path / "whole" / "pictures").iterdir()}
+
+
+def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeypatch):
+    photos, opened = tmp_path / "photos", []
+    photos.mkdir()
+    for path in folder.iterdir():
+        (photos / path.name).write_bytes(path.read_bytes())
+    monkeypatch.setattr(look, "read_photo", lambda path: opened.append(path.name) or read_photo(path))
+
+    def judged(resume=True, **options):
+        opened.clear()
+        options = {"ledger_photos": 0, "journal": tmp_path / "photos.jsonl", "resume": resume, **options}
+        given = dict(models=[NET], printer=identity_printer())
+        return gather_evidence(photos, make_manifest(promise()), **given, **options).report
+
+    first = judged()
+    assert len(opened) == 6
+    assert judged() == first and opened == []
+    (photos / "b1.jpg").write_bytes((photos / "b0.jpg").read_bytes())
+    save(shot(3, 520), photos / "c.jpg")
+    assert len(judged().photos) == 7 and opened == ["b1.jpg", "c.jpg"]
+    (photos / "c.jpg").unlink()
+    assert len(judged().photos) == 6 and opened == []
+    judged(scan_dpi=100.0)
+    assert len(opened) == 6  # another option, another result
+    judged(resume=False)
+    assert len(opened) == 6
+    controls = {"controls": photos}
+    assert judged(**controls).controls == judged(**controls).controls and opened == []
+
+
+def test_squares_do_not_wait_for_each_other(folder, monkeypatch):
+    alive, most = [], []
+    squares_of = look.squares_of
+
+    def watched(srgb, sizes_px):
+        squares = {size: square.copy() for size, square in squares_of(srgb, sizes_px).items()}
+        alive.extend(weakref.ref(square) for square in squares.values())
+        return squares
+
+    def network(photos):
+        most.append(sum(ref() is not None for ref in alive))
+        return torch.zeros(len(photos), 2)
+
+    monkeypatch.setattr(look, "squares_of", watched)
+    net = Classifier("net", "ab" * 32, 32, ("bright", "dark"), network)
+    given = dict(models=[net], printer=identity_printer(), ledger_photos=0)
+    gather_evidence(folder, make_manifest(promise()), **given)
+    assert len(alive) == 5 and max(most) == 1
+
+
+class Deadly:
+    """Workers of which one file kills each."""
+
+    def completed(self, function, items):
+        for number, item in enumerate(items):
+            future = Future()
+            if item[1].name == "b2.jpg":
+                future.set_exception(WorkerDied("a", "b", "c"))
+            else:
+                future.set_result(function(item))
+            yield number, future
+
+
+def test_a_photograph_that_ends_its_process_each_time_is_rejected_and_the_others_go_on(folder):
+    task = look.set_task(make_manifest(promise()), [NET], identity_printer(), None, None, False)
+    paths = sorted(folder.iterdir())
+    seen = look.look_at_all(task, paths, lambda squares: {}, Deadly(), None, lambda *_: None, lambda done: None)
+    codes = {one.entry.file: (one.entry.status, one.entry.code) for one in seen}
+    assert codes.pop("b2.jpg") == ("rejected", "unreadable") and codes.pop("a.JPG") == ("rejected", "unreadable")
+    assert set(codes.values()) == {("measured", None)}
+
+
+def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
+    measure = look.measure
+
+    def wrong(view, name, *rest):
+        measured = measure(view, name, *rest)
+        residual_mm = float("nan") if name == "b3.jpg" else measured.entry.residual_mm
+        return replace(measured, entry=measured.entry.model_copy(update={"residual_mm": residual_mm}))
+
+    monkeypatch.setattr(look, "measure", wrong)
+    found = gather_evidence(folder, make_manifest(promise()), models=[NET], printer=identity_printer()).report.photos
+    assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]
+
+
+def test_a_journal_forgets_other_keys_and_other_bytes(tmp_path):
+    photo, path = tmp_path / "a.jpg", tmp_path / "photos.jsonl"
+    photo.write_bytes(b"one")
+    for key, again in (("k", True), ("other", False)):
+        journal = Journal(path, "k", resume=False)
+        journal.add("a.jpg", photo, {"x": 1.25})
+        journal.close()
+        journal = Journal(path, key, resume=True)
+        assert (journal.find("a.jpg", photo) == {"x": 1.25}) is again
+        journal.close()
+    photo.write_bytes(b"two")
+    journal = Journal(path, "k", resume=True)
+    assert journal.find("a.jpg", photo) is None
+    journal.close()
+
+
+def test_a_folder_of_somebody_else_is_not_resumed(folder, sheet, tmp_path):
+    (tmp_path / "thesis.txt").write_text("x")
+    for resume in (True, False):
+        with pytest.raises(Refused, match="files"):
+            verify_photos(folder, sheet, tmp_path, resume=resume)
+    with pytest.raises(Refused, match=r"thesis\.txt"):
+        verify_photos(folder, sheet, tmp_path, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
