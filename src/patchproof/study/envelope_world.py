@@ -287,7 +287,7 @@ def _seen_at(scene: Scene, conditions: Conditions, piece_mm: np.ndarray, photo_p
     """Pixels N×2 of points of the piece in one photograph; NaN behind the camera."""
     if not isinstance(scene, MeshScene):
         return geometry.apply_homography(scene.piece_homographies(conditions, photo_px)[0], piece_mm)
-    pose = scene.camera_from_world(conditions)[0]
+    pose = scene.camera_from_print(conditions)[0]
     points = geometry.project(scene.matrix_px(photo_px), pose, scene.placement.world(piece_mm))
     return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
 
