@@ -28,22 +28,28 @@ def conditions(center, n, spread=0.12, seed=0):
 def test_the_interval_covers_the_truth_about_as_often_as_it_says():
     held = [
         (b := find_break(conditions(0.55, 48, seed=seed), AT)).low <= 0.55 <= b.high and abs(b.value - 0.55) < 0.12
-        for seed in range(20)
+        for seed in range(12)
     ]
-    assert sum(held) >= 17  # 95 % of 20 are 19; fewer than 17 has a chance of 0.02
+    assert sum(held) >= 9  # of 12; fewer than 9 has a chance of 0.002
 
 
 def test_the_grid_finds_the_maximum_that_an_optimizer_finds():
-    counts = np.array([[60.0, 58, 50, 31, 12, 4, 1]])
+    counts = np.array([60.0, 58, 50, 31, 12, 4, 1])
 
     def loss(p):
-        center, log_width, top = p
-        r = curve_at(np.array([center, np.exp(log_width), top, 0.0]), AT).clip(1e-9, 1 - 1e-9)
-        return -(counts[0] * np.log(r) + (64 - counts[0]) * np.log(1 - r)).sum()
+        center, log_width, top, share = p
+        r = curve_at(np.array([center, np.exp(log_width), top, share * top]), AT).clip(1e-9, 1 - 1e-9)
+        return -(counts * np.log(r) + (64 - counts) * np.log(1 - r)).sum()
 
-    best = minimize(loss, [0.5, -2.0, 0.95], method="Nelder-Mead").x
-    low, high, _ = _fit(counts, 64, AT)
-    assert low[0] - 0.02 <= best[0] <= high[0] + 0.02 and high[0] - low[0] < 0.1
+    bounds = [(0, 1.2), (-6, -0.9), (0.01, 0.999), (0, 0.8)]
+    best = minimize(loss, [0.5, -2.0, 0.95, 0.05], method="Nelder-Mead", bounds=bounds)
+    fine = np.linspace(0, 1, 2001)
+    rates = curve_at(np.array([best.x[0], np.exp(best.x[1]), best.x[2], best.x[3] * best.x[2]]), fine)
+    half = fine[np.abs(rates - (rates[0] + rates[-1]) / 2).argmin()]
+    low, high, curve = _fit(counts[None], 64, AT)
+    assert low[0] - 0.03 <= half <= high[0] + 0.03 and high[0] - low[0] < 0.1
+    center, width, top, floor = curve[0]
+    assert loss([center, np.log(width), top, floor / top]) < best.fun + 0.5
 
 
 def test_between_two_sure_points_the_breaking_point_is_open():

@@ -2,9 +2,9 @@
 
 In: a problem whose settings ask for `mine` tries. Out: the conditions of all training steps. Before the first step
 the clean object is shown in a quarter as many poses and lights, forward only, each before the same `BACKDROPS` draws of
-background, print and camera: alone, a draw's loss says more of its background than of its pose (in one scene, of the worst eighth of
-256 single draws, 6 % lay in the worst tenth of pose × light). Every other training view then takes its pose and light
-from the worst eighth. The rest stays as drawn, so that what is easy is not forgotten.
+background, print and camera: alone, a draw's loss says more of its background than of its pose (in one scene, of the
+worst eighth of 256 single draws, 6 % lay in the worst tenth of pose × light). Every other training view then takes its
+pose and light from the worst eighth. The rest stays as drawn, so that what is easy is not forgotten.
 
 Which draws are worst depends on the scene and its seed alone, never on the design: a run that was stopped mines the
 same ones when it goes on. Trying hard views anew in each step (online hard example mining: Shrivastava et al., CVPR

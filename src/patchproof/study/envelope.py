@@ -50,14 +50,15 @@ class Map(Strict):
 
 
 class EnvelopeSettings(Strict):
-    """Whose envelope, and how finely. `n` conditions per point are shown to the network, `photos` of them photographed
-    in full and measured; `map_n` and `map_photos` the same for points of maps.
+    """Whose envelope, and how finely. `n` conditions per point are shown to the network (a quarter of them where JPEG
+    is varied, which takes pictures of full size), `photos` of them photographed in full and measured; `map_n` and
+    `map_photos` the same for points of maps.
     """
 
     run: str
     seed: Annotated[int, Field(ge=0)] = 0
-    n: Count = 64
-    photos: Count = 12
+    n: Count = 128
+    photos: Count = 8
     points: Points = 6
     map_n: Count = 8
     map_photos: Count = 3
@@ -118,7 +119,8 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if is_map:
         y, across = _values(cell.values["y"])
         points = [point | {y: value} for value in across for point in points]
-    seen = recognized(world, points, drawn[:n])
+    shown = max(n // 4, photos) if "jpeg" in points[0] else n
+    seen = recognized(world, points, drawn[:shown])
     said = measured(world, points, drawn[:photos])
     works = ~seen if world.scene.settings.target.goal == "deceive" else seen
     found = {

@@ -1,9 +1,11 @@
 """Where a rate breaks: a falling curve fitted to counts at a few points, its breaking point, and doubt about both.
 
-In: what worked, conditions × points, and where in the sweep the points lie (0 easy, 1 hard). Out: `Break`. The curve is
-a logistic between two levels; its breaking point is where it has lost half of what it has at the easy end. Likelihood
-is maximized over a grid, which never fails to converge and shows where data leave the curve open: between two points of
-rate 1 and 0 the breaking point may lie anywhere, and the interval says so. All points share their conditions, and whole
+In: what worked, conditions × points, and where in the sweep the points lie (0 easy, 1 hard). Out: `Break`. The curve
+is a logistic between two levels; its breaking point is where it has lost half of what the sweep takes from it, if that
+is a quarter or more of what it began with. (Half of what it began with would be simpler, but an object that is
+recognized half of the time without its patch hovers there for ever.) Likelihood is maximized over a grid, which never
+fails to converge and shows where data leave the curve open: between two points of rate 1 and 0 the breaking point may
+lie anywhere, and the interval says so. All points share their conditions, and whole
 conditions are drawn anew for the bootstrap, so that what they have in common does not pass for precision.
 
 A curve that falls is fitted whatever the data do. Whether they contradict it is tested apart: the distance from the
@@ -26,12 +28,13 @@ DRAWS = 200
 TOLERANCE = 0.1  # in log-likelihood: curves this near to the best are as good as it
 NOT_MONOTONE = 0.01  # three curves to a sweep are tested at once
 LEAST_AT_EASY_END = 0.05  # Wilson's lower end of the rate there, below which there is nothing to lose
-BEYOND = 2.0  # stands for a breaking point outside of the sweep
+LEAST_LOST = 0.25  # of the rate at the easy end: what loses less over the whole sweep holds
+BEYOND = 2.0  # stands for a breaking point that is not in the sweep
 
 
 @dataclass(frozen=True)
 class Break:
-    """Positions in the sweep, `BEYOND` where the curve holds to its hard end; None where nothing worked at the start.
+    """Positions in the sweep, `BEYOND` where the curve holds; None where nothing worked at the easy end.
 
     `curve` is the best one at positions 0, 0.01, ... 1.
     """
@@ -92,23 +95,24 @@ def monotone_p(rates: np.ndarray, drawn: np.ndarray) -> float:
 
 @lru_cache(maxsize=1)
 def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """Curves G×4 and the position at which each has lost half of what it has at 0."""
-    centers, widths = np.linspace(0, 1.2, 61), np.geomspace(0.002, 0.4, 7)
+    """Curves G×4 and where each has lost half of what it loses from 0 to 1, the earliest first."""
+    centers, widths = np.linspace(0, 1.2, 61), np.geomspace(0.002, 0.4, 10)
     tops, floors = np.sin(np.linspace(0.05, np.pi / 2 - 0.05, 15)) ** 2, np.array([0, 0.1, 0.25, 0.4, 0.6, 0.8])
     center, width, top, share = (a.ravel() for a in np.meshgrid(centers, widths, tops, floors, indexing="ij"))
     curves = np.stack([center, width, top, share * top], 1)
-    half = (curve_at(curves.T, np.zeros(1)) / 2 - curves[:, 3]) / (top * (1 - share))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        lost = center - width * np.log(half / (1 - half))
-    return curves, np.where((half > 0) & (lost <= 1), lost.clip(0), BEYOND)
+    first, last = (curve_at(curves.T, np.full(1, end)) for end in (0.0, 1.0))
+    level = (((first + last) / 2 - curves[:, 3]) / (top * (1 - share))).clip(1e-9, 1 - 1e-9)  # flat ones round to 1
+    lost = center - width * np.log(level / (1 - level))
+    lost = np.where(first - last >= LEAST_LOST * first, lost.clip(0, 1), BEYOND)
+    order = np.argsort(lost, kind="stable")
+    return curves[order], lost[order]
 
 
 def _fit(counts: np.ndarray, n: int, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Per row of counts B×P: the lowest and the highest breaking point of the curves as good as the best, B×4 best."""
     curves, lost = _grid()
     rates = np.stack([curve_at(curves.T, np.full(1, x)) for x in at]).clip(1e-4, 1 - 1e-4)  # P×G
-    likelihood = counts @ np.log(rates) + (n - counts) @ np.log(1 - rates)
-    best = likelihood.max(1, keepdims=True)
-    good = likelihood >= best - TOLERANCE
-    low = np.where(good, lost, np.inf).min(1)
-    return low, np.where(good, lost, -np.inf).max(1), curves[likelihood.argmax(1)]
+    odds, none = np.log(rates / (1 - rates)).astype(np.float32), n * np.log(1 - rates).sum(0).astype(np.float32)
+    likelihood = counts.astype(np.float32) @ odds + none
+    good = likelihood >= likelihood.max(1, keepdims=True) - TOLERANCE  # curves are sorted by breaking point
+    return lost[good.argmax(1)], lost[::-1][good[:, ::-1].argmax(1)], curves[likelihood.argmax(1)]

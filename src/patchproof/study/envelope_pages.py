@@ -15,7 +15,7 @@ import numpy as np
 
 from patchproof.report.tables import Drawing, Estimate, Table, Value, rate
 from patchproof.study.envelope_axes import AXES
-from patchproof.study.envelope_fit import BEYOND, NOT_MONOTONE
+from patchproof.study.envelope_fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,9 +38,9 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
             "Breaking points",
             (*ends, *STAGES.values(), "not monotone"),
             tuple(_break_row(one) for one in sweeps),
-            "Where a fitted falling curve has lost half of its rate at the easy end: median of the bootstrap over "
-            f"conditions, 95 % interval. “{HOLDS}”: not within the sweep. n conditions: {settings.n} recognized, "
-            f"{settings.photos} photographed.",
+            "Where a fitted falling curve has lost half of what it loses over the sweep: median of the bootstrap over "
+            f"conditions, 95 % interval. “{HOLDS}”: it loses less than {LEAST_LOST:.0%} of its rate. n conditions: "
+            f"{settings.n} shown to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
         ),
         Table(
             "beyond",
@@ -76,7 +76,8 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
         "Operating envelope",
         lambda figure: _draw_page(figure, sweeps, maps),
         _PAGE_IN,
-        "Bars run from the easy end to where half of the rate is lost; whiskers are 95 % intervals; an arrow holds on.",
+        "Bars run from the easy end to where half of what the sweep takes is lost; whiskers: 95 % intervals; →: it "
+        "holds; !: not monotone; in brackets the fitted rates at both ends.",
     )
     if not sweeps:
         return (page,)
@@ -191,8 +192,8 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
             )
         axis = AXES[x["axis"]]
         axes.text(-0.02, row, f"{axis.title}\n{axis.unit}", ha="right", va="center", fontsize=7.5)
-        axes.text(0.0, row + 0.46, f"{x['easy']:.3g}", ha="left", va="center", fontsize=6, alpha=0.7)
-        axes.text(1.0, row + 0.46, f"{x['hard']:.3g}", ha="right", va="center", fontsize=6, alpha=0.7)
+        axes.text(0.0, row + 0.46, _short(x["easy"]), ha="left", va="center", fontsize=6, alpha=0.7)
+        axes.text(1.0, row + 0.46, _short(x["hard"]), ha="right", va="center", fontsize=6, alpha=0.7)
     axes.set_xlim(-0.3, 1.22)
     axes.set_ylim(len(sweeps) - 0.3, -0.7)
     axes.set_axis_off()
@@ -209,8 +210,13 @@ def _draw_bar(axes: Axes, y: float, x: dict, found_break: dict, color: str, labe
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)
         return
     axes.plot([low, min(high, 1.0)], [y, y], color="black", linewidth=0.9)
-    text = f"{_at(x, value):.3g}" + (" !" if _rises(found_break) else "")
+    curve = found_break["curve"]
+    text = f"{_short(_at(x, value))} ({curve[0]:.2f}–{curve[-1]:.2f})" + (" !" if _rises(found_break) else "")
     axes.text(min(high, 1.0) + 0.01, y, text, va="center", fontsize=6.5)
+
+
+def _short(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
 def _draw_map(axes: Axes, one: Result) -> None:
@@ -227,7 +233,7 @@ def _draw_map(axes: Axes, one: Result) -> None:
     ):
         axis = AXES[end["axis"]]
         values = axis.values(end["easy"], end["hard"], end["points"])
-        set_ticks(range(end["points"]), [f"{v:.2g}" if v < 100 else f"{v:.0f}" for v in values], fontsize=6)
+        set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
         set_label(f"{axis.title}, {axis.unit}", fontsize=7)
 
 
@@ -256,7 +262,7 @@ def _draw_sweep(axes: Axes, one: Result) -> None:
             axes.axvline(found_break["value"], color=color, linestyle=":", linewidth=1)
     axis = AXES[x["axis"]]
     values = axis.values(x["easy"], x["hard"], x["points"])
-    axes.set_xticks(at, [f"{v:.2g}" if v < 100 else f"{v:.0f}" for v in values], fontsize=7)
+    axes.set_xticks(at, [_short(v) for v in values], fontsize=7)
     axes.set_xlabel(f"{axis.title}, {axis.unit}", fontsize=8)
     axes.set_ylim(-0.05, 1.05)
     axes.spines[["top", "right"]].set_visible(False)

@@ -40,7 +40,7 @@ from patchproof.sheet.raster import piece_pixels
 from patchproof.study.envelope_axes import GEOMETRY, Point, conditions_at, placed_at
 from patchproof.study.reprint import DPI_RANGE, OVERSAMPLING
 from patchproof.study.sheet import sheet_of
-from patchproof.verify.camera import view_of
+from patchproof.verify.camera import ANY_FOCAL_ERROR, EXIF_FOCAL_ERROR, View
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import PromisedRanges
 from patchproof.verify.surface import Surface, surface_of
@@ -273,10 +273,13 @@ def _on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> 
 def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px) -> Measurement:
     """What the tool says of a part of a photograph whose corner lies at `origin_px`."""
     whole_px = world.scene.settings.camera.photo_px
-    focal_px = float(scene.matrix_px(whole_px)[0, 0]) if isinstance(scene, MeshScene) else None
-    entry = measure(
-        view_of(Photo(srgb, focal_px, Path("photo")), None), "photo", world.surface, None, PromisedRanges({})
-    ).entry
+    matrix_px = None
+    if isinstance(scene, MeshScene):  # of pictures nobody knows the focal length
+        matrix_px = scene.matrix_px(whole_px).copy()
+        matrix_px[:2, 2] -= origin_px
+    photo = Photo(srgb, None if matrix_px is None else float(matrix_px[0, 0]), Path("photo"))
+    view = View(photo, matrix_px, ANY_FOCAL_ERROR if matrix_px is None else EXIF_FOCAL_ERROR, calibrated=False)
+    entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
     if entry.status == "measured" and entry.homography_px_from_mm is not None:
         corners = geometry.rect_corners(world.surface.rect_mm)
@@ -290,7 +293,7 @@ def _seen_at(scene: Scene, conditions: Conditions, piece_mm: np.ndarray, photo_p
     """Pixels N×2 of points of the piece in one photograph; NaN behind the camera."""
     if not isinstance(scene, MeshScene):
         return geometry.apply_homography(scene.piece_homographies(conditions, photo_px)[0], piece_mm)
-    pose = scene.camera_from_world(conditions)[0]
+    pose = scene.camera_from_print(conditions)[0]
     points = geometry.project(scene.matrix_px(photo_px), pose, scene.placement.world(piece_mm))
     return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
 
