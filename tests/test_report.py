@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+import functools
 import html
+import http.server
 import io
 import json
 import re
 import shutil
 import subprocess
+import threading
 from html.parser import HTMLParser
 
 import numpy as np
@@ -116,7 +119,7 @@ def test_json_is_the_report_and_nothing_else(tmp_path):
 
 def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(tmp_path):
     written(tmp_path)
-    rows = list(csv.DictReader((tmp_path / "report.csv").open(encoding="utf-8")))
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "report.csv").read_text(encoding="utf-8"))))
     photos = some_report().photos
     assert [row["file"] for row in rows] == [photo.file for photo in photos]
     assert (
@@ -169,6 +172,11 @@ document.title = JSON.stringify({wide, small, broken, fetched, width: document.d
 EARLY = "<head><script>window.troubles = []; window.onerror = m => { window.troubles.push(String(m)) }</script>"
 
 
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *arguments):
+        pass
+
+
 def seen_in_browser(page, width_px, tmp_path):
     """What a browser says of the page in a frame of that width, since a headless window is never narrower than 500."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
@@ -176,16 +184,18 @@ def seen_in_browser(page, width_px, tmp_path):
         pytest.skip("no Chromium here to look at the page")
     probe = page.read_text(encoding="utf-8").replace("<head>", EARLY, 1).replace("</body>", PROBE)
     (tmp_path / "probe.html").write_text(probe, encoding="utf-8")
-    frame = tmp_path / "frame.html"
-    frame.write_text(
-        f"<iframe src='probe.html' width='{width_px}' height='800' style='border:0' onload='"
-        "document.title = this.contentDocument ? this.contentDocument.title : 0'></iframe>"
+    (tmp_path / "frame.html").write_text(
+        f"<link rel=icon href='data:,'><iframe src='probe.html' width='{width_px}' height='800' style='border:0'"
+        " onload='document.title = this.contentDocument.title'></iframe>"
     )
-    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
-    flags += (
-        f" --disable-component-update --disable-sync --allow-file-access-from-files --user-data-dir={tmp_path / 'u'}"
-    )
-    done = subprocess.run([browser, *flags.split(), "--dump-dom", frame.as_uri()], capture_output=True, timeout=60)
+    flags = f"--headless --no-sandbox --disable-gpu --no-first-run --user-data-dir={tmp_path / 'user'} --dump-dom"
+    flags += " --disable-background-networking --disable-component-update --disable-sync --disable-quic"
+    handler = functools.partial(Quiet, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:  # of a file: page, failed loads are lost
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/frame.html"
+        done = subprocess.run([browser, *flags.split(), address], capture_output=True, timeout=60)
+        server.shutdown()
     title = re.search(r"<title>(\{.*?\})</title>", done.stdout.decode())
     assert title is not None, done.stderr.decode()[-500:]
     return json.loads(html.unescape(title[1]))

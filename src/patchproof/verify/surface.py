@@ -137,7 +137,7 @@ def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, in
     Scissors, folds and what a shop adds beside the frame are left out. Edges fall on whole pixels.
     """
     x, y, w, h = surface.piece_mm
-    px_per_mm = min(design.shape[1] / surface.rect_mm[2], _LARGEST_PIECE_PX / max(w, h))
+    px_per_mm = _LARGEST_PIECE_PX / max(w, h)
     picture = np.ones((max(1, round(h * px_per_mm)), max(1, round(w * px_per_mm)), 3), np.float32)
 
     def paste(rect, pixels: np.ndarray, how: int) -> None:
