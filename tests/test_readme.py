@@ -23,6 +23,11 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
 
+@pytest.fixture(autouse=True)
+def a_promise_of_few_views(monkeypatch):
+    monkeypatch.setattr("patchproof.optimize.run.PROMISE_VIEWS", 40)
+
+
 @pytest.fixture(scope="module")
 def here(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
