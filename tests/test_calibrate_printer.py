@@ -12,6 +12,7 @@ import torch
 from PIL import Image, ImageCms
 
 from patchproof import cli
+from patchproof.bench import printer as bench_printer
 from patchproof.calibrate import icc
 from patchproof.calibrate.chart import calibrate_chart, combine, map_of, print_variation, printer_of, prints_of
 from patchproof.calibrate.chart_photo import read_chart
@@ -25,7 +26,6 @@ from patchproof.photo.read import Photo
 from patchproof.settings import Refused
 from patchproof.sheet.chart import chart_colors
 from patchproof.sheet.manifest import dump_manifest
-from patchproof.study import bench_printer
 from patchproof.study.chart_photos import chart_manifest, photograph_page, printed_page
 from patchproof.study.inkjets import DRIVERS, draw_inkjet
 

@@ -460,7 +460,7 @@ def bench(
     overwrite: Overwrite = False,
 ) -> None:
     """Speed against accuracy of each knob on this machine: charts, a table and JSON."""
-    from patchproof.study.bench import run_bench
+    from patchproof.bench.run import run_bench
 
     with _progress() as bar:
         lines = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)

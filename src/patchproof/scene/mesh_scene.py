@@ -18,7 +18,8 @@ from patchproof.channel import lens
 from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
 from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.mesh import Mesh, load_mesh
+from patchproof.scene.load_mesh import load_mesh
+from patchproof.scene.mesh import Mesh
 from patchproof.scene.placement import Frame, Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
 from patchproof.scene.texture import Canvas, texture_canvas
