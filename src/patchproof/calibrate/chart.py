@@ -89,8 +89,8 @@ def calibrate_chart(
     ]
     if choice.width < WIDE:
         warnings.append(
-            f"the {choice.colors} readable swatches are nearly gray (rms {choice.width:.2f} of the color cube; charts "
-            f"have 0.25): the errors stated are of colors like these, others are a guess"
+            f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in its thinnest "
+            f"direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
         )
     provenance = {
         "source": f"{len(readings)} photographs of {len(by_print)} print{'s' if len(by_print) > 1 else ''} of a chart",
@@ -205,7 +205,9 @@ def ladder_table(choice: Choice) -> list[dict[str, Any]]:
         }
         for figure in choice.figures
     ]
-    return rows + [{"rung": name, "delta_e00": None, "reason": "swatches too few or too gray"} for name in choice.left_out]
+    return rows + [
+        {"rung": name, "delta_e00": None, "reason": "swatches too few or too much alike"} for name in choice.left_out
+    ]
 
 
 def summary_lines(calibration: Calibration) -> list[str]:
@@ -214,7 +216,7 @@ def summary_lines(calibration: Calibration) -> list[str]:
     lines = [f"{told['source']}; {told['model_of']}"]
     for row in told["ladder"]:
         mark = "  <- chosen: the simplest within one standard error of the best" if row["rung"] == choice.name else ""
-        figure = "swatches too few or too gray"
+        figure = "swatches too few or too much alike"
         if row["delta_e00"] is not None:
             figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
         lines.append(f"  {row['rung']:20s} {figure}{mark}")

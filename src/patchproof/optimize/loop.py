@@ -97,7 +97,8 @@ def _step(problem: Problem, state: State, seen: Seen) -> Step:
         raise Refused("finite gradients", f"{largest} in step {state.number + 1} from the networks", do)
     if isinstance(penalty, Tensor):
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
-    loss = float(losses.detach()) + float(penalty)
+        penalty = float(penalty.detach())
+    loss = float(losses.detach()) + penalty
     return Step(_descend(state, gradient, problem), loss, confidences, rates, largest, pictures=pictures.detach())
 
 
