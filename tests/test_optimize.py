@@ -296,14 +296,14 @@ def test_promises_of_other_seeds_spread_as_their_interval_says(tmp_path):
     near-duplicates would be, dispersion 8, and the interval fails: what it says holds for independent draws alone.
     """
     problem = set_problem(scene_with(tmp_path, camera__photo_px=[64, 64], printer__dot_gain=[-0.2, 0.2]))
-    design = np.full((*problem.subject.printed_px[::-1], 3), (115, 128, 128), np.uint8)
+    design = np.full((*problem.subject.printed_px[::-1], 3), (108, 128, 128), np.uint8)
     shown = shown_with_controls(problem, design, ())
     drawn = [judged(problem, shown, problem.scene.draw("promise", 40, seed)) for seed in range(10)]
     seen = np.array([outcomes.recognized["design"][0] for outcomes in drawn])
     for recognized, holds in ((seen, True), (seen[:, :5].repeat(8, 1), False)):
         counts, rate = recognized.sum(1), recognized.mean()
         inside = sum(low <= rate <= high for low, high in (wilson(int(count), 40) for count in counts))
-        assert 0.2 < rate < 0.8
+        assert 0.15 < rate < 0.85
         assert (0.2 < dispersion(counts, 40) < 2.4) == holds and (inside >= 8) == holds, (rate, counts)
 
 
