@@ -30,7 +30,7 @@ from patchproof.study.study import Cell, Result, Study
 STEP = {"print": "print", "blur": "blur_and_noise", "cast": "light_and_camera", "dim": "light_and_camera"}
 LEAST_COST = 0.10  # of confidence
 _TRIES = 3  # troubles drawn for a trial until one costs enough
-_FADED = 0.3  # of the density that dyes may keep
+_FADED = 0.2  # of the density that dyes may keep
 
 
 class LedgerSettings(Strict):
@@ -57,12 +57,13 @@ def run(settings: LedgerSettings, base: Path, cell: Cell) -> dict[str, Any]:
     hall = _hall(str(base / cell.values["run"]), settings.photo_px)
     number, n = cell.values["number"], settings.photos
     conditions = hall.scene.draw("reprint", n, settings.seed, number * n)
-    plain = hall.confidence(hall.take(conditions))
+    views = hall.views(conditions)
+    plain = hall.confidence(hall.take(views, conditions))
     rng = np.random.default_rng([settings.seed, number])
     found: dict[str, Any] = {}
     for _ in range(_TRIES):
         trouble, printer, changed = _trouble(cell.values["culprit"], rng, conditions, hall)
-        photos = hall.take(changed, printer)
+        photos = hall.take(views, changed, printer)
         loss = hall.sign * (plain - hall.confidence(photos))
         found = {"trouble": trouble, "outcome": "weak", "cost": float(loss.mean()), "photos": 0}
         if loss.mean() >= LEAST_COST:
@@ -95,21 +96,33 @@ class _Hall:
         views = scene.piece_homographies(conditions, scene.settings.camera.photo_px)
         return scene.piece.module_mm * float(np.median([local_scale(view, middle)[0] for view in views]))
 
-    def take(self, conditions, printed: Callable[[Any], Any] | None = None) -> list[bytes]:
+    def piece(self, printed: Callable[[Any], Any]):
+        """The piece as it was printed, sRGB 1×3×H×W to the same."""
+        from patchproof.render.pixels import PiecePicture
+
+        srgb = printed(self.pixels)[0].permute(1, 2, 0)
+        whole = (0, 0, srgb.shape[1], srgb.shape[0])
+        return PiecePicture(srgb, whole, whole)
+
+    def views(self, conditions) -> list[Any]:
+        """What is rasterized once for all that is done to print, light and camera."""
+        from patchproof.render.views import see
+
+        piece, each = self.piece(self.printer.apply), range(len(conditions))
+        return [see(self.stage, piece, conditions[i : i + 1], self.photo_px) for i in each]
+
+    def take(self, views, conditions, printed: Callable[[Any], Any] | None = None) -> list[bytes]:
         """A JPEG file for each condition of the piece as `printed` shows it (by default as promised)."""
         import torch
         from PIL import Image
 
-        from patchproof.render.photograph import photograph
-        from patchproof.render.pixels import PiecePicture
+        from patchproof.render.photograph import expose
 
-        srgb = (printed or self.printer.apply)(self.pixels)[0].permute(1, 2, 0)
-        whole = (0, 0, srgb.shape[1], srgb.shape[0])
-        photos = []
-        for i in range(len(conditions)):
+        piece, photos = self.piece(printed or self.printer.apply), []
+        for i, view in enumerate(views):
             one = conditions[i : i + 1]
             with torch.no_grad():
-                picture = photograph(self.stage, PiecePicture(srgb, whole, whole), one, self.photo_px, jpeg=False)
+                picture = expose(replace(view, conditions=one), piece, jpeg=False)
             codes = (picture[0].permute(1, 2, 0).numpy().clip(0, 1) * 255 + 0.5).astype(np.uint8)
             buffer = BytesIO()
             Image.fromarray(codes).save(buffer, "JPEG", quality=int(one.jpeg[0]))
@@ -160,7 +173,7 @@ class _Hall:
         }
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=8)
 def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
     import torch
 
@@ -215,12 +228,12 @@ def _trouble(kind: str, rng: np.random.Generator, conditions, hall: _Hall):
         name, printer = _wrong_printer(rng, hall)
         return name, printer, conditions
     if kind == "blur":  # up to what still shows the cells of markers apart
-        modules = rng.uniform(0.25, 0.55)
+        modules = rng.uniform(0.35, 0.55)
         return f"{modules:.2f} modules", None, with_value(conditions, "blur_px", modules * hall.module_px(conditions))
     if kind == "cast":
-        gains = np.exp(rng.uniform(-1.6, 0.2, 3))
+        gains = np.exp(rng.uniform(-1.8, 0.2, 3))
         return f"gains {gains.round(2)}", None, replace(conditions, white_balance=conditions.white_balance * gains)
-    stops = rng.uniform(1.5, 5.5)
+    stops = rng.uniform(2.0, 5.5)
     return f"{stops:.1f} stops", None, replace(conditions, exposure_ev=conditions.exposure_ev - stops)
 
 
@@ -240,7 +253,7 @@ def _wrong_printer(rng: np.random.Generator, hall: _Hall):
         inkjet = draw_inkjet(seed)
         name, light = f"inkjet {seed}", lambda srgb: inkjet(srgb)
     else:
-        kept = rng.uniform(_FADED, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(_FADED, 0.6))
+        kept = rng.uniform(_FADED, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(_FADED, 0.5))
         name, light = f"faded {kept.round(2)}", lambda srgb: _faded(hall.printer, kept, srgb)
 
     def printed(pixels):

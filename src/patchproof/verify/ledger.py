@@ -133,14 +133,19 @@ def _looks(manifest: Manifest, surface: Surface, promised: Promised, printed) ->
 
 
 def _references(conditions, shots: Sequence[Shot], manifest: Manifest, promised: Promised) -> list[Reference]:
-    """One of the promise's conditions for each photograph, spread evenly over their contrasts."""
+    """One of the promise's conditions for each photograph, spread evenly over their contrasts.
+
+    The brightest photograph gets the brightest, and so on: paired by chance, a few photographs' light share is mostly
+    the luck of the draw.
+    """
     conditions = sorted(conditions, key=lambda c: c.contrast)
-    rank = ((np.arange(len(shots)) + 0.5) / len(shots) * len(conditions)).astype(int)
+    spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(conditions)).astype(int)
+    rank = np.argsort(np.argsort([float(np.mean(shot.light.paper - shot.light.ink)) for shot in shots]))
     camera = manifest.settings.get("camera", {})
     low, high = camera.get("noise", (0.0, 0.0))
     noise = low + (high - low) * np.random.default_rng(1).permutation(len(shots) * 2)[: len(shots)] / (2 * len(shots))
     references = []
-    for shot, i, level in zip(shots, np.random.default_rng(0).permutation(rank), noise, strict=True):
+    for shot, i, level in zip(shots, spread[rank], noise, strict=True):
         side = shot.square.shape[0]
         scale = side / min(camera["photo_px"]) if "photo_px" in camera else shot.scale
         white = conditions[i].contrast / (1 - float(promised.ink.mean()))
