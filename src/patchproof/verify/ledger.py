@@ -13,9 +13,10 @@ and each effect gets its mean cost over all orders of switching them on (Shapley
 explains. Shares sum to the whole, v(nothing on) - v(photograph), and may be negative. "Off" means off by the promise:
 each photograph borrows light and blur from one of the promise's own conditions, so that what was promised is no loss.
 
-By convention an affine map in linear light fixed by paper white and marker black is light and camera, the rest of a
-color difference is print: ink that is lighter than promised and a veil of stray light look alike. Without readable
-swatches the two are one step.
+Gains and a veil that make paper white and marker black what was promised are light and camera, the rest of a color
+difference is print. Ink lighter than promised and a veil of stray light look alike but for one thing: a veil lies over
+the whole photograph, so what exceeds its darkest place is ink; up to there it counts as light. Without readable
+swatches print and light are one step.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ def ledger_of(
         return None
     undo = [light_fit(shot, promised) for shot in shots]
     relative = [fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)]
-    printed = fit_print(relative, promised.swatches, promised.ink)
+    inks = [fit.apply(shot.light.ink) for fit, shot in zip(undo, shots, strict=True)]
+    printed = fit_print(relative, promised.swatches, np.median(inks, axis=0), promised.ink)
     looks = _looks(manifest, surface, promised, printed)
     values = []
     for shot, fit, reference in zip(shots, undo, _references(conditions, shots, manifest, promised), strict=True):
