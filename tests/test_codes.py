@@ -40,7 +40,7 @@ def trouble(markers=8, module_px=4.0, **figures):
         ("tilted", {"tilt_deg": 77.9}, {"tilt_deg": 78.1}),
         ("blurred", {"blur_px": 1.99}, {"blur_px": 2.01}),  # half a module of 4 px
         ("too_small", {"px_per_mm": 0.241}, {"px_per_mm": 0.239}),  # 24 px across 100 mm
-        ("too_small", {"corner_uncertainty_mm": 2.99}, {"corner_uncertainty_mm": 3.01}),
+        ("too_small", {"corner_uncertainty_mm": 1.49}, {"corner_uncertainty_mm": 1.51}),
         ("curled", {"residual_mm": 0.99}, {"residual_mm": 1.01}),
     ],
 )

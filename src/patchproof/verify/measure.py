@@ -34,7 +34,8 @@ from patchproof.verify.surface import Promised, Surface
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighbouring cells melt together
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean colour
 MOST_TILT_DEG = 78.0  # foreshortened to a fifth
-MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side
+MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
+MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
 MOST_SCALE_ERROR = 0.01
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
@@ -230,7 +231,8 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
     """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
     side_mm = min(surface.rect_mm[2:])
     module_px = float(np.median([b.module_px for b in found.markers.values()]))
-    uncertain = entry.corner_uncertainty_mm > MOST_UNCERTAIN * side_mm
+    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
+    uncertain = entry.corner_uncertainty_mm > most_uncertain
     if entry.tilt_deg > MOST_TILT_DEG:
         return CannotJudge("tilted", entry.tilt_deg, MOST_TILT_DEG, _ADVICE["tilted"])
     if entry.blur_px > MOST_BLUR * module_px:
@@ -250,7 +252,7 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
             "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"
         )
     if uncertain:
-        return CannotJudge("too_small", side_mm * entry.px_per_mm, 2 * SMALLEST_DESIGN_PX, _ADVICE["too_small"])
+        return CannotJudge("too_small", entry.corner_uncertainty_mm, most_uncertain, _ADVICE["too_small"])
     return None
 
 
