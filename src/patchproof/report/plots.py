@@ -1,4 +1,4 @@
-"""Where photographs were recognized and where not: small plots as inline SVG that follow the page's text colour.
+"""Where photographs were recognized and where not: small plots as inline SVG that follow the page's text color.
 
 In: entries of a report as plain data. Out: SVG text. Points lie at 0 or 1 with a little fixed scatter; the line is a
 running share of the nearest photographs, and is drawn only where there are enough of them to mean something.
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-_INK = "#010203"  # stands for the page's own text colour and is replaced in the SVG
+_INK = "#010203"  # stands for the page's own text color and is replaced in the SVG
 _YES, _NO = "#2a9d6f", "#d1495b"
 _LEAST_FOR_LINE = 24
 
