@@ -89,7 +89,7 @@ def test_the_stated_uncertainty_covers_the_truth_in_drawn_corners():
     ids=["one", "two", "four", "eight"],
 )
 def test_few_markers_state_as_wide_an_uncertainty_as_they_have(ids, typical_mm):
-    """Noise three times the floor; of 200 draws 96, 96, 93 and 92 % are covered. One marker's residual tells nothing
+    """Noise three times the floor; of 100 draws 96, 96, 92 and 92 % are covered. One marker's residual tells nothing
     of its noise: taken for the floor, its 95 % figure held in 29 %.
     """
     hits, stated = 0, []
