@@ -70,6 +70,13 @@ def _draw_ledger(axes, ledger: Mapping) -> None:
         if share["interval"] is not None:
             ends = start + (np.sign(end - start) * np.sign(share["share"]) or -1) * np.array(share["interval"])
             axes.plot(ends, [row, row], color=_INK, linewidth=1.2)
+    levels = [
+        f"{100 * ideal:.0f} %",
+        *(f"{100 * change:+.1f}" for change in after - before),
+        f"{100 * after[-1]:.0f} %",
+    ]
+    for row, level in enumerate(levels):
+        axes.text(1.02, row, level, color=_INK, va="center", transform=axes.get_yaxis_transform())
     axes.set_yticks([0, *rows, len(costs) + 1], ["ideal", *(_STEPS.get(s, s) for s in shares), "photographs"])
     axes.invert_yaxis()
     axes.set_xlabel("confidence in the target")

@@ -22,7 +22,7 @@ from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
 from patchproof.photo.read import Photo
-from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
 from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 from patchproof.verify.appearance import MOST_CLIPPED, appearance
 from patchproof.verify.camera import View
@@ -39,6 +39,8 @@ MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured sho
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
 MOST_SCALE_ERROR = 0.01
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
+# Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
+MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
 _ADVICE = {
     "blurred": "hold still, tap to focus on the patch, or use more light",
     "too_small": "come closer or use the camera's full resolution",
@@ -214,7 +216,12 @@ def _with_geometry(
     }
     if view.matrix_px is not None:
         azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
-        figures |= {"azimuth_deg": azimuth, "distance_mm": distance}
+        angle, length = view_uncertainty(fit, view.matrix_px, surface.center_mm)
+        figures |= {
+            "azimuth_deg": azimuth if angle <= MOST_AZIMUTH_ERROR_DEG else None,
+            "azimuth_uncertainty_deg": angle,
+            "distance_mm": distance if length <= MOST_DISTANCE_ERROR * distance else None,
+        }
     if view.calibrated:
         ratio, uncertainty = x_over_y(fit, view.matrix_px, view.focal_error)
         figures["scale_x_over_y"] = ratio if uncertainty <= MOST_RATIO_ERROR else None

@@ -43,11 +43,15 @@ class PromisedRanges:
         entry = at_side(entry, self.side_px)
         for name, (low, high) in self.limits.items():
             value = getattr(entry, name)
-            if value is None or (low <= value <= high) or (name != "px_per_mm" and not trust_angles):
+            if value is None or (name != "px_per_mm" and not trust_angles):
+                continue
+            if name == "azimuth_deg":  # a photograph is left out only where it is sure to lie outside
+                low, high = low - (entry.azimuth_uncertainty_deg or 0), high + (entry.azimuth_uncertainty_deg or 0)
+            if low <= value <= high:
                 continue
             below = value < low
             do = _ADVICE[name][0 if below else 1]
-            unit = f" in a photo {self.side_px:g} px high" if name == "px_per_mm" and self.side_px else ""
+            unit = f" at {self.side_px:g} px of the shorter side" if name == "px_per_mm" and self.side_px else ""
             advice = f"{name} is {value:.3g}{unit}, the promise covers {low:.3g} to {high:.3g}: {do}"
             return CannotJudge("out_of_range", value, low if below else high, advice)
         return None

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from patchproof.bench.chart import Chart, Check, OnStage, Point, Series, Table
+from patchproof.bench.measure import mean_interval, median_interval
 from patchproof.color import srgb_from_linear
 from patchproof.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import COARSEST_PX, DICTIONARY, levels, look, printed_markers, whole
 from patchproof.photo.rectify import fit_page
-from patchproof.study.bench import Chart, Check, OnStage, Point, Series, Table, mean_interval, median_interval
 
 SIZES_PX = ((1600, 1200), (2400, 1800), (4000, 3000))
 COARSEST = (500, COARSEST_PX, 2000)
