@@ -48,9 +48,9 @@ def detect_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
         megapixels = round(size_px[0] * size_px[1] / 1e6)
         points, found = [], []
         for coarsest_px in COARSEST:
-            for name, find in (("fitted borders", find_fitted), ("OpenCV's corners", find_plain)):
+            for name, find in (("fitted", find_fitted), ("OpenCV's", find_plain)):
                 seconds, errors, share = tried(shots, find, coarsest_px)
-                setting = f"from {coarsest_px} px, {name}"
+                setting = f"{coarsest_px} px, {name}"
                 default = coarsest_px == COARSEST_PX and find is find_fitted
                 points.append(_point(setting, 1000 * seconds, errors, default))
                 found.append((setting, f"{share:.1%}"))
@@ -65,7 +65,10 @@ def detect_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
             cost_label="milliseconds of processor time per photograph",
             error_label="error of the design's corners, px (median)",
             series=(Series(f"{megapixels} MP", tuple(points)),),
-            notes=(f"{count} photographs, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; decoding is not counted",),
+            notes=(
+                "the search starts at so many px; corners are fitted or OpenCV's",
+                f"{count} photographs, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; decoding is not counted",
+            ),
             checks=tuple(checks),
             tables=(Table(("markers found", "share"), tuple(found)),),
         )
