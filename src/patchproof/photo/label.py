@@ -15,7 +15,7 @@ import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.rectify import rectify
-from patchproof.sheet.manifest import Manifest
+from patchproof.sheet.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
 _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template
@@ -23,7 +23,9 @@ _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the
 
 @dataclass(frozen=True)
 class Label:
-    """`printed` is 16 digits of the design's SHA-256, or the kind of a sheet without one."""
+    """`printed` is 16 digits of the design's SHA-256, or the kind of a sheet without one; a page of several designs has
+    an id of its own and digits of all their hashes.
+    """
 
     sheet_id: str
     printed: str
@@ -31,12 +33,14 @@ class Label:
 
 def label_of(manifest: Manifest) -> Label:
     """What the code on this manifest's page says."""
+    if manifest.page_code is not None:
+        return parsed(manifest.page_code)
     return Label(manifest.sheet_id, manifest.design.sha256[:16] if manifest.design else manifest.kind)
 
 
 def parsed(text: str) -> Label | None:
     """The label in a code's text; None where the code is not ours."""
-    match = re.match(r"patchproof:([0-9A-Z]{10}):([0-9a-z]+)", text)
+    match = re.match(PAGE_CODE, text)
     return Label(match[1], match[2]) if match else None
 
 
