@@ -19,11 +19,12 @@ from patchproof.sheet.chart_page import chart_sheet
 from patchproof.sheet.manifest import load_manifest
 from patchproof.sheet.page import Box, largest_piece_mm, prove_apart
 from patchproof.sheet.piece import lay_out_piece
+from patchproof.sheet.plan_page import PlanPage
 from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheet.several import OneDesign, write_several
 from patchproof.sheet.template import load_template, template_names
 from patchproof.sheet.tiles import plan_tiles
-from patchproof.sheet.write import write_sheet
+from patchproof.sheet.write import check_sheet, write_sheet
 from patchproof.verify.camera import view_of
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges
@@ -158,7 +159,7 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimetr
     path, manifest = tiled
     surface, origin, errors = surface_of(manifest), np.array(manifest.design.rect_mm[:2]), []
     assert len(manifest.tiles) >= 12 and len(surface.piece_ids) == 8
-    for tile in manifest.tiles[:: max(len(manifest.tiles) // 4, 1)]:
+    for tile in manifest.tiles:
         scan, truth = scanned(page_pixels(path, tile.page, DPI), tile.page)
         measured = measure(view_of(Photo(scan, None, None), None), "scan", surface, None, promised_ranges(()), DPI)
         entry = measured.entry
@@ -265,3 +266,25 @@ def test_what_cannot_be_printed_is_refused_in_one_sentence(tmp_path):
     with pytest.raises(Refused, match="a folder that can be written to"):
         chart_sheet(load_template("chart_a4"), tmp_path / "file" / "c.pdf")
     assert json.loads(json.dumps([p.name for p in tmp_path.iterdir()])) == ["file"]
+
+
+def test_check_says_of_each_kind_of_page_what_is_cut(tmp_path, tiled):
+    def told(manifest):
+        return " ".join(check_sheet(manifest))
+
+    chart = told(chart_sheet(load_template("chart_a4"), tmp_path / "c.pdf"))
+    assert "Cut nothing" in chart and "piece" not in chart and "7.0 mm from its edge" in chart
+    board = told(board_sheet("charuco_a4", tmp_path / "b.pdf"))
+    assert "Glue the uncut page" in board and "Cut the" not in board
+    tiles = told(tiled[1])
+    count = len(tiled[1].tiles)
+    assert f"Cut the {count} tiles of pages 2 to {count + 1}" in tiles and "page 1 stays whole" in tiles
+    assert "-" not in tiles.split("cut line stay ")[1].split(" mm")[0]
+    for manifest in write_several(tmp_path / "s.pdf", load_template("a3"), designs(ID, "B1B2C3D4E5")):
+        corner = "{:.0f} mm from the left and {:.0f} mm from the top".format(*manifest.cut_mm)
+        assert f"of sheet {manifest.sheet_id}" in told(manifest) and corner in told(manifest)
+    plan = PlanPage(None, (("How to photograph it", ("From all sides.",)),))
+    one = write(tmp_path / "p.pdf", "a4", plan=plan)
+    assert one.plan_page == 2 and "Page 2 is for people" in told(one)
+    assert "Cut the piece of 94.6 × 94.6 mm" in told(one)
+    assert "Page 2" not in told(write(tmp_path / "q.pdf", "a4"))

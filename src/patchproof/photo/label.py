@@ -49,11 +49,16 @@ def read_label(srgb: np.ndarray) -> Label | None:
     shrink = _LARGEST_PX / max(srgb.shape[:2])
     if shrink < 1:
         srgb = cv2.resize(srgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    try:
-        text, _, _ = cv2.QRCodeDetector().detectAndDecode(cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY))
-    except cv2.error:  # some quadrangles that are no code make its decoder stumble
-        return None
-    return parsed(text)
+    gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
+    # of 7 oblique pages of either size they read 6 and 1 (A4), 5 and 7 (labels): neither is enough
+    for detector in (cv2.QRCodeDetectorAruco(), cv2.QRCodeDetector()):
+        try:
+            label = parsed(detector.detectAndDecode(gray)[0])
+        except cv2.error:  # some quadrangles that are no code make its decoder stumble
+            continue
+        if label is not None:
+            return label
+    return None
 
 
 def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], label: Label) -> None:

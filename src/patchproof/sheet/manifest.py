@@ -145,6 +145,7 @@ class Manifest(Strict):
     ruler_mm: tuple[Positive, Positive]
     card_mm: Rect | None = None  # the printed outline that a bank card is laid into, on the design's page
     page_code: Annotated[str, Field(pattern=PAGE_CODE)] | None = None  # of a page that several designs share
+    plan_page: Page | None = None  # the page for people: where the piece goes, and how to photograph it
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]
