@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from patchproof.study import bench_detect
-from patchproof.study.bench_detect import find_fitted, find_plain, shoot, tried
+from patchproof.bench import detect as bench_detect
+from patchproof.bench.detect import find_fitted, find_plain, shoot, tried
 
 
 def test_fitted_borders_beat_plain_corners_on_known_photographs():

@@ -9,7 +9,8 @@ import pytest
 
 from patchproof.scene.bend import STRETCH_LIMIT, place_bent
 from patchproof.scene.exponential import Smooth, exponential_map, largest_stretch
-from patchproof.scene.mesh import Material, Part, from_parts, load_mesh
+from patchproof.scene.load_mesh import load_mesh
+from patchproof.scene.mesh import Material, Part, from_parts
 from patchproof.scene.placement import LIFT_MM, patch_frame
 from patchproof.scene.surface import Chart, crop, edge_points, heights, net
 from patchproof.settings import PatchSettings, Refused

@@ -14,9 +14,9 @@ from patchproof.optimize.run import optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import with_value
 from patchproof.settings import Refused
-from patchproof.study.envelope import EnvelopeSettings, cells
-from patchproof.study.envelope_axes import AXES, conditions_at, placed_at
-from patchproof.study.envelope_world import (
+from patchproof.study.envelope.axes import AXES, conditions_at, placed_at
+from patchproof.study.envelope.sweeps import EnvelopeSettings, cells
+from patchproof.study.envelope.world import (
     _Stages,
     _window,
     measured,

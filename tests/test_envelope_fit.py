@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from patchproof.study.envelope_fit import (
+from patchproof.study.envelope.fit import (
     BEYOND,
     NOT_MONOTONE,
     _fit,

@@ -284,7 +284,7 @@ def test_require_kept_makes_any_other_verdict_exit_with_1(journey, tmp_path):
 
 
 def test_bad_meshes_end_in_one_sentence_or_a_warning(data, tmp_path, capsys):
-    from patchproof.scene.mesh import load_mesh
+    from patchproof.scene.load_mesh import load_mesh
     from patchproof.settings import Refused
 
     names = sorted(path.name for path in (data / "meshes" / "bad").iterdir() if path.suffix in {".obj", ".glb", ".stl"})

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from patchproof.color import linear_from_srgb
-from patchproof.scene.mesh import Material, Part, from_parts, load_mesh
+from patchproof.scene.load_mesh import load_mesh
+from patchproof.scene.mesh import Material, Part, from_parts
 from patchproof.settings import Refused
 
 DATA = os.environ.get("PATCHPROOF_DATA")

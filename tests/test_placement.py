@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from patchproof.scene.mesh import load_mesh
+from patchproof.scene.load_mesh import load_mesh
 from patchproof.scene.placement import LIFT_MM, patch_frame, place_card
 from patchproof.settings import PatchSettings, Refused
 

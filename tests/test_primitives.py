@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from patchproof.scene import primitives, solids
-from patchproof.scene.mesh import load_mesh
+from patchproof.scene.load_mesh import load_mesh
 from patchproof.settings import Refused
 
 ALL_PARTS = [(name, seed) for name in primitives.names() for seed in range(4)]

@@ -13,7 +13,8 @@ from scipy.sparse.csgraph import connected_components
 
 from patchproof.color import linear_from_srgb
 from patchproof.scene import unwrap as unwrapping
-from patchproof.scene.mesh import Material, Part, from_parts, load_mesh
+from patchproof.scene.load_mesh import load_mesh
+from patchproof.scene.mesh import Material, Part, from_parts
 from patchproof.scene.texels import coverage
 from patchproof.scene.texture import texture_canvas
 from patchproof.scene.unwrap import has_place, unwrap
@@ -98,7 +99,7 @@ def test_faces_that_xatlas_folds_over_others_are_cut_out(monkeypatch):
 
 def test_the_same_mesh_gives_the_same_bytes_in_another_process():
     code = (
-        "import hashlib, numpy as np; from patchproof.scene.mesh import load_mesh;"
+        "import hashlib, numpy as np; from patchproof.scene.load_mesh import load_mesh;"
         "from patchproof.scene.unwrap import unwrap; m = load_mesh('primitive:mug', 300);"
         "m = unwrap(m, np.ones(len(m.faces), bool), 128);"
         "print(hashlib.sha256(m.corner_uv.tobytes() + m.materials[0].texture_srgb.tobytes()).hexdigest())"

@@ -229,7 +229,7 @@ class OptimizeSettings(Strict):
     mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on come from the worst
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
-    step_size: Positive = 0.1
+    step_size: Annotated[Positive, Field(le=1)] = 0.1  # of sRGB's range; what is larger than it only jumps to its ends
     tv: NotNegative = 0.0
     # Loss for colors that the printer misses, per 100 ΔE00. At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
     # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).

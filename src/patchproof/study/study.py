@@ -32,9 +32,10 @@ from patchproof.workers import Workers, one_thread, open_workers, result_of
 STUDIES: dict[str, str] = {
     "deceive": "patchproof.study.deceive",
     "detection": "patchproof.study.detection",
-    "envelope": "patchproof.study.envelope",
+    "envelope": "patchproof.study.envelope.sweeps",
     "gamut": "patchproof.study.gamut",
     "harden": "patchproof.study.harden",
+    "ledger": "patchproof.study.ledger_trials",
     "mining": "patchproof.study.mining",
     "patch2d": "patchproof.study.patch2d",
     "patch3d": "patchproof.study.patch3d",

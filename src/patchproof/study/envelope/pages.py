@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.report.tables import Drawing, Estimate, Table, Value, rate
-from patchproof.study.envelope_axes import AXES
-from patchproof.study.envelope_fit import BEYOND, LEAST_LOST, NOT_MONOTONE
+from patchproof.study.envelope.axes import AXES
+from patchproof.study.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -37,7 +37,7 @@ from patchproof.scene.scene import Scene
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.raster import piece_pixels
-from patchproof.study.envelope_axes import GEOMETRY, Point, conditions_at, placed_at
+from patchproof.study.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
 from patchproof.study.reprint import DPI_RANGE, OVERSAMPLING
 from patchproof.study.sheet import sheet_of
 from patchproof.verify.camera import ANY_FOCAL_ERROR, EXIF_FOCAL_ERROR, View

@@ -21,10 +21,10 @@ from pydantic import Field
 
 from patchproof.optimize.run import load_run
 from patchproof.settings import Finite, Refused, Strict, nearest
-from patchproof.study.envelope_axes import AXES, MAPS, possible
-from patchproof.study.envelope_fit import find_break
-from patchproof.study.envelope_pages import figures, tables
-from patchproof.study.envelope_world import measured, open_world, recognized
+from patchproof.study.envelope.axes import AXES, MAPS, possible
+from patchproof.study.envelope.fit import find_break
+from patchproof.study.envelope.pages import figures, tables
+from patchproof.study.envelope.world import measured, open_world, recognized
 from patchproof.study.study import Cell, Study
 
 _SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from patchproof.bench.chart import Chart, Check, OnStage, Point, Series, Table
+from patchproof.bench.measure import mean_interval, median_interval
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.ladder import Map, choose, difference, distinct, rungs
@@ -23,7 +25,6 @@ from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.claims import wilson
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.study.bench import Chart, Check, OnStage, Point, Series, Table, mean_interval, median_interval
 from patchproof.study.chart_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
 from patchproof.study.inkjets import DRIVERS, draw_inkjet
 

@@ -17,15 +17,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from patchproof.bench.chart import Chart, Check, Growth, OnStage, Point, Series, Shares
+from patchproof.bench.measure import median_interval, slope, timed
 from patchproof.optimize.goals import target_loss
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.render.fragments import Cameras
 from patchproof.render.photograph import expose
 from patchproof.render.raster import rasterize
-from patchproof.scene.mesh import load_mesh
+from patchproof.scene.load_mesh import load_mesh
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
-from patchproof.study.bench import Chart, Check, Growth, OnStage, Point, Series, Shares, median_interval, slope, timed
 
 SUBDIVISIONS = (3, 4, 5, 6, 7, 8)  # 1.3 thousand to 1.3 million faces
 GROWTH_FACES = 5  # subdivisions where something else grows: 20 thousand faces

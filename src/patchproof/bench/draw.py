@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.study.bench import Chart, Growth, Point, Series, Shares, describe
+from patchproof.bench.chart import Chart, Growth, Point, Series, Shares
+from patchproof.bench.measure import describe
 
 _COLORS = ("#1f5fa8", "#c2571a", "#2a8f62", "#8a4fa3", "#6b6b6b")
 _LINE = 48  # characters of an axis label in one line

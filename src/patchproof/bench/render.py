@@ -20,6 +20,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from patchproof import geometry
+from patchproof.bench.chart import Chart, Check, OnStage, Point, Series, Table
+from patchproof.bench.measure import mean_interval, psnr, ratio, timed
+from patchproof.bench.speed import growth_chart, step_chart
 from patchproof.channel.camera import encoded
 from patchproof.optimize.goals import target_loss
 from patchproof.optimize.loop import steps
@@ -37,19 +40,6 @@ from patchproof.scene.scene import build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings, read_toml
 from patchproof.sheet.piece import Piece
 from patchproof.study import demo
-from patchproof.study.bench import (
-    Chart,
-    Check,
-    OnStage,
-    Point,
-    Series,
-    Table,
-    mean_interval,
-    psnr,
-    ratio,
-    timed,
-)
-from patchproof.study.bench_speed import growth_chart, step_chart
 from patchproof.study.patterns import background
 from patchproof.study.reprint import take_photo
 

@@ -1,0 +1,1 @@
+"""Where each stage of one run's patch stops working."""
