@@ -6,7 +6,7 @@ default. Machine, threads and date stand in the corner.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import singledispatch
 from pathlib import Path
 from textwrap import fill
@@ -49,15 +49,24 @@ def save_chart(chart: Chart, about: Mapping[str, Any], path: Path) -> None:
 def _draw(chart: Chart, axes) -> None:
     for series, color, marker in zip(chart.series, _COLORS, _MARKERS, strict=False):
         _draw_points(axes, series, color, marker)
-        front = sorted((point for point in series.points if point.front), key=lambda point: point.cost)
-        axes.plot([p.cost for p in front], [p.error for p in front], color=color, lw=1, ls="--", zorder=1)
+        if not chart.one_front:
+            _draw_front(axes, series.points, color)
+    points = [point for series in chart.series for point in series.points]
+    if chart.one_front:
+        _draw_front(axes, points, "0.4")
     axes.plot([], [], color="0.4", lw=1, ls="--", label="Pareto front (filled)")
     axes.plot([], [], "o", ms=11, mfc="none", mec="black", mew=1.3, ls="none", label="default")
-    costs = [point.cost for series in chart.series for point in series.points]
-    if max(costs) > 4 * min(costs):
-        _plain_log(axes)
+    if max(p.cost for p in points) > 4 * min(p.cost for p in points):
+        _plain_log(axes.xaxis, axes.set_xscale)
+    if max(p.error for p in points) > 30 * min(p.error for p in points) > 0:
+        _plain_log(axes.yaxis, axes.set_yscale)
     if chart.target is not None:
         axes.axhline(chart.target, color="0.5", lw=1, ls=":", label=f"target {chart.target:g}")
+
+
+def _draw_front(axes, points: Sequence[Point], color: str) -> None:
+    front = sorted((point for point in points if point.front), key=lambda point: point.cost)
+    axes.plot([p.cost for p in front], [p.error for p in front], color=color, lw=1, ls="--", zorder=1)
 
 
 def _draw_points(axes, series: Series, color: str, marker: str) -> None:
@@ -121,11 +130,11 @@ def _(chart: Shares, axes) -> None:
     axes.margins(x=0.12)
 
 
-def _plain_log(axes) -> None:
+def _plain_log(axis, set_scale) -> None:
     """A logarithmic axis with ratios written out."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, position: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    set_scale("log")
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, position: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

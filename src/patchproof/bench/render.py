@@ -82,7 +82,15 @@ def render_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
 
 
 def set_world(count: int, on_stage: OnStage) -> World:
-    """The demo's scene before made-up clutter, and `count` steps of its optimization."""
+    """The demo's problem, and the best design of `count` steps of its optimization."""
+    problem = demo_problem()
+    for step in steps(with_settings(problem, steps=count)):
+        on_stage("design", step.state.number, count)
+    return World(problem, from_pixels(as_pixels(step.state.best)))
+
+
+def demo_problem() -> Problem:
+    """The demo's scene before made-up clutter."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.toml"
         path.write_text(demo.SCENE, encoding="utf-8")
@@ -90,13 +98,10 @@ def set_world(count: int, on_stage: OnStage) -> World:
     del tables["background"]
     scene = build_scene(SceneSettings.model_validate(tables), Path())
     clutter = (background(np.random.default_rng([demo.SEED, i]), demo.BACKGROUND_PX) for i in range(demo.BACKGROUNDS))
-    problem = set_problem(replace(scene, backgrounds=Backgrounds(tuple(clutter))))
-    for step in steps(_with_settings(problem, steps=count)):
-        on_stage("design", step.state.number, count)
-    return World(problem, from_pixels(as_pixels(step.state.best)))
+    return set_problem(replace(scene, backgrounds=Backgrounds(tuple(clutter))))
 
 
-def _with_settings(problem: Problem, seed: int | None = None, **optimize: int) -> Problem:
+def with_settings(problem: Problem, seed: int | None = None, **optimize: int | float | str) -> Problem:
     """The problem with other settings of the loop, and another seed of its draws."""
     scene = problem.scene
     changed = scene.settings.optimize.model_copy(update=optimize)
@@ -345,14 +350,14 @@ def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -
 
 def refresh_chart(problem: Problem, count: int, views: int, seeds: int, on_stage: OnStage) -> Chart:
     """Steps for which views keep their poses against the selection loss after as many steps, and after as much time."""
-    seconds = _refresh_seconds(_with_settings(problem, views=views))
+    seconds = _refresh_seconds(with_settings(problem, views=views))
     cost = {n: seconds["see"] / n + seconds["rest"] for n in REFRESHES}
     ratios = {n: cost[n] / cost[1] for n in REFRESHES}  # of rounds, in turn
     ends = {n: max(count, round(count / np.median(ratios[n]))) for n in REFRESHES}
     losses = {key: [] for key in [(n, when) for n in REFRESHES for when in ("steps", "time")]}
     for seed in range(seeds):
         for i, n in enumerate(REFRESHES):
-            loop = steps(_with_settings(problem, seed, steps=ends[n], views=views, refresh=n))
+            loop = steps(with_settings(problem, seed, steps=ends[n], views=views, refresh=n))
             best = {step.state.number: step.state.best_loss for step in loop}
             losses[n, "steps"].append(best[count])
             losses[n, "time"].append(best[ends[n]])
