@@ -48,10 +48,10 @@ def detect_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
         megapixels = f"{size_px[0] * size_px[1] / 1e6:.0f} MP"
         points = []
         for coarsest_px in COARSEST:
-            for name, find in (("fitted borders", find_fitted), ("OpenCV's corners", find_plain)):
+            for name, find in (("fitted", find_fitted), ("OpenCV", find_plain)):
                 seconds, errors, share = tried(shots, find, coarsest_px)
                 default = coarsest_px == COARSEST_PX and find is find_fitted
-                setting = f"from {coarsest_px} px, {name}"
+                setting = f"{coarsest_px} px {name}"
                 points.append(_point(setting, 1000 * seconds, errors, default))
                 found.append((f"{megapixels}: {setting}", f"{share:.1%}"))
                 if default:
@@ -65,7 +65,10 @@ def detect_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
         cost_label="milliseconds per photograph",
         error_label="error of the design's corners, px (median)",
         series=tuple(series),
-        notes=(f"{count} photographs a size, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; decoding is not counted",),
+        notes=(
+            "fitted: borders of markers, as the tool does it; OpenCV: its own refined corners",
+            f"{count} photographs a size, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; decoding is not counted",
+        ),
         checks=(
             Check(f"milliseconds for {megapixels} by default", largest.cost, MOST_MS),
             Check("px of corner error by default", max(p.error for p in last.values()), 0.1),

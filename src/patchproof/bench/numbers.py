@@ -11,7 +11,7 @@ import copy
 import os
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,7 @@ class Way:
     @property
     def name(self) -> str:
         """As it stands in a chart."""
-        return f"{self.type_name}, {self.order_name}"
+        return f"{self.type_name} {self.order_name}"
 
 
 WAYS = tuple(
@@ -63,12 +63,16 @@ class Answer:
 
 def numbers_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     """The one chart."""
-    problem, rounds = demo_problem(), 5 if quick else 25
+    problem, rounds, left_out = demo_problem(), 5 if quick else 15, ()
     classifiers = [problem.classifiers[0]]
     path = Path(os.environ.get("PATCHPROOF_DATA", "-")) / REAL
-    if path.is_file():
+    if quick or not path.is_file():
+        why = "with --quick" if quick else "PATCHPROOF_DATA names no folder with it"
+        left_out = (f"{REAL} was left out: {why}",)
+    else:
         classifiers.append(load_classifier(f"file:{path}", Path()))
-    yield types_chart(problem, classifiers, rounds, on_stage)
+    chart = types_chart(problem, classifiers, rounds, on_stage)
+    yield replace(chart, notes=(*chart.notes, *left_out))
 
 
 def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on_stage: OnStage) -> Chart:
@@ -93,7 +97,6 @@ def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on
             rows.append((f"{classifier.name.rpartition('/')[2]}: {way.name}", *_figures(answers[way], truth)))
         series.append(Series(classifier.name.rpartition("/")[2], tuple(points)))
         on_stage("numbers", number + 1, len(classifiers))
-    left_out = () if len(classifiers) > 1 else (f"{REAL} was left out: PATCHPROOF_DATA names no folder with it",)
     return Chart(
         "types",
         "Types of numbers and orders of memory",
@@ -103,7 +106,6 @@ def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on
         (
             f"{VIEWS} views of the demo's scene; bfloat16 by torch.autocast, gradients in float32 at the pictures",
             "rows: N×3×H×W in that order; channels last: the colors of a pixel side by side",
-            *left_out,
         ),
         tables=(Table(("", "mean |logit - float64's|", "largest", "cosine of the gradient"), tuple(rows)),),
     )

@@ -215,8 +215,8 @@ def what_pays(corners_px: Corners) -> ToPx:
 
 
 MODELS: dict[str, Callable[[Corners], ToPx]] = {
-    "plane, all corners": _plain,
-    "plane, robust": plane,
+    "plain plane": _plain,
+    "robust plane": plane,
     "lens": _lens,
     "cylinder": _cylinder,
     "what pays": what_pays,
