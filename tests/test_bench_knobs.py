@@ -55,10 +55,9 @@ def test_a_default_s_quality_in_decibels_is_an_error_too():
 def test_one_front_spans_all_series():
     series = (Series("a", (point(1, 1), point(2, 0.9))), Series("b", (point(1, 2), point(2, 0.5, default=True))))
     chart = Chart("some", "Some knob", "cost", "error", series)
-    fronts = [
-        [p.front for one in with_front(c).series for p in one.points] for c in (chart, replace(chart, one_front=True))
-    ]
-    assert fronts == [[True, True, True, True], [True, False, False, True]]
+    own, shared = (with_front(replace(chart, one_front=one)) for one in (False, True))
+    assert [p.front for one in own.series for p in one.points] == [True, True, True, True]
+    assert [p.front for one in shared.series for p in one.points] == [True, False, False, True]
 
 
 def test_paired_intervals_leave_out_what_settings_share():
@@ -116,7 +115,7 @@ def test_pixels_and_paper_are_each_other_s_inverse(kind):
     mm = rng.uniform(0, PIECE_MM, (50, 2))
     assert sheet.mm(sheet.px(mm)) == pytest.approx(mm, abs=1e-6)
     assert sheets.error_mm(sheet.px, sheet) == pytest.approx(0, abs=1e-9)
-    assert sheets.error_mm(lambda at: sheet.px(at + [0.3, 0.4]), sheet) == pytest.approx(0.5, rel=0.03)
+    assert sheets.error_mm(lambda at: sheet.px(at + np.array([0.3, 0.4])), sheet) == pytest.approx(0.5, rel=0.03)
 
 
 def test_a_photograph_shows_the_paper_where_the_sheet_says():
