@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from patchproof.geometry import intrinsics
 from patchproof.photo.detect import Found
 from patchproof.photo.edges import Borders
-from patchproof.photo.rectify import PageFit
+from patchproof.photo.read import Photo
+from patchproof.photo.rectify import PageFit, fit_page
 from patchproof.verify import measure
+from patchproof.verify.camera import View
 from patchproof.verify.results import PhotoEntry
 from patchproof.verify.surface import surface_of
-from test_photo_synthetic import PIECE_IDS, make_manifest
+from test_photo_rectify import marker_corners, noisy_corners
+from test_photo_synthetic import PIECE_IDS, make_manifest, view
 from test_verify_run import measured, shot
 
 SURFACE = surface_of(make_manifest())
@@ -33,7 +40,7 @@ def trouble(markers=8, module_px=4.0, **figures):
         ("tilted", {"tilt_deg": 77.9}, {"tilt_deg": 78.1}),
         ("blurred", {"blur_px": 1.99}, {"blur_px": 2.01}),  # half a module of 4 px
         ("too_small", {"px_per_mm": 0.241}, {"px_per_mm": 0.239}),  # 24 px across 100 mm
-        ("too_small", {"corner_uncertainty_mm": 2.99}, {"corner_uncertainty_mm": 3.01}),
+        ("too_small", {"corner_uncertainty_mm": 1.49}, {"corner_uncertainty_mm": 1.51}),
         ("curled", {"residual_mm": 0.99}, {"residual_mm": 1.01}),
     ],
 )
@@ -51,6 +58,20 @@ def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
     entry = measure._with_scale(PhotoEntry(file="a", status="measured"), scale, 1.0)
     assert (entry.status, entry.code, entry.scale_x) == ("measured", code, scale)
     assert code is None or "100 %" in entry.advice
+
+
+def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
+    """The same sheet from 10° to the right: at 1.5 m the corners know it to 1°, at 8 m neither it nor how far it is."""
+    light, matrix = SimpleNamespace(contrast=0.5), intrinsics(40, (1200, 900))
+    seen = View(Photo(np.zeros((900, 1200, 3), np.uint8), None, Path("a")), matrix, 0.005, False)
+    for distance, tells in ((1500, True), (12000, False)):
+        corners = noisy_corners(view(10, 3, distance), 0.045)
+        found = Found({i: Borders(corners[i], 1.0, 0.0, 1.0, 4.0, True) for i in PIECE_IDS}, (), ())
+        fit = fit_page(corners, marker_corners())
+        entry = measure._with_geometry(PhotoEntry(file="a", status="judged"), seen, found, fit, light, SURFACE)
+        assert (entry.azimuth_deg is not None) == tells == (entry.azimuth_uncertainty_deg < 10)
+        if tells:
+            assert entry.azimuth_deg == pytest.approx(10, abs=2) and entry.distance_mm == pytest.approx(1500, rel=0.01)
 
 
 def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):

@@ -67,13 +67,13 @@ def test_the_print_is_read_from_swatches_and_needs_eight_of_them():
     faded = 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)
     seen = np.stack([faded, faded, np.full_like(faded, np.nan)])
     ink = np.full(3, 0.02)
-    printed = fit_print(list(seen), corners, ink)
+    printed = fit_print(list(seen), corners, ink, ink)
     assert printed(np.stack([ink, np.ones(3)])) == pytest.approx(np.stack([ink, np.ones(3)]), abs=0.01)
     assert printed(corners) == pytest.approx(faded, abs=0.02)
     assert printed(promised[None]) == pytest.approx(promised[None], abs=0.03)
     few = faded.copy()
     few[7:] = np.nan
-    assert fit_print([few], corners, ink) is None
+    assert fit_print([few], corners, ink, ink) is None
 
 
 @functools.cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from patchproof.optimize.goals import target_loss, total_variation
 from patchproof.optimize.loop import _step, start, steps
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import set_problem
-from patchproof.optimize.promise import CONTROLS, promise_from, try_out
+from patchproof.optimize.promise import CONTROLS, judged, promise_from, shown_with_controls, try_out
 from patchproof.optimize.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.scene import build_scene
@@ -68,6 +69,16 @@ def test_cross_entropy_of_the_accepted_labels_by_hand():
     assert float(gradient[0, 0]) == pytest.approx(1)  # a sure network still says which way
 
 
+@pytest.mark.parametrize(("goal", "wrong"), [("assist", [[0.0, 1.0]]), ("deceive", [[1.0, 0.0]])])
+@pytest.mark.parametrize("margin", [80.0, 800.0, 3e4])
+def test_what_is_wrong_with_certainty_keeps_its_gradient(goal, wrong, margin):
+    """The goal is far from reached: p of label 0 is e^-margin or 1 - e^-margin. float32's log(1 - p) is lost at 17."""
+    logits = (margin * torch.tensor(wrong)).requires_grad_()
+    (gradient,) = torch.autograd.grad(target_loss(logits, [0], goal).sum(), logits)
+    assert gradient[0].tolist() == pytest.approx([-1, 1] if goal == "assist" else [1, -1])
+    assert not bool(torch.isfinite(torch.log(1 - torch.softmax(torch.tensor([17.0, 0.0]), 0)[0])))
+
+
 def test_total_variation_by_hand():
     checks = torch.tensor([[0.0, 1.0], [1.0, 0.0]]).expand(3, 2, 2)
     assert float(total_variation(checks)) == 2 and float(total_variation(torch.ones(3, 4, 4))) == 0
@@ -106,6 +117,59 @@ def test_a_signed_step_moves_each_pixel_by_the_step_size(tmp_path):
     moved = (step.state.design - 0.5).abs()
     assert float(moved.max()) == pytest.approx(0.03, abs=1e-6)
     assert step.gradient > 0
+
+
+@pytest.mark.parametrize("explosion", [1.0, 1e6, 1e15])
+def test_however_a_gradient_explodes_adam_moves_by_a_few_step_sizes(tmp_path, explosion):
+    """(1 - β1) / √(1 - β2) = 3.2 step sizes at most, in the one step that explodes after a hundred calm ones."""
+    problem = set_problem(scene_with(tmp_path, optimize__step_size=0.01))
+    state = start(problem)
+    for _ in range(100):
+        state = loop._descend(
+            state, torch.randn(state.design.shape, generator=torch.Generator().manual_seed(0)), problem
+        )
+    state = replace(state, design=torch.full_like(state.design, 0.5))
+    moved = (loop._descend(state, torch.full_like(state.design, explosion), problem).design - 0.5).abs().max()
+    assert bool(torch.isfinite(moved)) and float(moved) < 0.0317
+
+
+class Fragile(torch.nn.Module):
+    """What a network does to logits (by `spoil`) beyond the pictures that it was checked on."""
+
+    def __init__(self, spoil):
+        super().__init__()
+        self.spoil = spoil
+
+    def forward(self, photos):
+        score = photos.mean((1, 2, 3)) * 4
+        return self.spoil(torch.stack([score, -score], 1))
+
+
+def spoiled(problem, spoil):
+    return replace(problem, classifiers=(replace(problem.classifiers[0], network=Fragile(spoil)),))
+
+
+def test_networks_that_answer_nan_or_infinity_are_refused_and_large_answers_are_not(tmp_path):
+    """Unseen, one such step would have ended every later one, and a NaN counts as the largest logit."""
+    problem = set_problem(scene_with(tmp_path, camera__photo_px=[96, 96]))
+    begin, drawn = start(problem), problem.scene.draw("promise", 2)
+    seen = problem.see(problem.subject.shown(begin.design), drawn, 32)
+    assert math.isfinite(_step(spoiled(problem, lambda logits: 1e30 * logits), begin, seen).loss)
+    for spoil in (lambda logits: logits * torch.nan, lambda logits: logits * 1e30 * 1e30):
+        with pytest.raises(Refused, match="finite logits, got NaN or infinity from the network"):
+            _step(spoiled(problem, spoil), begin, seen)
+        with pytest.raises(Refused, match="finite logits"):
+            judged(spoiled(problem, spoil), {"design": problem.subject.shown(begin.design)}, drawn)
+    with pytest.raises(Refused, match="finite gradients, got nan in step 1"):
+        _step(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, seen)
+
+
+def test_the_penalty_moves_the_design_and_is_not_taken_for_a_gradient_of_the_networks(tmp_path):
+    problem = set_problem(scene_with(tmp_path, optimize__tv=1.0, target__models=["module:fake_networks.corner"]))
+    noisy = replace(start(problem), design=torch.rand_like(start(problem).design))
+    seen = problem.see(problem.subject.shown(noisy.design), problem.scene.draw("promise", 2), 32)
+    step = _step(problem, noisy, seen)
+    assert step.gradient == 0 and not torch.equal(step.state.design, noisy.design)
 
 
 def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
@@ -185,6 +249,62 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path, few_v
     assert same_files(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "a" / "run.json").read_bytes() == (tmp_path / "b" / "run.json").read_bytes()
     assert not same_files(tmp_path / "a", tmp_path / "c", ("design.png",))
+
+
+@pytest.mark.parametrize(
+    ("models", "step_size", "says"),
+    [
+        ("red_against_blue", 0.002, None),
+        ("red_against_blue", 0.0005, "it began as: give it more optimize.steps or a larger optimize.step_size"),
+        ("corner", 0.1, "it began as: no network's answer depends on it"),
+    ],
+)
+def test_a_design_that_never_moved_is_said_to_be_none(tmp_path, few_views, models, step_size, says):
+    """Ten signed steps of 0.002 are 5 of 255 codes, of 0.0005 one. The promise tells it, too: as good as gray."""
+    models = [f"module:fake_networks.{models}"]
+    changes = dict(
+        target__models=models,
+        optimize__step_size=step_size,
+        optimize__optimizer="sign",
+        optimize__steps=10,
+        optimize__views=2,
+    )
+    scene = toml(tmp_path / "scene.toml", **changes)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        promise = optimize_scene(scene, tmp_path / "run").promise
+    told = [str(one.message) for one in caught if "began as" in str(one.message)]
+    assert told == [] if says is None else says in told[0]
+    low, high = promise.controls["grey"].difference_interval
+    assert says is None or low <= 0 <= high
+
+
+def test_a_step_across_the_whole_range_is_the_largest(tmp_path):
+    assert scene_with(tmp_path, optimize__step_size=1.0).settings.optimize.step_size == 1
+    with pytest.raises(Refused, match=r'usable "optimize\.step_size"'):
+        scene_with(tmp_path, optimize__step_size=1.01)
+
+
+def dispersion(counts, n):
+    """Variance of counts over a binomial's."""
+    rate = np.sum(counts) / (n * len(counts))
+    return np.var(counts, ddof=1) / (n * rate * (1 - rate))
+
+
+def test_promises_of_other_seeds_spread_as_their_interval_says(tmp_path):
+    """Ten promises of one design. Last good: independent draws, dispersion 1. First bad: each draw eight times, as
+    near-duplicates would be, dispersion 8, and the interval fails: what it says holds for independent draws alone.
+    """
+    problem = set_problem(scene_with(tmp_path, camera__photo_px=[64, 64], printer__dot_gain=[-0.2, 0.2]))
+    design = np.full((*problem.subject.printed_px[::-1], 3), (115, 128, 128), np.uint8)
+    shown = shown_with_controls(problem, design, ())
+    drawn = [judged(problem, shown, problem.scene.draw("promise", 40, seed)) for seed in range(10)]
+    seen = np.array([outcomes.recognized["design"][0] for outcomes in drawn])
+    for recognized, holds in ((seen, True), (seen[:, :5].repeat(8, 1), False)):
+        counts, rate = recognized.sum(1), recognized.mean()
+        inside = sum(low <= rate <= high for low, high in (wilson(int(count), 40) for count in counts))
+        assert 0.2 < rate < 0.8
+        assert (0.2 < dispersion(counts, 40) < 2.4) == holds and (inside >= 8) == holds, (rate, counts)
 
 
 class Killed(Exception):

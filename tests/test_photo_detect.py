@@ -45,6 +45,15 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(manifest, piece):
     assert corner_errors(found, manifest, homography).max() < 0.3
 
 
+@pytest.mark.parametrize("azimuth", [20, -45])
+def test_large_sharp_markers_do_not_move_as_wholes(manifest, piece, azimuth):
+    # 10 px per module: samples as far apart as a module is deep step over such borders, which moved markers by 0.1 px
+    homography, mm = view(azimuth, -17, 260, 6), corners_mm(manifest)
+    found = find_markers(photograph(piece, homography, blur_px=0.4, noise=0.003), IDS)
+    moved = [(b.corners_px - apply_homography(homography, mm[i])).mean(0) for i, b in found.markers.items()]
+    assert len(moved) >= 6 and np.abs(moved).max() < 0.04
+
+
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 2.0, 3.0])
 def test_blur_is_read_off_the_borders(piece, blur_px):
     # 300 mm away a module is 8 px wide, so 3 px of blur still leave its middle dark

@@ -211,6 +211,22 @@ def test_equal_depths_go_to_the_lower_face_and_order_does_not_matter_otherwise()
     assert order[shuffled.face].tolist() == plain.face.tolist()
 
 
+def test_a_plane_in_front_wins_down_to_23_bits_and_then_ties_go_to_the_lower_face():
+    """Two squares, the upper one listed last; gaps of 2^-23 and 2^-24 of the distance. Aslant, below that, rounding
+    mixes them: a mesh with two skins has no order there, and every run shows the same mixture.
+    """
+    square = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+
+    def upper_share(bits, eye):
+        both = torch.cat([square, square + torch.tensor([0, 0, 4 * 2.0**-bits], dtype=torch.float64)])
+        return float((rasterize(both, faces, cameras([eye]), 0.01).face >= 2).float().mean())
+
+    assert upper_share(23, [0.0, 0, 4]) == upper_share(23, [2.0, 1, 3]) == 1
+    assert upper_share(24, [0.0, 0, 4]) == 0 and 0 < upper_share(24, [2.0, 1, 3]) < 1
+    assert upper_share(24, [2.0, 1, 3]) == upper_share(24, [2.0, 1, 3])
+
+
 def test_culling_keeps_the_outside():
     vertices, faces = sphere()
     views = cameras([[0.0, 0, 4]])

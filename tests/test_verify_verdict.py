@@ -88,6 +88,18 @@ def test_ranges_have_a_tenth_of_margin_and_ignore_what_is_unknown():
     assert ranges.violated(entry(), True) is None
 
 
+def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():
+    """The promise covers up to 30 + 6°. At 40° by corners that know it to 3.9° it is outside, to 4.1° it may be in."""
+    claims = [
+        ConditionClaim(px_per_mm=1, tilt_deg=1, azimuth_deg=a, contrast=1, blur_px=1, recognized=True)
+        for a in (-30, 30)
+    ]
+    ranges = promised_ranges(claims)
+    at = dict(px_per_mm=1.0, tilt_deg=1.0, azimuth_deg=40.0)
+    assert ranges.violated(entry(**at, azimuth_uncertainty_deg=3.9), True).code == "out_of_range"
+    assert ranges.violated(entry(**at, azimuth_uncertainty_deg=4.1), True) is None
+
+
 def test_the_matched_rate_is_that_of_the_nearest_conditions():
     near, far = [1 + i / 1000 for i in range(20)], [5 + i / 1000 for i in range(20)]
     claims = conditions(near + far, [True] * 20 + [False] * 20)

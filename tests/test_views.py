@@ -297,7 +297,9 @@ def test_a_lens_puts_the_markers_where_opencv_says(tmp_path, k1):
 
 def test_a_camera_inside_the_object_is_refused_in_one_sentence(tmp_path):
     scene = box_scene(tmp_path)
-    with pytest.raises(Refused, match=r"got 1 of 2 views inside its bounding box: raise view\.distance_mm\.$"):
+    with pytest.raises(
+        Refused, match=r"got 1 of 2 views inside its bounding box or within 1\.5 mm of it: raise view\.distance_mm\.$"
+    ):
         see(set_stage(scene), WHITE, posed(scene, 2, distance_mm=[700, 100]), (64, 64))
 
 
@@ -314,6 +316,51 @@ def test_a_piece_seen_edge_on_is_not_there(tmp_path):
     assert shares(seen, 5, 128)[:3].sum() < 0.5
     (gradient,) = torch.autograd.grad(picture.sum(), srgb)
     assert bool(torch.isfinite(gradient).all())
+
+
+def gradient_of(scene, size_px=128, **pose):
+    """The gradient of a picture's sum to a 64×64 noise design, and the pixels that the piece covers."""
+    noise = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    seen = see(set_stage(scene), WHITE, posed(scene, 1, **pose), (size_px, size_px))
+    (gradient,) = torch.autograd.grad(expose(seen, replace(WHITE, srgb=noise)).sum(), noise)
+    assert bool(torch.isfinite(gradient).all())
+    return gradient, float(seen.piece.share.sum())
+
+
+@pytest.mark.parametrize(
+    "pose", [{}, {"azimuth_deg": 60}, {"azimuth_deg": 75}, {"distance_mm": 200}, {"distance_mm": 152}]
+)
+def test_gradients_are_as_large_as_the_piece_is_seen_at_grazing_angles_and_near_the_camera(tmp_path, pose):
+    """A gradient sums up to the pixels that show it and no more, from the front and where 164 mm are 1.5 px wide (75°;
+    the plane is edge-on at 77.6°), and where one texel fills 5,000 pixels (2 mm away).
+    """
+    gradient, share = gradient_of(box_scene(tmp_path), **pose)
+    assert share > 50
+    assert 0.9 < float(gradient.abs().sum()) / (3 * share) < 1.05
+
+
+def test_a_piece_under_half_a_pixel_wide_has_no_gradient_and_too_near_a_camera_is_refused(tmp_path):
+    scene = box_scene(tmp_path)
+    gradient, share = gradient_of(scene, azimuth_deg=77)  # 0.4 px wide, between the pixels' centers
+    assert share == 0 and not bool(gradient.any())
+    assert gradient_of(scene, distance_mm=151.6)[1] == pytest.approx(128**2, rel=0.01)
+    with pytest.raises(Refused, match=r"1 of 1 views inside .* or within 1\.5 mm of it"):
+        gradient_of(scene, distance_mm=151.4)
+
+
+@pytest.mark.parametrize("share", [1e-4, 1e-6])
+def test_pictures_change_as_little_as_the_pose_does(tmp_path, share):
+    """From 0.5 to 4 m, three octaves of mip levels: no level pops. Mean |Δ| per relative step of the distance is 0.07
+    to 0.11.
+    """
+    stage, far = set_stage(box_scene(tmp_path)), np.geomspace(500, 4000, 48)
+    srgb = torch.rand(256, 256, 3, generator=torch.Generator().manual_seed(0))
+    noise = PiecePicture(srgb, (0, 0, 256, 256), (0, 0, 256, 256))
+    a, b = (
+        shade(see(stage, noise, posed(stage.scene, 48, distance_mm=far * k, azimuth_deg=30), (96, 96)), noise)
+        for k in (1, 1 + share)
+    )
+    assert float((a - b).abs().mean()) < 0.3 * share
 
 
 def test_an_object_of_one_pixel_still_renders(tmp_path):

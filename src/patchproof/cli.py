@@ -217,6 +217,9 @@ def reprint(
     card: Annotated[
         bool, typer.Option("--card", help="Photograph the uncut page with a bank card on it instead.")
     ] = False,
+    path_traced: Annotated[
+        bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
+    ] = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     overwrite: Overwrite = False,
@@ -231,6 +234,10 @@ def reprint(
         raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
     if card and (scan_dpi is not None or control is not None):
         raise typer.BadParameter("takes the page as it is; leave --scan-dpi and --control out", param_hint="--card")
+    if path_traced and (card or scan_dpi is not None):
+        raise typer.BadParameter(
+            "is of the piece on its object; leave --scan-dpi and --card out", param_hint="--path-traced"
+        )
     if scan_dpi is not None:
         truth = scan(pdf, load_run(run), n, out, scan_dpi, printer=printer, print_scale=scale, overwrite=overwrite)
     elif card:
@@ -259,6 +266,7 @@ def reprint(
                 printer=printer,
                 print_scale=scale,
                 control=control.value if control else None,
+                path_traced=path_traced,
                 jobs=jobs,
                 cluster=cluster,
                 overwrite=overwrite,

@@ -229,7 +229,7 @@ class OptimizeSettings(Strict):
     mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on come from the worst
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
-    step_size: Positive = 0.1
+    step_size: Annotated[Positive, Field(le=1)] = 0.1  # of sRGB's range; what is larger than it only jumps to its ends
     tv: NotNegative = 0.0
     gamut: NotNegative = 0.1  # loss for colors that the printer misses, per 100 ΔE00
     in_gamut: bool = False  # keep the design, after every step, to colors that the printer shows as asked (ΔE00 ≤ 3)

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
-from patchproof.calibrate.ladder import Choice, Map, choose, difference, rungs
+from patchproof.calibrate.ladder import WIDE, Choice, Map, choose, difference, rungs
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import (
     Printer,
@@ -87,6 +87,11 @@ def calibrate_chart(
         for one, error in zip(readings, agreement, strict=True)
         if error is not None and error > STRANGE_PHOTO
     ]
+    if choice.width < WIDE:
+        warnings.append(
+            f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in its thinnest "
+            f"direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
+        )
     provenance = {
         "source": f"{len(readings)} photographs of {len(by_print)} print{'s' if len(by_print) > 1 else ''} of a chart",
         "model_of": model_of(camera),
@@ -200,7 +205,9 @@ def ladder_table(choice: Choice) -> list[dict[str, Any]]:
         }
         for figure in choice.figures
     ]
-    return rows + [{"rung": name, "delta_e00": None, "reason": "too few swatches"} for name in choice.left_out]
+    return rows + [
+        {"rung": name, "delta_e00": None, "reason": "swatches too few or too much alike"} for name in choice.left_out
+    ]
 
 
 def summary_lines(calibration: Calibration) -> list[str]:
@@ -209,7 +216,7 @@ def summary_lines(calibration: Calibration) -> list[str]:
     lines = [f"{told['source']}; {told['model_of']}"]
     for row in told["ladder"]:
         mark = "  <- chosen: the simplest within one standard error of the best" if row["rung"] == choice.name else ""
-        figure = "too few swatches"
+        figure = "swatches too few or too much alike"
         if row["delta_e00"] is not None:
             figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
         lines.append(f"  {row['rung']:20s} {figure}{mark}")

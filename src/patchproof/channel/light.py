@@ -90,7 +90,7 @@ def irradiance(normal: Tensor, view: Tensor, light: Light, position_mm: Tensor |
     """
     ambient = light.ambient.index_select(0, view)
     if light.uneven is not None:
-        uneven = (_irradiance_basis(normal) * light.uneven.index_select(0, view)).sum(-1)
+        uneven = (irradiance_basis(normal) * light.uneven.index_select(0, view)).sum(-1)
         ambient = (ambient + uneven).clamp_min(0)
     cosine = (normal * light.toward.index_select(0, view)).sum(-1).clamp_min(0)
     total = ambient + light.directional.index_select(0, view) * cosine
@@ -134,7 +134,7 @@ def _from_lamp(lamp: Lamp, view: Tensor, position_mm: Tensor) -> tuple[Tensor, T
     return power / square, away * square.rsqrt()[:, None]
 
 
-def _irradiance_basis(normal: Tensor) -> Tensor:
+def irradiance_basis(normal: Tensor) -> Tensor:
     """P×8: what each coefficient of unit variance adds to the irradiance, in all of variance 1 at every normal."""
     x, y, z = normal.unbind(-1)
     first = [2 * _C2 * y, 2 * _C2 * z, 2 * _C2 * x]

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.view import center_square
+from patchproof.settings import Refused
 
 
 def confidence(logits: Tensor, indices: Sequence[int]) -> Tensor:
@@ -41,8 +42,14 @@ class Classifier:
     recognized = staticmethod(recognized)
 
     def logits(self, photos_srgb: Tensor) -> Tensor:
-        """N×K logits of the photographs' centered squares."""
-        return self.network(center_square(photos_srgb, self.input_px))
+        """N×K logits of the photographs' centered squares; refused where they are no numbers, which would pass for an
+        answer: the largest of a row with NaN is the NaN.
+        """
+        logits = self.network(center_square(photos_srgb, self.input_px))
+        if not bool(torch.isfinite(logits).all()):
+            do = "check its weights and its number format"
+            raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
+        return logits
 
 
 def weights_sha256(network: torch.nn.Module) -> str | None:

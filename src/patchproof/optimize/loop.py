@@ -10,6 +10,7 @@ A step depends on the state and its own number alone, so that a run that was sto
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -22,6 +23,7 @@ from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.views import Seen, relit
+from patchproof.settings import Refused
 
 SELECT_EVERY = 10
 SELECT_VIEWS = 64
@@ -51,7 +53,7 @@ class Step:
     loss: float
     confidence: float
     rate: float
-    gradient: float  # largest absolute value; 0 means that the classifier no longer tells designs apart
+    gradient: float  # the classifiers' largest, penalties apart; 0 means that they no longer tell designs apart
     select_loss: float | None = None
     select_rate: float | None = None
     pictures: Tensor | None = field(default=None, repr=False)
@@ -88,12 +90,16 @@ def _step(problem: Problem, state: State, seen: Seen) -> Step:
     design = state.design.clone().requires_grad_()
     pictures = expose(seen, problem.subject.shown(design))
     losses, confidences, rates = _score(problem, pictures)
-    loss = losses + problem.subject.penalty(design)
-    (gradient,) = torch.autograd.grad(loss, design)
-    moved = _descend(state, gradient, problem)
-    return Step(
-        moved, float(loss.detach()), confidences, rates, float(gradient.abs().max()), pictures=pictures.detach()
-    )
+    (gradient,) = torch.autograd.grad(losses, design)
+    largest, penalty = float(gradient.abs().max()), problem.subject.penalty(design)
+    if not math.isfinite(largest):  # one such step would turn the design into nothing for good
+        do = "check its number format: some pictures lead it to infinity"
+        raise Refused("finite gradients", f"{largest} in step {state.number + 1} from the networks", do)
+    if isinstance(penalty, Tensor):
+        gradient = gradient + torch.autograd.grad(penalty, design)[0]
+        penalty = float(penalty.detach())
+    loss = float(losses.detach()) + penalty
+    return Step(_descend(state, gradient, problem), loss, confidences, rates, largest, pictures=pictures.detach())
 
 
 def _descend(state: State, gradient: Tensor, problem: Problem) -> State:

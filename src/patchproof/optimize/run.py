@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -32,6 +33,9 @@ from patchproof.sheet.manifest import Promise
 
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
 OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, *RESULT_FILES, "evaluate.json", ".*.part")
+
+
+LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,7 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
     """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
     total = problem.scene.settings.optimize.steps
     _cut_log(out / _LOG, state.number)
+    largest = None
     with open(out / _LOG, "a", encoding="utf-8") as log:
         for step in steps(problem, state):
             state = step.state
@@ -117,8 +122,20 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
                 write_whole(out / _CHECKPOINT, lambda path, state=state: _save(state, problem, path))
             if state.number == total:
                 write_whole(out / _VIEWS, lambda path, step=step: _contact_sheet(step.pictures).save(path, "PNG"))
+            largest = max(step.gradient, largest or 0.0)
             on_step(step, total)
+    _doubt(float((state.best - start(problem).design).abs().max()), largest)
     return problem.subject.pixels(state.best)
+
+
+def _doubt(moved: float, gradient: float | None) -> None:
+    """Warn of a design that is none; `moved` is its largest change, `gradient` the largest of all steps."""
+    if moved > LEAST_MOVE or gradient is None:
+        return
+    why = "give it more optimize.steps or a larger optimize.step_size"
+    if gradient == 0:
+        why = "no network's answer depends on it: do the views show it, and is it large enough in them?"
+    warnings.warn(f"the design is still what it began as: {why}", stacklevel=3)
 
 
 def _promise(problem: Problem, design: np.ndarray, on_promise: Callable[[int, int], None]) -> Promise:

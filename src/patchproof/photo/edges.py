@@ -23,6 +23,8 @@ ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
 REACH = 0.87  # of a border's half-length: nearer to its ends the next border's blur mixes in
 # in modules: inwards the printed cells are known, outwards only one module of paper is
 INWARD, OUTWARD = 1.0, 0.6
+# of the blur found, either side: beyond it all is flat, and samples a pixel apart would move a sharp border by 0.1 px
+REACH_SIGMAS, LEAST_REACH_PX = 4.0, 2.5
 # what sampling adds to the blur: a pixel's own width (1/12 px²) and bilinear interpolation (mean over phases 1/6 px²)
 _SAMPLING_VARIANCE = 1 / 12 + 1 / 6
 _MOST_STEPS, _SETTLED_PX = (6, 5), 1e-3
@@ -46,13 +48,14 @@ def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray
     behind = np.stack(
         [cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1
     )  # M×4×n, along each border
-    corners, state = rough, None
-    for _ in range(2):  # the second round samples across the borders that the first one found
-        state = _fit_round(luminance, corners, behind)
+    corners, state, reach_px = rough, None, np.full((len(rough), 4), np.inf)
+    for _ in range(2):  # the second round samples across the borders that the first one found, no farther than needed
+        state = _fit_round(luminance, corners, behind, reach_px)
         moved = np.linalg.norm(state[0] - rough, axis=2).max(1)
         near = moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
         good = near & state[1]
         corners = np.where(good[:, None, None], state[0], rough)
+        reach_px = np.where(good[:, None], np.maximum(REACH_SIGMAS * state[2], LEAST_REACH_PX), np.inf)
     _, _, sigma, black, white = state
     module = _module_px(corners, modules)
     return [
@@ -91,10 +94,11 @@ def _module_px(corners: np.ndarray, modules: int) -> np.ndarray:
     return np.maximum(depth, 1e-3) / modules
 
 
-def _fit_round(luminance, corners, behind):
+def _fit_round(luminance, corners, behind, reach_px):
     middle, half, normal = border_frame(corners)
     module = _module_px(corners, behind.shape[2])
-    inward, outward = np.clip(INWARD * module, 1.2, 12.0), np.clip(OUTWARD * module, 1.0, 10.0)
+    inward = np.clip(INWARD * module, 1.2, np.minimum(reach_px, 12.0))
+    outward = np.clip(OUTWARD * module, 1.0, np.minimum(reach_px, 10.0))
     s = np.linspace(-REACH, REACH, ALONG)
     t = np.linspace(-inward, outward, ACROSS, axis=-1)  # M×4×ACROSS
     points = (

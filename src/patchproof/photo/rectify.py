@@ -3,8 +3,9 @@
 In: corners in pixels and in page millimetres, by marker id. Out: `PageFit`. Least median of squares finds the corners
 that agree (it breaks down when half of them lie), Gauss-Newton on the reprojection error of those gives the
 homography and its covariance. The uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn
-from that covariance. Left out on purpose: lens terms. A lens that bends shows as residual, and residual widens the
-uncertainty.
+from that covariance. Few corners say little of their own noise, so what is made of it is wider (Student's t); a single
+marker fits any noise exactly, and gets a wide guess. Left out on purpose: lens terms. A lens that bends shows as
+residual, and residual widens the uncertainty.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.2 (reprojection error), 5.2 (covariance).
 """
@@ -16,12 +17,21 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.special import stdtrit
 
-from patchproof.geometry import apply_homography, fit_homography, normalized, rect_corners
+from patchproof.geometry import (
+    apply_homography,
+    fit_homography,
+    normalized,
+    plane_pose,
+    rect_corners,
+    view_angles,
+)
 from patchproof.photo.cannot import CannotJudge
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)
 CORNER_NOISE_PX = 0.045
+UNSEEN_NOISE_PX = 0.2  # of one marker, whose residual is 0 whatever its noise: more than sharp photographs have
 _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is averaged down
 
 
@@ -66,6 +76,24 @@ def corner_uncertainty_mm(fit: PageFit, rect_mm) -> float:
     draws = np.random.default_rng(0).standard_normal((1000, 8)) @ _root(fit.covariance).T
     shift_mm = np.einsum("cij,ncj->nci", to_mm, (draws @ rows.T).reshape(-1, 4, 2))
     return float(np.percentile(np.linalg.norm(shift_mm, axis=2).max(1), 95))
+
+
+def view_uncertainty(fit: PageFit, matrix_px: np.ndarray, point_mm) -> tuple[float, float]:
+    """(azimuth_deg, distance_mm) 95 % uncertainties of the camera as a page point sees it.
+
+    A small or far sheet looks almost the same from either side of its normal: the azimuth's sign goes first. The
+    spread is that of the pose one standard deviation off along each axis of the homography's covariance.
+    """
+
+    def seen(entries) -> np.ndarray:
+        homography = np.append(entries, 1.0).reshape(3, 3)
+        return np.array(view_angles(plane_pose(homography, matrix_px), point_mm))[[0, 2]]
+
+    entries = fit.px_from_mm.ravel()[:8]
+    apart = np.array([seen(entries + axis) - seen(entries - axis) for axis in _root(fit.covariance).T]) / 2
+    apart[:, 0] = (apart[:, 0] + 90) % 180 - 90  # half of an angle's difference
+    azimuth, distance = 1.96 * np.linalg.norm(apart, axis=0)
+    return float(azimuth), float(distance)
 
 
 def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: float) -> np.ndarray:
@@ -151,9 +179,10 @@ def _mm_from_px(homography, mm) -> np.ndarray:
 def _with_figures(homography, mm, px, ids) -> PageFit:
     residual = px - apply_homography(homography, mm)
     freedom = residual.size - 8
-    noise = CORNER_NOISE_PX
+    noise = UNSEEN_NOISE_PX
     if freedom > 0:
-        noise = max(noise, float(np.sqrt((residual**2).sum() / freedom)))
+        student = stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
+        noise = max(CORNER_NOISE_PX, float(np.sqrt((residual**2).sum() / freedom) * student))
     jacobian = _jacobian(homography, mm)
     scale = np.linalg.norm(jacobian, axis=0)
     inverse = np.linalg.pinv(jacobian / scale)

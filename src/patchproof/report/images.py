@@ -1,4 +1,4 @@
-"""Pictures for a page without files: arrays as data URIs, colour differences as a map with a fixed scale.
+"""Pictures for a page without files: arrays as data URIs, color differences as a map with a fixed scale.
 
 In: uint8 sRGB H×W×3 or float cells. Out: JPEG or PNG bytes, and `data:` URIs. The scale of the map is the same in all
 reports, so that two reports can be laid side by side.
@@ -15,7 +15,7 @@ import numpy as np
 
 from patchproof.output import make_folder
 
-DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another colour
+DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
 _JPEG_QUALITY = 82
 _PNG = b"\x89PNG"
@@ -27,7 +27,7 @@ def jpeg(pixels: np.ndarray) -> bytes:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """uint8 sRGB or sRGB with alpha as PNG, for flat colours."""
+    """uint8 sRGB or sRGB with alpha as PNG, for flat colors."""
     return _encoded(pixels, "PNG", {"optimize": True})
 
 

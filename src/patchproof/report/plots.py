@@ -1,4 +1,4 @@
-"""Where photographs were recognized and where not: small plots as inline SVG that follow the page's text colour.
+"""Where photographs were recognized and where not: small plots as inline SVG that follow the page's text color.
 
 In: entries of a report as plain data. Out: SVG text. Points lie at 0 or 1 with a little fixed scatter; the line is a
 running share of the nearest photographs, and is drawn only where there are enough of them to mean something.
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-_INK = "#010203"  # stands for the page's own text colour and is replaced in the SVG
+_INK = "#010203"  # stands for the page's own text color and is replaced in the SVG
 _YES, _NO = "#2a9d6f", "#d1495b"
 _LEAST_FOR_LINE = 24
 
@@ -70,6 +70,13 @@ def _draw_ledger(axes, ledger: Mapping) -> None:
         if share["interval"] is not None:
             ends = start + (np.sign(end - start) * np.sign(share["share"]) or -1) * np.array(share["interval"])
             axes.plot(ends, [row, row], color=_INK, linewidth=1.2)
+    levels = [
+        f"{100 * ideal:.0f} %",
+        *(f"{100 * change:+.1f}" for change in after - before),
+        f"{100 * after[-1]:.0f} %",
+    ]
+    for row, level in enumerate(levels):
+        axes.text(1.02, row, level, color=_INK, va="center", transform=axes.get_yaxis_transform())
     axes.set_yticks([0, *rows, len(costs) + 1], ["ideal", *(_STEPS.get(s, s) for s in shares), "photographs"])
     axes.invert_yaxis()
     axes.set_xlabel("confidence in the target")

@@ -79,6 +79,7 @@ def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str
         ledger=notes.get("ledger"),
         waterfall=ledger_plot(notes["ledger"]) if notes.get("ledger") else "",
         plots=_plots(report, promise, primary),
+        sized=any(photo["scale_x"] is not None for photo in report["photos"]),
         cards=[_card(photo, encoded.get(photo["file"], {})) for photo in report["photos"]],
         codes=_codes(report["photos"]),
         delta_top=DELTA_TOP,

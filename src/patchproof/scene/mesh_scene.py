@@ -30,6 +30,7 @@ from patchproof.sheet.template import load_template
 from patchproof.sheet.tiles import plan_tiles
 
 _VIEWS_TRIED = 1024
+CLEARANCE = 5e-3  # of the object's length between it and a camera: what is nearer than the near plane would vanish
 
 
 @dataclass(frozen=True)
@@ -189,11 +190,12 @@ def _smallest_scales(settings: SceneSettings, mesh: Mesh, frame: Frame, card: Pl
 
 def _refuse_inside(mesh: Mesh, eyes: np.ndarray) -> None:
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    inside = ((eyes > low) & (eyes < high)).all(1)
+    near = CLEARANCE * float((high - low).max())
+    inside = ((eyes > low - near) & (eyes < high + near)).all(1)
     if inside.any():
         raise Refused(
             f"cameras outside the object ({high[0] - low[0]:.0f} × {high[1] - low[1]:.0f} × {high[2] - low[2]:.0f} mm)",
-            f"{inside.sum()} of {len(eyes)} views inside its bounding box",
+            f"{inside.sum()} of {len(eyes)} views inside its bounding box or within {near:.2g} mm of it",
             "raise view.distance_mm",
         )
 

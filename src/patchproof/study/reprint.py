@@ -35,6 +35,7 @@ from patchproof.scene.scene import Scene, build_scene
 from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
+from patchproof.study.path_traced import photograph_traced
 from patchproof.study.sheet import sheet_of
 from patchproof.verify.surface import surface_of
 from patchproof.workers import open_workers, result_of
@@ -58,6 +59,7 @@ def reprint(
     printer: str | None = None,
     print_scale: tuple[float, float] = (1.0, 1.0),
     control: str | None = None,
+    path_traced: bool = False,
     overwrite: bool = False,
     jobs: int = 1,
     cluster: str | None = None,
@@ -66,6 +68,7 @@ def reprint(
     """Write n photographs and truth.json into the folder `out`; returns the truth.
 
     `control` hangs up that control's own sheet (mean, grey, noise) in place of the PDF's, or nothing (bare).
+    `path_traced` takes them with a renderer that is not ours (see `path_traced`).
     """
     if control not in (None, "bare"):
         # beside the photographs, where other machines may look, too
@@ -82,6 +85,7 @@ def reprint(
                 seed=seed,
                 printer=printer,
                 print_scale=print_scale,
+                path_traced=path_traced,
                 overwrite=overwrite,
                 jobs=jobs,
                 cluster=cluster,
@@ -93,9 +97,10 @@ def reprint(
     conditions, truth = scene.draw("reprint", n, seed), {}
     if jobs == 1 and cluster is None:
         piece = None if bare else printed_piece(pdf_path, manifest, scene, printer_of(run, printer))
-        take = partial(_take, set_stage(scene), piece)
+        take = partial(_take, set_stage(scene), piece, path_traced)
     else:
-        take = partial(_take_there, _Hung(Path(pdf_path).resolve(), run.folder.resolve(), printer, print_scale, bare))
+        hung = _Hung(Path(pdf_path).resolve(), run.folder.resolve(), printer, print_scale, bare)
+        take = partial(_take_there, hung, path_traced)
     with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
         each = [conditions[i : i + 1] for i in range(n)]
         done = 0
@@ -129,13 +134,17 @@ def _hung_up(hung: _Hung) -> tuple[Stage, PiecePicture | None]:
     return set_stage(scene), piece
 
 
-def _take_there(hung: _Hung, conditions: Conditions) -> bytes:
-    return _take(*_hung_up(hung), conditions)
+def _take_there(hung: _Hung, path_traced: bool, conditions: Conditions) -> bytes:
+    return _take(*_hung_up(hung), path_traced, conditions)
 
 
-def _take(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
+def _take(stage: Stage, piece: PiecePicture | None, path_traced: bool, conditions: Conditions) -> bytes:
     buffer = BytesIO()
-    take_photo(stage, piece, conditions, buffer)
+    if path_traced:
+        picture = photograph_traced(stage, piece, conditions)[0].permute(1, 2, 0)
+        save_photo(picture, stage.scene, int(conditions.jpeg[0]), buffer)
+    else:
+        take_photo(stage, piece, conditions, buffer)
     return buffer.getvalue()
 
 
@@ -235,7 +244,7 @@ def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions,
     save_photo(picture, stage.scene, int(conditions.jpeg[0]), path)
 
 
-def save_photo(picture: torch.Tensor, scene: Scene, quality: int, path: Path) -> None:
+def save_photo(picture: torch.Tensor, scene: Scene, quality: int, path: Path | BytesIO) -> None:
     """An H×W×3 sRGB picture as this scene's camera writes it."""
     photo_px, exif = scene.settings.camera.photo_px, Image.Exif()
     if isinstance(scene, MeshScene):  # of pictures nobody knows the focal length

@@ -35,6 +35,7 @@ STUDIES: dict[str, str] = {
     "envelope": "patchproof.study.envelope.sweeps",
     "gamut": "patchproof.study.gamut",
     "harden": "patchproof.study.harden",
+    "ledger": "patchproof.study.ledger_trials",
     "mining": "patchproof.study.mining",
     "patch2d": "patchproof.study.patch2d",
     "patch3d": "patchproof.study.patch3d",

@@ -13,9 +13,10 @@ and each effect gets its mean cost over all orders of switching them on (Shapley
 explains. Shares sum to the whole, v(nothing on) - v(photograph), and may be negative. "Off" means off by the promise:
 each photograph borrows light and blur from one of the promise's own conditions, so that what was promised is no loss.
 
-By convention an affine map in linear light fixed by paper white and marker black is light and camera, the rest of a
-color difference is print: ink that is lighter than promised and a veil of stray light look alike. Without readable
-swatches the two are one step.
+Gains and a veil that make paper white and marker black what was promised are light and camera, the rest of a color
+difference is print. Ink lighter than promised and a veil of stray light look alike but for one thing: a veil lies over
+the whole photograph, so what exceeds its darkest place is ink; up to there it counts as light. Without readable
+swatches print and light are one step.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ def ledger_of(
         return None
     undo = [light_fit(shot, promised) for shot in shots]
     relative = [fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)]
-    printed = fit_print(relative, promised.swatches, promised.ink)
+    inks = [fit.apply(shot.light.ink) for fit, shot in zip(undo, shots, strict=True)]
+    printed = fit_print(relative, promised.swatches, np.median(inks, axis=0), promised.ink)
     looks = _looks(manifest, surface, promised, printed)
     values = []
     for shot, fit, reference in zip(shots, undo, _references(conditions, shots, manifest, promised), strict=True):
@@ -133,14 +135,19 @@ def _looks(manifest: Manifest, surface: Surface, promised: Promised, printed) ->
 
 
 def _references(conditions, shots: Sequence[Shot], manifest: Manifest, promised: Promised) -> list[Reference]:
-    """One of the promise's conditions for each photograph, spread evenly over their contrasts."""
+    """One of the promise's conditions for each photograph, spread evenly over their contrasts.
+
+    The brightest photograph gets the brightest, and so on: paired by chance, a few photographs' light share is mostly
+    the luck of the draw.
+    """
     conditions = sorted(conditions, key=lambda c: c.contrast)
-    rank = ((np.arange(len(shots)) + 0.5) / len(shots) * len(conditions)).astype(int)
+    spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(conditions)).astype(int)
+    rank = np.argsort(np.argsort([float(np.mean(shot.light.paper - shot.light.ink)) for shot in shots]))
     camera = manifest.settings.get("camera", {})
     low, high = camera.get("noise", (0.0, 0.0))
     noise = low + (high - low) * np.random.default_rng(1).permutation(len(shots) * 2)[: len(shots)] / (2 * len(shots))
     references = []
-    for shot, i, level in zip(shots, np.random.default_rng(0).permutation(rank), noise, strict=True):
+    for shot, i, level in zip(shots, spread[rank], noise, strict=True):
         side = shot.square.shape[0]
         scale = side / min(camera["photo_px"]) if "photo_px" in camera else shot.scale
         white = conditions[i].contrast / (1 - float(promised.ink.mean()))

@@ -22,7 +22,7 @@ from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
 from patchproof.photo.read import Photo
-from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
 from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 from patchproof.verify.appearance import MOST_CLIPPED, appearance
 from patchproof.verify.camera import View
@@ -34,10 +34,13 @@ from patchproof.verify.surface import Promised, Surface
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighbouring cells melt together
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean colour
 MOST_TILT_DEG = 78.0  # foreshortened to a fifth
-MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side
+MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
+MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
 MOST_SCALE_ERROR = 0.01
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
+# Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
+MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
 _ADVICE = {
     "blurred": "hold still, tap to focus on the patch, or use more light",
     "too_small": "come closer or use the camera's full resolution",
@@ -212,7 +215,12 @@ def _with_geometry(
     }
     if view.matrix_px is not None:
         azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
-        figures |= {"azimuth_deg": azimuth, "distance_mm": distance}
+        angle, length = view_uncertainty(fit, view.matrix_px, surface.center_mm)
+        figures |= {
+            "azimuth_deg": azimuth if angle <= MOST_AZIMUTH_ERROR_DEG else None,
+            "azimuth_uncertainty_deg": angle,
+            "distance_mm": distance if length <= MOST_DISTANCE_ERROR * distance else None,
+        }
     if view.calibrated:
         ratio, uncertainty = x_over_y(fit, view.matrix_px, view.focal_error)
         figures["scale_x_over_y"] = ratio if uncertainty <= MOST_RATIO_ERROR else None
@@ -223,7 +231,8 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
     """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
     side_mm = min(surface.rect_mm[2:])
     module_px = float(np.median([b.module_px for b in found.markers.values()]))
-    uncertain = entry.corner_uncertainty_mm > MOST_UNCERTAIN * side_mm
+    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
+    uncertain = entry.corner_uncertainty_mm > most_uncertain
     if entry.tilt_deg > MOST_TILT_DEG:
         return CannotJudge("tilted", entry.tilt_deg, MOST_TILT_DEG, _ADVICE["tilted"])
     if entry.blur_px > MOST_BLUR * module_px:
@@ -243,7 +252,7 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
             "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"
         )
     if uncertain:
-        return CannotJudge("too_small", side_mm * entry.px_per_mm, 2 * SMALLEST_DESIGN_PX, _ADVICE["too_small"])
+        return CannotJudge("too_small", entry.corner_uncertainty_mm, most_uncertain, _ADVICE["too_small"])
     return None
 
 

@@ -1,6 +1,6 @@
 """What this print makes of colors beside what the promise's printer would have made of them, from swatches in view.
 
-In: swatches of several photographs, media-relative by paper white and marker black. Out: a map from promised to printed
+In: swatches and marker ink of several photographs, media-relative. Out: a map from promised to printed
 light, or None where fewer than eight swatches are readable anywhere. One print hangs in all photographs, so its
 swatches are pooled over them: light and noise differ from photo to photo, ink does not. The map is the promise's
 printer plus an affine map plus a thin-plate spline through what is left, in encoded values, which needs the fewest
@@ -21,11 +21,11 @@ _SMOOTHING = 1e-3  # keeps reading errors of half a code value from bending the 
 
 
 def fit_print(
-    relative: Sequence[np.ndarray], promised: np.ndarray, ink: np.ndarray
+    relative: Sequence[np.ndarray], promised: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray] | None:
     """Linear light `... × 3` as printed from linear light as promised; `relative` N×3 per photo, NaN where unread.
 
-    Paper and marker `ink` keep their light: that they do is how light is told from print.
+    Paper keeps its light: that it does is how light is told from print. The markers' `ink` became `seen_ink`.
     """
     from scipy.interpolate import RBFInterpolator
 
@@ -37,9 +37,8 @@ def fit_print(
     readable = np.isfinite(pooled).all(1)
     if readable.sum() < LEAST_SWATCHES:
         return None
-    fixed = np.stack([np.ones(3), ink])
-    sent = srgb_from_linear(np.concatenate([promised[readable], fixed]))
-    seen = srgb_from_linear(np.clip(np.concatenate([pooled[readable], fixed]), 0, 1))
+    sent = srgb_from_linear(np.stack([*promised[readable], np.ones(3), ink]))
+    seen = srgb_from_linear(np.clip(np.stack([*pooled[readable], np.ones(3), seen_ink]), 0, 1))
     try:
         difference = RBFInterpolator(sent, seen - sent, kernel="thin_plate_spline", degree=1, smoothing=_SMOOTHING)
     except np.linalg.LinAlgError:  # swatches in one plane of the color cube

@@ -37,7 +37,11 @@ class PromisedRanges:
         """The first figure of the photo that the promise does not cover."""
         for name, (low, high) in self.limits.items():
             value = getattr(entry, name)
-            if value is None or (low <= value <= high) or (name != "px_per_mm" and not trust_angles):
+            if value is None or (name != "px_per_mm" and not trust_angles):
+                continue
+            if name == "azimuth_deg":  # a photograph is left out only where it is sure to lie outside
+                low, high = low - (entry.azimuth_uncertainty_deg or 0), high + (entry.azimuth_uncertainty_deg or 0)
+            if low <= value <= high:
                 continue
             below = value < low
             do = _ADVICE[name][0 if below else 1]

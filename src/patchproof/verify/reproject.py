@@ -33,6 +33,7 @@ _CELLS = 16  # of the design, along its shorter side, where its own colors stand
 _NOT_BLURRED_PX = 0.1
 _LEAST_AGREEMENT = 0.6  # of marker cells with the print, where right homographies reach 0.9 and more
 _LEAST_NOISE = 0.004  # of linear light: code values and JPEG
+_DARKEST, _PATCH = 0.002, 5  # share of a photograph that noise may bring under its veil, in means over so many pixels
 _SUPERSAMPLE = 2
 _LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
 
@@ -105,8 +106,16 @@ def noise_of(srgb: np.ndarray) -> float:
 
 
 def light_fit(shot: Shot, promised: Promised) -> ColorFit:
-    """From photographed to media-relative light by paper white and marker black, the convention for light."""
-    return white_black(shot.light.paper, shot.light.ink, promised.ink)
+    """From photographed to media-relative light by paper white and what veil of stray light lies over the photograph.
+
+    A veil lifts all of it alike: it is no lighter than the darkest place, nor than makes marker black what was
+    promised. Ink that is lighter still, or darker, is print.
+    """
+    paper, ink = shot.light.paper, shot.light.ink
+    # means, since noise that is cut off at zero lifts dark ink as it lifts them
+    darkest = np.quantile(cv2.blur(_LINEAR[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
+    veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
+    return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
 
 def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:

@@ -54,7 +54,8 @@ class PhotoEntry(Strict):
     scale_uncertainty: Finite | None = None  # 95 %, relative, of the worse axis; of card photographs
     scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
     tilt_deg: Finite | None = None
-    azimuth_deg: Finite | None = None
+    azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right
+    azimuth_uncertainty_deg: Finite | None = None  # 95 %, from the corners alone
     distance_mm: Finite | None = None
     contrast: Finite | None = None
     blur_px: Finite | None = None
