@@ -89,27 +89,27 @@ def _training_chart(
     problem: Problem, runs: Mapping[str, Mapping], usual: str, effort: Effort, on_stage: OnStage
 ) -> Chart:
     """Each run's settings, after half of the views and after all; `usual` is the default among them."""
-    usual_settings = OptimizeSettings()
-    names, ends = list(runs), (effort.views // 2, effort.views)
-    losses, cost = np.zeros((effort.seeds, len(names), len(ends))), np.zeros((len(names), len(ends)))
+    settings = {name: OptimizeSettings().model_copy(update=dict(run)) for name, run in runs.items()}
+    # the last steps of other numbers would not have been selected from
+    ends = {
+        name: [n for n in (effort.views // 2, effort.views) if n // one.views % SELECT_EVERY == 0]
+        for name, one in settings.items()
+    }
+    losses: list[list[float]] = []
     for seed in range(effort.seeds):
-        for i, name in enumerate(names):
-            settings = usual_settings.model_copy(update=dict(runs[name]))
-            numbers = tuple(end // settings.views for end in ends)
-            how = settings.views, settings.optimizer, settings.step_size
-            losses[seed, i] = trained_losses(problem, effort.judged, seed, *how, numbers)
-            cost[i] = [seen(settings.views, number) for number in numbers]
-            on_stage("training", seed * len(names) + i + 1, effort.seeds * len(names))
-    means = paired_means(losses.reshape(effort.seeds, -1))
-    series = []
-    for j, end in enumerate(ends):
-        points = []
-        for i, name in enumerate(names):
-            if end // runs[name].get("views", OptimizeSettings().views) % SELECT_EVERY:
-                continue  # its last steps were not selected from
-            (middle, interval), x = means[i * len(ends) + j], float(cost[i, j])
-            points.append(Point(name, x, middle, (x, x), interval, name == usual and end == effort.views))
-        series.append(Series(f"trained on {end} views", tuple(points)))
+        losses.append([])
+        for i, (name, one) in enumerate(settings.items()):
+            numbers = tuple(end // one.views for end in ends[name])
+            how = one.views, one.optimizer, one.step_size
+            losses[seed] += trained_losses(problem, effort.judged, seed, *how, numbers)
+            on_stage("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
+    points: dict[int, list[Point]] = {}
+    columns = [(name, end) for name in runs for end in ends[name]]
+    for (name, end), (middle, interval) in zip(columns, paired_means(np.array(losses)), strict=True):
+        x = float(seen(settings[name].views, end // settings[name].views))
+        default = name == usual and end == effort.views
+        points.setdefault(end, []).append(Point(name, x, middle, (x, x), interval, default))
+    series = [Series(f"trained on {end} views", tuple(some)) for end, some in sorted(points.items())]
     before = judge_of(problem, effort.judged).loss(start(problem).design)
     return Chart(
         "training",
