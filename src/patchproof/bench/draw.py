@@ -44,7 +44,7 @@ def save_chart(chart: Chart, about: Mapping[str, Any], path: Path) -> None:
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=10)
+            axes.legend(edgecolor="none", framealpha=0.8, fontsize=10)
         figure.supxlabel(describe(about), fontsize=7.5, color="0.35", x=0.995, ha="right")
         figure.savefig(path, dpi=130, metadata={"Software": None})
 
