@@ -89,8 +89,8 @@ def calibrate_chart(
     ]
     if choice.width < WIDE:
         warnings.append(
-            f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in its thinnest "
-            f"direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
+            f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in their "
+            f"thinnest direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
         )
     provenance = {
         "source": f"{len(readings)} photographs of {len(by_print)} print{'s' if len(by_print) > 1 else ''} of a chart",
