@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -83,7 +84,7 @@ def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on
         network = classifier.network
         with torch.no_grad():
             label = network(pictures).argmax(1)
-        truth = answer(copy.deepcopy(network).double(), pictures.double(), label)
+        truth = answer(_copy(network).double(), pictures.double(), label)
         answers, calls = {}, {}
         for way in WAYS:
             work = _work(network, way, pictures, label)
@@ -120,8 +121,15 @@ def answer(network: Callable[[Tensor], Tensor], pictures: Tensor, label: Tensor)
     return Answer(logits.detach(), gradient)
 
 
+def _copy(network: torch.nn.Module) -> torch.nn.Module:
+    """Another one of the same weights; torch warns of its own ways as it copies an exported program."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        return copy.deepcopy(network)
+
+
 def _work(network, way: Way, pictures: Tensor, label: Tensor) -> Callable[[], Answer]:
-    own = copy.deepcopy(network).to(memory_format=way.order)
+    own = _copy(network).to(memory_format=way.order)
     pictures = pictures.contiguous(memory_format=way.order)
 
     def work() -> Answer:
