@@ -13,6 +13,7 @@ import pytest
 from conftest import SCENE
 from patchproof import cli, geometry
 from patchproof.optimize import run as run_module
+from patchproof.settings import shipped
 from patchproof.sheet.manifest import load_manifest
 from patchproof.sheet.raster import attached_manifest
 
@@ -122,6 +123,32 @@ def test_the_sheet_is_the_same_bytes_when_made_twice(journey, tmp_path):
     assert command("sheet", journey / "run", "--out", tmp_path / "again.pdf") == 0
     assert (tmp_path / "again.pdf").read_bytes() == (journey / "sheet.pdf").read_bytes()
     assert (tmp_path / "again.json").read_bytes() == (journey / "sheet.json").read_bytes()
+
+
+def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
+    small = shipped("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
+    assert "177.0, 262.4]" in small
+    (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "90.0, 90.0]"), encoding="utf-8")
+    pdf, run = tmp_path / "tiles.pdf", journey / "run"
+    # a control, for which no promise is made anew
+    assert command("sheet", run, "--out", pdf, "--template", tmp_path / "small.toml", "--control", "mean") == 0
+    manifest = load_manifest(tmp_path / "tiles.json")
+    scans, given = tmp_path / "scans", ("--scan-dpi", 120)
+    assert command("reprint", pdf, "--run", run, "--n", 1, "--out", scans, *given) == 0
+    sheet = ("--sheet", tmp_path / "tiles.json", "--models", "builtin")
+    assert command("verify", scans, *sheet, "--out", tmp_path / "report", *given) == 0
+    photos = json.loads((tmp_path / "report" / "report.json").read_text())["photos"]
+    truth = json.loads((scans / "truth.json").read_text())
+    assert len(photos) == len(manifest.tiles) + 1 >= 3
+    for photo, tile in zip(photos[1:], manifest.tiles, strict=True):
+        assert photo["status"] == "measured" and photo["scale_x"] == pytest.approx(1, abs=0.003)
+        own = np.array(tile.page_from_design_mm)[:, 2] - np.array(manifest.tiles[0].page_from_design_mm)[:, 2]
+        corners = geometry.rect_corners(tile.cut_mm) - own
+        at = [
+            geometry.apply_homography(np.array(one["homography_px_from_mm"]), corners)
+            for one in (photo, truth[photo["file"]])
+        ]
+        assert np.abs(at[0] - at[1]).max() / 120 * 25.4 < 0.25
 
 
 def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_path):

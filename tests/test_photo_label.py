@@ -14,6 +14,7 @@ from patchproof.photo.read import Photo
 from patchproof.sheet.blank import blank_sheet
 from patchproof.sheet.piece import lay_out_piece
 from patchproof.sheet.raster import page_pixels
+from patchproof.sheet.several import OneDesign, write_several
 from patchproof.sheet.template import load_template
 from patchproof.sheet.write import write_sheet
 from patchproof.verify.camera import view_of
@@ -109,3 +110,27 @@ def test_the_code_alone_tells_of_another_sheet_when_no_marker_can_be_read(pages)
     covered = covered[: int(65 / 25.4 * 150)]
     assert verified(pages["ours"][0], covered).entry.code == "wrong_sheet"
     assert verified(manifest, covered).entry.code == "too_few_markers"
+
+
+def test_a_page_of_several_designs_is_each_ones_own_and_nobody_elses(tmp_path):
+    rng, template, looks = np.random.default_rng(3), load_template("a4"), {}
+
+    def page(name, *designs):
+        each = [
+            OneDesign(lay_out_piece((40, 40), 8, identity, "design"), identity, "design", pixels, None, {})
+            for identity, pixels in designs
+        ]
+        manifests = write_several(tmp_path / f"{name}.pdf", template, each)
+        looks[name] = (page_pixels(tmp_path / f"{name}.pdf", 1, 150) * 0.8).astype(np.uint8)
+        assert {label_of(manifest) for manifest in manifests} == {read_label(looks[name])}
+        return manifests
+
+    ids, designs = ("A1B2C3D4E5", "B1B2C3D4E5", "C1B2C3D4E5"), rng.integers(0, 256, (4, 16, 16, 3), np.uint8)
+    ours = page("ours", *zip(ids, designs[:3], strict=True))
+    entry = verified(ours[2], looks["ours"], 150).entry
+    assert (entry.status, entry.code) == ("measured", None)
+    page("one changed", *zip(ids, designs[[0, 1, 3]], strict=True))
+    page("without ours", ("Z9Y8X7W6V5", designs[3]), *zip(ids[1:], designs[1:3], strict=True))
+    for other, code in (("one changed", "wrong_sheet"), ("without ours", "several_sheets")):
+        entry = verified(ours[0], looks[other], 150).entry
+        assert (entry.status, entry.code) == ("rejected", code)

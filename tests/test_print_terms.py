@@ -100,7 +100,8 @@ def scene_with(folder, **changes):
 def test_every_step_of_an_optimization_in_gamut_is_in_gamut(tmp_path):
     worst = {}
     for in_gamut in (False, True):
-        problem = set_problem(scene_with(tmp_path, optimize__in_gamut=in_gamut, printer__profile="uncoated"))
+        given = {"optimize__in_gamut": in_gamut, "optimize__gamut": 0.0}
+        problem = set_problem(scene_with(tmp_path, printer__profile="uncoated", **given))
         designs = torch.stack([step.state.design for step in steps(problem)])
         worst[in_gamut] = float(problem.printer.gamut_distance(designs).max())
     assert worst[True] <= IN_GAMUT + 1e-4 < 8 < worst[False]

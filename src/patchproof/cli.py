@@ -200,7 +200,8 @@ def sheet(
     for manifest, path in zip(manifests, paths, strict=True):
         _say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
-        _say(*(line for manifest in manifests for line in check_sheet(manifest)), *shop_lines(out))
+        lines = (line for manifest in manifests for line in check_sheet(manifest))
+        _say(*dict.fromkeys(lines), *shop_lines(out))  # what holds for several designs is said once
 
 
 @app.command()

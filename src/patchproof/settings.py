@@ -231,7 +231,9 @@ class OptimizeSettings(Strict):
     optimizer: Literal["adam", "sign"] = "adam"
     step_size: Annotated[Positive, Field(le=1)] = 0.1  # of sRGB's range; what is larger than it only jumps to its ends
     tv: NotNegative = 0.0
-    gamut: NotNegative = 0.1  # loss for colors that the printer misses, per 100 ΔE00
+    # Loss for colors that the printer misses, per 100 ΔE00. At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
+    # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).
+    gamut: NotNegative = 1.0
     in_gamut: bool = False  # keep the design, after every step, to colors that the printer shows as asked (ΔE00 ≤ 3)
     nps: NotNegative = 0.0  # loss for the non-printability score of Sharif et al., 1 for random colors; to compare with
 

@@ -63,7 +63,7 @@ def _draw(chart: Chart, axes) -> None:
     costs, errors = [p.cost for p in points], [p.error for p in points]
     if max(costs) > 4 * min(costs):
         _plain_log(axes.xaxis, axes.set_xscale, max(costs) / min(costs))
-    if max(errors) > 30 * min(errors) > 0:
+    if 0 < 20 * min(errors) < max(errors) < np.inf:
         _plain_log(axes.yaxis, axes.set_yscale, max(errors) / min(errors))
     _write_settings(axes, chart)
     if chart.target is not None:
@@ -91,7 +91,7 @@ def _write_settings(axes, chart: Chart) -> None:
     axes.autoscale_view()
     groups: list[list[tuple[Point, str, np.ndarray]]] = []
     for series, color in zip(chart.series, _COLORS, strict=False):
-        for p in series.points:
+        for p in (point for point in series.points if np.isfinite(point.error)):
             at = to_share.transform((p.cost, p.error))
             near = (g for g in groups if (np.abs(g[0][2] - at) < _TOGETHER).all())
             group = next(near, None)

@@ -15,7 +15,7 @@ import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.rectify import rectify
-from patchproof.sheet.manifest import Manifest
+from patchproof.sheet.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
 _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template
@@ -23,7 +23,9 @@ _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the
 
 @dataclass(frozen=True)
 class Label:
-    """`printed` is 16 digits of the design's SHA-256, or the kind of a sheet without one."""
+    """`printed` is 16 digits of the design's SHA-256, or the kind of a sheet without one; a page of several designs has
+    an id of its own and digits of all their hashes.
+    """
 
     sheet_id: str
     printed: str
@@ -31,12 +33,14 @@ class Label:
 
 def label_of(manifest: Manifest) -> Label:
     """What the code on this manifest's page says."""
+    if manifest.page_code is not None:
+        return parsed(manifest.page_code)
     return Label(manifest.sheet_id, manifest.design.sha256[:16] if manifest.design else manifest.kind)
 
 
 def parsed(text: str) -> Label | None:
     """The label in a code's text; None where the code is not ours."""
-    match = re.match(r"patchproof:([0-9A-Z]{10}):([0-9a-z]+)", text)
+    match = re.match(PAGE_CODE, text)
     return Label(match[1], match[2]) if match else None
 
 
@@ -45,11 +49,16 @@ def read_label(srgb: np.ndarray) -> Label | None:
     shrink = _LARGEST_PX / max(srgb.shape[:2])
     if shrink < 1:
         srgb = cv2.resize(srgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    try:
-        text, _, _ = cv2.QRCodeDetector().detectAndDecode(cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY))
-    except cv2.error:  # some quadrangles that are no code make its decoder stumble
-        return None
-    return parsed(text)
+    gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
+    # of 7 oblique pages of either size they read 6 and 1 (A4), 5 and 7 (labels): neither is enough
+    for detector in (cv2.QRCodeDetectorAruco(), cv2.QRCodeDetector()):
+        try:
+            label = parsed(detector.detectAndDecode(gray)[0])
+        except cv2.error:  # some quadrangles that are no code make its decoder stumble
+            continue
+        if label is not None:
+            return label
+    return None
 
 
 def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], label: Label) -> None:

@@ -23,6 +23,7 @@ Point = tuple[Finite, Finite]
 Rect = tuple[Finite, Finite, Positive, Positive]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
+PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
 Page = Annotated[int, Field(ge=1)]
 
 
@@ -143,6 +144,8 @@ class Manifest(Strict):
     cut_mm: Rect
     ruler_mm: tuple[Positive, Positive]
     card_mm: Rect | None = None  # the printed outline that a bank card is laid into, on the design's page
+    page_code: Annotated[str, Field(pattern=PAGE_CODE)] | None = None  # of a page that several designs share
+    plan_page: Page | None = None  # the page for people: where the piece goes, and how to photograph it
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]

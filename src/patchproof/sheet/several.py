@@ -1,13 +1,16 @@
 """Several designs on one page, each with its own piece, markers and manifest.
 
 In: what `write_sheet` takes, once for each design. Out: SHEET.pdf and SHEET_1.json, SHEET_2.json... in the order of the
-designs, all of which the PDF carries. Frames keep the marker ids that they were promised with. Ids come from 1000 by
-hash, so two sheets may share one; the page's own markers avoid all of them, and in a design's manifest the others'
-markers stand among the page's where nothing else has their id, so that a photograph of the uncut page is known as one.
+designs, all of which the PDF carries. The page has an id of its own and one code for all of them: a code that lists
+three designs or more is too fine to be read at 150 dpi. Frames keep the marker ids that they were promised with. Ids
+come from 1000 by hash, so two sheets may share one; the page's own markers avoid all of them, and in a design's
+manifest the others' markers stand among the page's where nothing else has their id, so that a photograph of the uncut
+page is known as one.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from patchproof.settings import Refused
-from patchproof.sheet.manifest import Manifest, Promise, Swatch
+from patchproof.sheet.manifest import Manifest, Promise, Swatch, design_sha256
 from patchproof.sheet.page import PageLayout, lay_out_parts, moved, moved_marker, place_pieces, size_text
 from patchproof.sheet.pdf import Printed
-from patchproof.sheet.piece import Piece, hash_order
+from patchproof.sheet.piece import Piece, hash_order, sheet_id
 from patchproof.sheet.template import Template
 from patchproof.sheet.write import (
     check_pixels,
@@ -28,7 +31,6 @@ from patchproof.sheet.write import (
     pdf_name,
     printed_design,
     printed_marker,
-    qr_text,
     save_sheets,
 )
 
@@ -59,10 +61,10 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[On
         check_pixels(one.design_srgb8)
     pieces = [one.piece for one in designs]
     places = place_pieces(template, pieces)
-    page = lay_out_parts(
-        template, pieces, places, _page_ids(designs, template), " ".join(_codes(designs)), _words(designs)
-    )
-    manifests = [_manifest(template, page, designs, places, i) for i in range(len(designs))]
+    identity = sheet_id({"sheets": [[one.sheet_id, one.kind] for one in designs]}, 0)
+    code = _page_code(identity, designs)
+    page = lay_out_parts(template, pieces, places, _page_ids(designs, template), code, _words(identity, designs))
+    manifests = [_manifest(template, page, designs, places, i, code) for i in range(len(designs))]
     pictures = tuple((rect, one.design_srgb8) for rect, one in zip(page.designs_mm, designs, strict=True))
     paths = manifest_paths(pdf_path, len(designs))
     save_sheets(pdf_path, [Printed(page, pictures)], dict(zip(paths, manifests, strict=True)))
@@ -76,21 +78,25 @@ def _page_ids(designs: Sequence[OneDesign], template: Template) -> list[int]:
     return [i for i in order if i not in used][: len(template.marker.corners_mm)]
 
 
-def _codes(designs: Sequence[OneDesign]) -> list[str]:
-    return [qr_text(one.sheet_id, one.kind, one.design_srgb8) for one in designs]
+def _page_code(identity: str, designs: Sequence[OneDesign]) -> str:
+    """The page's id, and 16 digits of a SHA-256 over those of its designs."""
+    hashes = "".join(design_sha256(one.design_srgb8) for one in designs)
+    return f"patchproof:{identity}:{hashlib.sha256(hashes.encode()).hexdigest()[:16]}"
 
 
-def _words(designs: Sequence[OneDesign]) -> dict[str, str]:
+def _words(identity: str, designs: Sequence[OneDesign]) -> dict[str, str]:
     sizes = sorted({size_text(one.piece.size_mm) for one in designs})
     return {
-        "sheet_id": designs[0].sheet_id,
+        "sheet_id": identity,
         "kind": f"{len(designs)} designs,",
         "design": " and ".join(sorted({size_text(one.piece.design_rect_mm[2:]) for one in designs})),
         "piece": " and ".join(sizes),
     }
 
 
-def _manifest(template: Template, page: PageLayout, designs: Sequence[OneDesign], places, index: int) -> Manifest:
+def _manifest(
+    template: Template, page: PageLayout, designs: Sequence[OneDesign], places, index: int, code: str
+) -> Manifest:
     """One design's: its own piece first, then everything else on the page whose id cannot be mistaken."""
     one, corner = designs[index], places[index]
     own = [moved_marker(marker, corner) for marker in one.piece.markers]
@@ -107,6 +113,7 @@ def _manifest(template: Template, page: PageLayout, designs: Sequence[OneDesign]
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in chart),
         cut_mm=page.cuts_mm[index],
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
+        page_code=code,
         promise=one.promise,
         settings=one.settings,
     )

@@ -10,7 +10,7 @@ Left out on purpose: asking before overwriting, which is the command line's busi
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,7 @@ def write_sheet(
         manifest = manifest.model_copy(update=update)
     if plan is not None:
         pages.append(lay_out_plan(plan, template, sheet_id))
+        manifest = manifest.model_copy(update={"plan_page": len(pages)})
     save_sheets(pdf_path, pages, {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
@@ -118,15 +119,41 @@ def check_sheet(manifest: Manifest) -> list[str]:
     ]
     if manifest.kind == "board":
         return [*lines, "Glue the uncut page to something flat and stiff."]
-    lines.append(f"Cut the piece of {manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm along the dashed line.")
+    if manifest.kind == "chart":
+        return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
+    lines += [*_cutting(manifest)]
+    if manifest.plan_page is not None:
+        lines.append(
+            f"Page {manifest.plan_page} is for people, on any paper: where the piece goes and how to photograph it."
+        )
     if manifest.design is None:
         lines.append("The piece carries no design: its middle stays white paper.")
-    inside = sum(_within(swatch.rect_mm, manifest.cut_mm) for swatch in manifest.chart)
+    frames = {tile.page: tile.cut_mm for tile in manifest.tiles} or {1: manifest.cut_mm}
+    inside = sum(s.page in frames and _within(s.rect_mm, frames[s.page]) for s in manifest.chart)
     if inside < len(FRAME_COLORS):
         lines.append(
             f"The frame has room for {inside} of {len(FRAME_COLORS)} swatches, so color on it is measured less well."
         )
     return lines
+
+
+def _cutting(manifest: Manifest) -> Iterator[str]:
+    """What is cut out of which page."""
+    size = f"{manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm"
+    if manifest.tiles:
+        pages = [tile.page for tile in manifest.tiles]
+        yield (
+            f"Cut the {len(pages)} tiles of pages {min(pages)} to {max(pages)} along the dashed lines, flaps and all, "
+            f"and glue them to one piece of {size} as page 1 shows; page 1 stays whole."
+        )
+    elif manifest.page_code is not None:
+        x, y = manifest.cut_mm[:2]
+        yield (
+            f"Cut each piece of the page along its own dashed line; that of sheet {manifest.sheet_id} is the one of "
+            f"{size} whose corner lies {x:.0f} mm from the left and {y:.0f} mm from the top."
+        )
+    else:
+        yield f"Cut the piece of {size} along the dashed line."
 
 
 def printed_design(design: np.ndarray, rect_mm: RectMm, page: int = 1) -> Design:
@@ -205,7 +232,8 @@ def replace_both(contents: dict[Path, bytes]) -> None:
 def _nearest_ink_mm(manifest: Manifest) -> float:
     """From the page's edge to the nearest marker, swatch or cut line."""
     width, height = manifest.page_mm
-    rects = [manifest.cut_mm, *(swatch.rect_mm for swatch in manifest.chart)]
+    rects = [tile.cut_mm for tile in manifest.tiles] or [manifest.cut_mm]
+    rects = [*rects, *(swatch.rect_mm for swatch in manifest.chart)]
     points = [point for marker in manifest.markers for point in marker.corners_mm]
     points += [(x + dx, y + dy) for x, y, w, h in rects for dx, dy in ((0, 0), (w, h))]
     return min(min(x, y, width - x, height - y) for x, y in points)

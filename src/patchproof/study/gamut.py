@@ -55,8 +55,8 @@ WAYS = (
     UNPRINTED,
     Way("NPS alone", printed=False, nps=1.0),
     Way("printer's table", printed=True),
-    Way("table and gamut term", printed=True, gamut=0.1),
-    Way("table and gamut term × 30", printed=True, gamut=3.0),
+    Way("table and gamut term", printed=True, gamut=1.0),
+    Way("table and gamut term × 10", printed=True, gamut=10.0),
     Way("in gamut by construction", printed=True, in_gamut=True),
 )
 

@@ -163,34 +163,51 @@ def scan(
     print_scale: tuple[float, float] = (1.0, 1.0),
     overwrite: bool = False,
 ) -> dict:
-    """Write n flat scans of the uncut page, printed at `print_scale` and scanned at `dpi`."""
+    """Write n flat scans of each uncut page with markers, printed at `print_scale` and scanned at `dpi`."""
+    manifest, _ = sheet_scene(pdf_path, run)
+    shown, truth = printer_of(run, printer), {}
+    px_from_mm = np.diag([dpi / 25.4 * print_scale[0], dpi / 25.4 * print_scale[1], 1.0])
+    with new_folder(out, OWN, overwrite) as folder:
+        for page in sorted({marker.page for marker in manifest.markers}):
+            picture = _scanned(page_pixels(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, shown, print_scale)
+            corners = {
+                str(m.id): geometry.apply_homography(px_from_mm, m.corners_mm).tolist()
+                for m in manifest.markers
+                if m.page == page
+            }
+            for _ in range(n):
+                name = f"scan_{len(truth) + 1:04d}.jpg"
+                Image.fromarray(_bytes(picture)).save(folder / name, "JPEG", quality=SCAN_QUALITY)
+                truth[name] = {
+                    "homography_px_from_mm": (px_from_mm @ _page_from_design(manifest, page)).tolist(),
+                    "marker_corners_px": corners,
+                    "conditions": {"scan_dpi": dpi, "print_scale": list(print_scale)},
+                }
+        write_json(folder / "truth.json", truth)
+    return truth
+
+
+def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scale: tuple[float, float]) -> np.ndarray:
+    """A page's pixels, twice as fine as the scan, as the scanner shows their print: H×W×3 in [0, 1]."""
     import cv2
 
-    manifest, _ = sheet_scene(pdf_path, run)
-    if manifest.tiles:
-        raise Refused("a sheet on one page to scan", f"{len(manifest.tiles)} tiles", "leave --scan-dpi out")
-    page = torch.tensor(page_pixels(pdf_path, 1, 2 * dpi)).permute(2, 0, 1)[None] / 255  # twice as fine as the scan
-    seen = printer_of(run, printer).apply(page)[0].permute(1, 2, 0).numpy()
-    size_px = tuple(round(side * dpi / 25.4) for side in manifest.page_mm)
+    with torch.no_grad():
+        seen = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
     # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
     matrix = np.array(
         [[scale / 2 if i == j else 0 for j in (0, 1)] + [scale / 4 - 0.5] for i, scale in enumerate(print_scale)]
     )
-    soft = cv2.GaussianBlur(seen, (0, 0), SCAN_BLUR_PX)
-    picture = cv2.warpAffine(soft, matrix, size_px, borderValue=(1.0, 1.0, 1.0))
-    homography, truth = np.diag([dpi / 25.4 * print_scale[0], dpi / 25.4 * print_scale[1], 1.0]), {}
-    corners = {str(m.id): geometry.apply_homography(homography, m.corners_mm).tolist() for m in manifest.markers}
-    with new_folder(out, OWN, overwrite) as folder:
-        for i in range(n):
-            name = f"scan_{i + 1:04d}.jpg"
-            Image.fromarray(_bytes(picture)).save(folder / name, "JPEG", quality=SCAN_QUALITY)
-            truth[name] = {
-                "homography_px_from_mm": homography.tolist(),
-                "marker_corners_px": corners,
-                "conditions": {"scan_dpi": dpi, "print_scale": list(print_scale)},
-            }
-        write_json(folder / "truth.json", truth)
-    return truth
+    size_px = tuple(round(side * dpi / 25.4) for side in page_mm)
+    return cv2.warpAffine(cv2.GaussianBlur(seen, (0, 0), SCAN_BLUR_PX), matrix, size_px, borderValue=(1.0, 1.0, 1.0))
+
+
+def _page_from_design(manifest: Manifest, page: int) -> np.ndarray:
+    """3×3 from the millimetres of the design's page to a tile's; pages without a tile keep their own."""
+    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
+    if page not in square:
+        return np.eye(3)
+    own = square[manifest.design.page if manifest.design else manifest.tiles[0].page]
+    return square[page] @ np.linalg.inv(own)
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
