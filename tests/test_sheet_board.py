@@ -37,7 +37,9 @@ def test_opencv_s_own_board_detector_reads_the_page(board):
     ids, corners = np.asarray(ids).reshape(-1), np.asarray(corners).reshape(-1, 2)
     assert ids.tolist() == list(range(54)) and sorted(np.asarray(names).reshape(-1)) == list(range(35))
     places = np.column_stack([12 + 24 * (ids % 6 + 1), 20 + 24 * (ids // 6 + 1)])
-    assert np.abs((corners + 0.5) / 150 * 25.4 - places).max() < 0.05  # measured 0.014 mm
+    off = (corners + 0.5) / 150 * 25.4 - places
+    # measured 0.014 mm; OpenCV 4.10 counts corners of boards from half a pixel (0.08 mm) further on
+    assert np.abs(off - off.mean(0)).max() < 0.05 and np.abs(off.mean(0)).max() < 0.1
     exact = {m.id: np.array(m.corners_mm) for m in board[1].markers}
     for name, quad in zip(np.asarray(names).reshape(-1), quads, strict=True):
         assert np.abs((quad.reshape(4, 2) + 0.5) / 150 * 25.4 - exact[int(name)]).max() < 0.25  # whole pixels
