@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from patchproof.classifier import load_classifier, program
-from patchproof.classifier.program import in_batches, load_program, no_pickle
+from patchproof.classifier.program import InBatches, load_program, no_pickle
 from patchproof.settings import Refused
 
 LABELS = ["red", "green", "blue", "none"]
@@ -371,7 +371,7 @@ def test_batches_are_cut_and_filled_up():
         return photos.mean((2, 3))
 
     photos = torch.rand(7, 3, 2, 2)
-    assert torch.equal(in_batches(network, 2, 3)(photos), photos.mean((2, 3)))
+    assert torch.equal(InBatches(network, 2, 3)(photos), photos.mean((2, 3)))
     assert seen == [3, 3, 2]
 
 

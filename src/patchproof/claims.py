@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 CONFIDENCE = 0.95
 LEAST_CLUSTERS = 5
@@ -31,6 +32,7 @@ def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[floa
     return (0.0 if successes == 0 else center - half), (1.0 if successes == n else center + half)
 
 
+@lru_cache(maxsize=4096)
 def prediction_interval(successes: int, n: int, photos: int, confidence: float = CONFIDENCE) -> tuple[int, int]:
     """Counts [lo, hi] that `photos` new images will show with the given confidence, after `successes` of `n`."""
     from scipy.stats import betabinom

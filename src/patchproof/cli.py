@@ -463,8 +463,10 @@ def study(
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="A benchmark: render, printer, detect, or all.")] = "all",
-    quick: Annotated[bool, typer.Option("--quick", help="A minute: fewer views, rounds and sizes.")] = False,
+    name: Annotated[
+        str, typer.Argument(help="A benchmark: render, train, numbers, printer, detect, evidence, or all.")
+    ] = "all",
+    quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for charts, table and JSON.")] = Path("patchproof-bench"),
     overwrite: Overwrite = False,
 ) -> None:

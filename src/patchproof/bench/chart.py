@@ -1,8 +1,8 @@
 """What a benchmark found: points of cost and error, with the Pareto front, the default, and claims that were tested.
 
 In: points, each saying how far it could be off. Out: charts as data and as lines of text. The front is what nothing
-else beats in both cost and error; the default is marked, so that one sees whether it lies there. Claims that a chart is
-made to test stand in it as `Check`s.
+else beats in both cost and error; the default is marked, and `with_default_checks` asks whether it lies there. Claims
+that a chart is made to test stand in it as `Check`s.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 Interval = tuple[float, float]
 OnStage = Callable[[str, int, int], None]
+OFF_FRONT = 5.0  # % more error than the front's at its cost that a default may have, where intervals do not overlap
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Chart:
-    """Cost to the right, error upwards, or where `higher_is_better` a quality such as PSNR; `target` is a line across.
+    """Cost to the right, error upwards, or where `higher_is_better` a quality in dB; `target` is a line across.
 
-    `notes` say what was measured and on what.
+    `notes` say what was measured and on what. `one_front`: series are choices for one task, not tasks of their own.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Chart:
     checks: tuple[Check, ...] = ()
     tables: tuple[Table, ...] = ()
     higher_is_better: bool = False
+    one_front: bool = False
     target: float | None = None
 
 
@@ -99,15 +101,55 @@ def pareto(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
 
 
 def with_front(chart: Chart) -> Chart:
-    """The chart with the points of each series' Pareto front marked."""
+    """The chart with the points of each task's Pareto front marked."""
     if isinstance(chart, Growth | Shares):
         return chart
-    sign, marked = (-1 if chart.higher_is_better else 1), []
-    for one in chart.series:
-        front = pareto([p.cost for p in one.points], [sign * p.error for p in one.points]).tolist()
-        points = (replace(point, front=on) for point, on in zip(one.points, front, strict=True))
-        marked.append(replace(one, points=tuple(points)))
+    sign, on_front = (-1 if chart.higher_is_better else 1), set()
+    for _, points in _tasks(chart):
+        front = pareto([p.cost for p in points], [sign * p.error for p in points])
+        on_front |= {id(point) for point, on in zip(points, front, strict=True) if on}
+    marked = (
+        replace(one, points=tuple(replace(point, front=id(point) in on_front) for point in one.points))
+        for one in chart.series
+    )
     return replace(chart, series=tuple(marked))
+
+
+def with_default_checks(chart: Chart) -> Chart:
+    """The chart with a check for each default: how much more error it has than the front's at its cost.
+
+    0 % where the two intervals overlap. Of a quality in dB the error is its root mean square.
+    """
+    if isinstance(chart, Growth | Shares):
+        return chart
+    checks = []
+    for label, points in _tasks(chart):
+        for default in (p for p in points if p.default):
+            rivals = [_error(p, chart.higher_is_better) for p in points if p.cost <= default.cost]
+            claim = f"{label}: % more error of the default than of the front at its cost"
+            checks.append(Check(claim, _beyond(_error(default, chart.higher_is_better), min(rivals)), OFF_FRONT))
+    return replace(chart, checks=(*chart.checks, *checks))
+
+
+def _tasks(chart: Chart) -> list[tuple[str, list[Point]]]:
+    """Points among which one chooses, each with its name."""
+    if chart.one_front:
+        return [(chart.name, [point for one in chart.series for point in one.points])]
+    return [(one.label, list(one.points)) for one in chart.series]
+
+
+def _error(point: Point, is_decibel: bool) -> tuple[float, float, float]:
+    """Error with its lower and upper end."""
+    if not is_decibel:
+        return (point.error, *point.error_interval)
+    low, high = point.error_interval
+    return tuple(10 ** (-value / 20) for value in (point.error, high, low))
+
+
+def _beyond(default: tuple[float, float, float], front: tuple[float, float, float]) -> float:
+    if default[1] <= front[2]:
+        return 0.0
+    return 100 * (default[0] / front[0] - 1) if front[0] > 0 else float("inf")
 
 
 def text(chart: Chart) -> list[str]:

@@ -90,32 +90,49 @@ def corners_mm() -> dict[int, np.ndarray]:
 def shoot(size_px: tuple[int, int], seed: int) -> Shot:
     """One photograph from a fixed seed: the piece fills a third of its height or so, over soft clutter."""
     rng = np.random.default_rng(seed)
-    azimuth, elevation = np.radians(rng.uniform([-50, -30], [50, 30]))
-    toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
-    world_from_piece = np.diag([1.0, -1.0, -1.0, 1.0])
-    world_from_piece[:2, 3] = [-PIECE_MM / 2, PIECE_MM / 2]
-    pose = look_at(rng.uniform(350, 700) * np.array(toward), [0, 0, 0], rng.uniform(-20, 20))
-    px_from_mm = plane_homography(intrinsics(50.0, size_px), pose, world_from_piece)
-    clutter = cv2.resize(rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32), size_px, interpolation=cv2.INTER_CUBIC)
+    camera_from_piece, matrix = drawn_view(rng, size_px)
+    px_from_mm = plane_homography(matrix, camera_from_piece, np.eye(4))
+    clutter = drawn_clutter(rng, size_px)
     fine = tuple(SAMPLES * side for side in size_px)
     # index i of the fine grid lies at (i + 0.5) / SAMPLES px, texel j of the raster at (j + 0.5) / RASTER_PX_PER_MM mm
     fine_from_px = np.array([[SAMPLES, 0, -0.5], [0, SAMPLES, -0.5], [0, 0, 1.0]])
     mm_from_texel = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, RASTER_PX_PER_MM]]) / RASTER_PX_PER_MM
     matrix = fine_from_px @ px_from_mm @ mm_from_texel
-    raster = _raster(rng)
+    raster = piece_raster(rng)
     warp = lambda part: cv2.resize(  # noqa: E731
         cv2.warpPerspective(part, matrix, fine, flags=cv2.INTER_NEAREST), size_px, interpolation=cv2.INTER_AREA
     )
     light = clutter * (1 - warp(np.full(raster.shape, 1, np.float32))) + warp(raster)
+    return Shot(developed(light, rng), px_from_mm)
+
+
+def drawn_view(rng, size_px: tuple[int, int], most_azimuth_deg: float = 50.0) -> tuple[np.ndarray, np.ndarray]:
+    """`camera_from_piece` 4×4 (mm, z into the paper) and the pinhole matrix 3×3."""
+    azimuth, elevation = np.radians(rng.uniform([-most_azimuth_deg, -30], [most_azimuth_deg, 30]))
+    toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    world_from_piece = np.diag([1.0, -1.0, -1.0, 1.0])
+    world_from_piece[:2, 3] = [-PIECE_MM / 2, PIECE_MM / 2]
+    camera_from_world = look_at(rng.uniform(350, 700) * np.array(toward), [0, 0, 0], rng.uniform(-20, 20))
+    return camera_from_world @ world_from_piece, intrinsics(50.0, size_px)
+
+
+def drawn_clutter(rng, size_px: tuple[int, int]) -> np.ndarray:
+    """H×W light of something soft behind the piece."""
+    return cv2.resize(rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32), size_px, interpolation=cv2.INTER_CUBIC)
+
+
+def developed(light: np.ndarray, rng) -> np.ndarray:
+    """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
     light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
     light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)
     codes = (srgb_from_linear(light.clip(0, 1)) * 255 + 0.5).astype(np.uint8)
     jpeg = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(60, 96))])[1]
     gray = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
-    return Shot(np.repeat(gray[..., None], 3, 2), px_from_mm)
+    return np.repeat(gray[..., None], 3, 2)
 
 
-def _raster(rng) -> np.ndarray:
+def piece_raster(rng) -> np.ndarray:
+    """Light of the piece at RASTER_PX_PER_MM: markers, and a soft design."""
     side = round(PIECE_MM * RASTER_PX_PER_MM)
     raster = np.full((side, side), 0.95, np.float32)
     x, y, width, height = (round(v * RASTER_PX_PER_MM) for v in DESIGN_MM)

@@ -6,7 +6,7 @@ default. Machine, threads and date stand in the corner.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import singledispatch
 from pathlib import Path
 from textwrap import fill
@@ -17,8 +17,12 @@ import numpy as np
 from patchproof.bench.chart import Chart, Growth, Point, Series, Shares
 from patchproof.bench.measure import describe
 
+Box = tuple[float, float, float, float]  # left, bottom, right, top as shares of the chart
 _COLORS = ("#1f5fa8", "#c2571a", "#2a8f62", "#8a4fa3", "#6b6b6b")
 _LINE = 48  # characters of an axis label in one line
+_CHARACTER = 0.0115  # width of a letter, as a share of the chart's
+_TOGETHER = (0.03, 0.03)  # of the chart's sides: points as near as that share a text
+_MANY = 2000  # times the smallest: decades alone are written at the axis
 _MARKERS = ("o", "s", "^", "D", "v")
 
 
@@ -40,7 +44,7 @@ def save_chart(chart: Chart, about: Mapping[str, Any], path: Path) -> None:
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=10)
+            axes.legend(edgecolor="none", framealpha=0.8, fontsize=10)
         figure.supxlabel(describe(about), fontsize=7.5, color="0.35", x=0.995, ha="right")
         figure.savefig(path, dpi=130, metadata={"Software": None})
 
@@ -49,18 +53,26 @@ def save_chart(chart: Chart, about: Mapping[str, Any], path: Path) -> None:
 def _draw(chart: Chart, axes) -> None:
     for series, color, marker in zip(chart.series, _COLORS, _MARKERS, strict=False):
         _draw_points(axes, series, color, marker)
-        front = sorted((point for point in series.points if point.front), key=lambda point: point.cost)
-        axes.plot([p.cost for p in front], [p.error for p in front], color=color, lw=1, ls="--", zorder=1)
+        if not chart.one_front:
+            _draw_front(axes, series.points, color)
+    points = [point for series in chart.series for point in series.points]
+    if chart.one_front:
+        _draw_front(axes, points, "0.4")
     axes.plot([], [], color="0.4", lw=1, ls="--", label="Pareto front (filled)")
     axes.plot([], [], "o", ms=11, mfc="none", mec="black", mew=1.3, ls="none", label="default")
-    costs = [point.cost for series in chart.series for point in series.points]
+    costs, errors = [p.cost for p in points], [p.error for p in points]
     if max(costs) > 4 * min(costs):
-        _plain_log(axes)
-    errors = [point.error for series in chart.series for point in series.points]
+        _plain_log(axes.xaxis, axes.set_xscale, max(costs) / min(costs))
     if 0 < 20 * min(errors) < max(errors) < np.inf:
-        axes.set_yscale("log")
+        _plain_log(axes.yaxis, axes.set_yscale, max(errors) / min(errors))
+    _write_settings(axes, chart)
     if chart.target is not None:
         axes.axhline(chart.target, color="0.5", lw=1, ls=":", label=f"target {chart.target:g}")
+
+
+def _draw_front(axes, points: Sequence[Point], color: str) -> None:
+    front = sorted((point for point in points if point.front), key=lambda point: point.cost)
+    axes.plot([p.cost for p in front], [p.error for p in front], color=color, lw=1, ls="--", zorder=1)
 
 
 def _draw_points(axes, series: Series, color: str, marker: str) -> None:
@@ -72,19 +84,47 @@ def _draw_points(axes, series: Series, color: str, marker: str) -> None:
         if p.default:
             axes.plot(x, y, "o", ms=14, mfc="none", mec="black", mew=1.3)
 
-    for text, at in _labels(series.points):
-        axes.annotate(text, at, xytext=(6, 5), textcoords="offset points", fontsize=9.5, color=color)
+
+def _write_settings(axes, chart: Chart) -> None:
+    """What each point is, beside it; points that fall together share one text."""
+    to_share = axes.transData + axes.transAxes.inverted()
+    axes.autoscale_view()
+    groups: list[list[tuple[Point, str, np.ndarray]]] = []
+    for series, color in zip(chart.series, _COLORS, strict=False):
+        for p in (point for point in series.points if np.isfinite(point.error)):
+            at = to_share.transform((p.cost, p.error))
+            near = (g for g in groups if (np.abs(g[0][2] - at) < _TOGETHER).all())
+            group = next(near, None)
+            groups.append([(p, color, at)]) if group is None else group.append((p, color, at))
+    taken = [(*(at - 0.01), *(at + 0.01)) for group in groups for _, _, at in group]
+    for group in groups:
+        colors = {color for _, color, _ in group}
+        text = ", ".join(dict.fromkeys(p.setting for p, _, _ in group))
+        ends = sorted(group, key=lambda one: one[0].cost)
+        right, up, box = _room(text, ends[0][2], ends[-1][2], taken)
+        taken.append(box)
+        place = ends[-1 if right else 0][0]
+        style = {"fontsize": 9.5, "color": colors.pop() if len(colors) == 1 else "0.25", "ha": "left", "va": "bottom"}
+        style |= ({} if right else {"ha": "right"}) | ({} if up else {"va": "top"})
+        offset = (6 if right else -6, 3 if up else -3)
+        axes.annotate(text, (place.cost, place.error), xytext=offset, textcoords="offset points", **style)
 
 
-def _labels(points: tuple[Point, ...]) -> list[tuple[str, tuple[float, float]]]:
-    """What to write where; points that fall together share one text."""
-    height = max(p.error for p in points) - min(p.error for p in points)
-    groups: list[list[Point]] = []
-    for p in points:
-        near = (g for g in groups if abs(g[0].error - p.error) <= 0.03 * height and 0.85 < g[0].cost / p.cost < 1.18)
-        group = next(near, None)
-        groups.append([p]) if group is None else group.append(p)
-    return [(", ".join(p.setting for p in g), (max(p.cost for p in g), g[0].error)) for g in groups]
+def _room(text: str, first: np.ndarray, last: np.ndarray, taken: Sequence[Box]) -> tuple[bool, bool, Box]:
+    """Whether a text goes to the right (else the left) of its points and above (else below): where it hides least."""
+    width, height = _CHARACTER * len(text) + 0.012, 0.045
+    found = []
+    for right, up in ((True, True), (True, False), (False, True), (False, False)):
+        x = last[0] if right else first[0] - width
+        y = first[1] if up else first[1] - height
+        box = (x, y, x + width, y + height)
+        outside = max(0.0, box[2] - 1.05) + max(0.0, -box[0])
+        hidden = sum(
+            max(0, min(box[2], b[2]) - max(box[0], b[0])) * max(0, min(box[3], b[3]) - max(box[1], b[1])) for b in taken
+        )
+        found.append((hidden + outside * height, not right, not up, box))
+    _, left, down, box = min(found, key=lambda one: one[0])
+    return not left, not down, box
 
 
 def _off(middle: float, interval: tuple[float, float]) -> list[list[float]]:
@@ -124,11 +164,11 @@ def _(chart: Shares, axes) -> None:
     axes.margins(x=0.12)
 
 
-def _plain_log(axes) -> None:
+def _plain_log(axis, set_scale, span: float) -> None:
     """A logarithmic axis with ratios written out."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, position: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    set_scale("log")
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if span < _MANY else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, position: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from patchproof.bench.chart import Chart, OnStage, text, with_front
+from patchproof.bench.chart import Chart, OnStage, text, with_default_checks, with_front
 from patchproof.bench.measure import describe, machine
 from patchproof.output import new_folder
 from patchproof.settings import Refused, nearest
@@ -38,7 +38,7 @@ def run_bench(
         for one in chosen:
             about, charts = machine(), []
             for chart in benches[one](quick, on_stage):
-                charts.append(with_front(chart))
+                charts.append(with_default_checks(with_front(chart)))
                 save_chart(charts[-1], about, folder / f"{one}_{chart.name}.png")
             _write_json(folder / f"{one}.json", {"bench": one, "quick": quick, "machine": about}, charts)
             lines += [describe(about), *(line for chart in charts for line in ["", *text(chart)])]
@@ -48,10 +48,20 @@ def run_bench(
 
 def _benches() -> dict[str, Callable[[bool, OnStage], Iterator[Chart]]]:
     from patchproof.bench.detect import detect_charts
+    from patchproof.bench.evidence import evidence_charts
+    from patchproof.bench.numbers import numbers_charts
     from patchproof.bench.printer import printer_charts
     from patchproof.bench.render import render_charts
+    from patchproof.bench.train import train_charts
 
-    return {"render": render_charts, "printer": printer_charts, "detect": detect_charts}
+    return {
+        "render": render_charts,
+        "train": train_charts,
+        "numbers": numbers_charts,
+        "printer": printer_charts,
+        "detect": detect_charts,
+        "evidence": evidence_charts,
+    }
 
 
 def _write_json(path: Path, about: dict[str, Any], charts: list[Chart]) -> None:

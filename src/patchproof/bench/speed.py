@@ -44,8 +44,8 @@ MOST_GB, MOST_SHARE, MOST_RASTER_SHARE = 1.5, 12.0, 10.0
 def growth_chart(quick: bool, on_stage: OnStage) -> Chart:
     """Time of `rasterize` against faces, and against fragments as pictures and batches grow."""
     peak = peak_gb(STEP_VIEWS, MEMORY_SIDE_PX)
-    subdivisions = SUBDIVISIONS[: len(SUBDIVISIONS) - quick]
-    sides, views = GROWTH_SIDES_PX, GROWTH_VIEWS
+    subdivisions = SUBDIVISIONS[: len(SUBDIVISIONS) - 2 * quick]
+    sides, views = (sizes[: len(sizes) - quick] for sizes in (GROWTH_SIDES_PX, GROWTH_VIEWS))
     tasks = [
         (f"faces, {SIDE_PX} px", [(n, 1, SIDE_PX) for n in subdivisions]),
         ("fragments, larger pictures", [(GROWTH_FACES, 1, side) for side in sides]),
@@ -53,7 +53,7 @@ def growth_chart(quick: bool, on_stage: OnStage) -> Chart:
     ]
     series = []
     for i, (label, sizes) in enumerate(tasks):
-        series.append(_growth(label, sizes, 3 if quick else 7, of_faces=i == 0))
+        series.append(_growth(label, sizes, 2 if quick else 7, of_faces=i == 0))
         on_stage("growth", i + 1, len(tasks))
     checks = [Check(f"slope of {one.label}", one.slope, STEEPEST) for one in series]
     if peak is not None:

@@ -32,7 +32,7 @@ RUNGS = {
     "k1 k2 p1 p2": _NO_K3,
     "k1 k2 p1 p2 k3": 0,
 }
-_FREE = {"pinhole": 4, "k1": 5, "k1 k2": 6, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}  # of NUMBERS, from the first
+FREE = {"pinhole": 4, "k1": 5, "k1 k2": 6, "k1 k2 p1 p2": 8, "k1 k2 p1 p2 k3": 9}  # of NUMBERS, from the first
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10)
 
 
@@ -140,7 +140,7 @@ def fit_rung(views: Sequence[View], name: str, start: Fit | None = None) -> Fit 
         (np.asarray(r, float).reshape(3), np.asarray(t, float).reshape(3)) for r, t in zip(turns, moves, strict=True)
     )
     residuals = tuple(_residual(view, numbers, pose) for view, pose in zip(views, poses, strict=True))
-    return Fit(name, numbers, np.where(np.arange(9) < _FREE[name], sd, 0.0), poses, residuals)
+    return Fit(name, numbers, np.where(np.arange(9) < FREE[name], sd, 0.0), poses, residuals)
 
 
 def matrix_and_bends(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

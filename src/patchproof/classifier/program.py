@@ -90,21 +90,24 @@ def _network(copy: io.BytesIO, path: Path, device: torch.device | str) -> Callab
         do = "export it again with this version of torch, or install the one it was exported with"
         raise Refused("a torch.export program", got, do) from error
     low, high = _batch_range(program)
-    return in_batches(module, low, high)
+    return InBatches(module, low, high)
 
 
-def in_batches(network: Callable[[Tensor], Tensor], low: int, high: int) -> Callable[[Tensor], Tensor]:
+class InBatches(torch.nn.Module):
     """`network` for any N, though itself it takes from `low` to `high` pictures; short batches repeat their last."""
 
-    def call(photos: Tensor) -> Tensor:
-        logits = []
-        for batch in photos.split(high):
-            missing = low - len(batch)
-            padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
-            logits.append(network(padded)[: len(batch)])
-        return torch.cat(logits)
+    def __init__(self, network: Callable[[Tensor], Tensor], low: int, high: int):
+        super().__init__()
+        self.network, self.low, self.high = network, low, high
 
-    return call
+    def forward(self, photos: Tensor) -> Tensor:
+        """N×3×S×S → N×K logits."""
+        logits = []
+        for batch in photos.split(self.high):
+            missing = self.low - len(batch)
+            padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
+            logits.append(self.network(padded)[: len(batch)])
+        return torch.cat(logits)
 
 
 def _batch_range(program: torch.export.ExportedProgram) -> tuple[int, int]:

@@ -47,46 +47,8 @@ class Unrolled:
     radius_mm: float | None
 
 
-def unroll(
-    srgb: np.ndarray,
-    corners_px: Mapping[int, np.ndarray],
-    corners_mm: Mapping[int, np.ndarray],
-    sheet_mm,
-    rect_mm,
-    focal_px: float | None = None,
-) -> Unrolled | None:
-    """The sheet (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
-
-    The uncertainty is that of the corners of `rect_mm`.
-    """
-    ids = sorted(corners_px.keys() & corners_mm.keys())
-    if len(ids) < LEAST_MARKERS:
-        return None
-    px = np.concatenate([np.asarray(corners_px[i], float) for i in ids])
-    mm = np.concatenate([np.asarray(corners_mm[i], float) for i in ids])
-    flat = fit_homography(mm, px)
-    plain = _rms(apply_homography(flat, mm) - px)
-    if not plain > FLAT_PX:
-        return None
-    size = srgb.shape[1], srgb.shape[0]
-    best = _best(flat, mm, px, size, focal_px)
-    if best.rms_px > PAYS * plain:
-        return None
-    # the borders were fitted as straight lines, which on strongly bent paper misses the corners where they meet
-    px = px - _chord_shift(best, mm)
-    best = _best(flat, mm, px, size, focal_px)
-    grid = _net(sheet_mm)
-    straight = fit_homography(grid, best.px(grid))
-    error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
-    picture = _straightened(srgb, best.px, straight, sheet_mm, margin_px=error)
-    residual_mm = np.linalg.norm(np.einsum("nij,nj->ni", _mm_from_px(best.px, mm), best.px(mm) - px), axis=1)
-    # the covariance of the homography alone says nothing about the bend: `uncertainty_mm` has it all
-    fit = PageFit(straight, np.zeros((8, 8)), best.rms_px * np.sqrt(2), _rms(residual_mm), tuple(ids))
-    return Unrolled(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best.radius_mm)
-
-
 @dataclass(frozen=True)
-class _Shape:
+class Shape:
     """A fitted model: `project(parameters, mm)`, the parameters with their covariance, what it leaves."""
 
     project: Project
@@ -100,13 +62,74 @@ class _Shape:
         return self.project(self.parameters, np.asarray(mm, float))
 
 
-def _best(flat, mm, px, size, focal_px) -> _Shape:
+@dataclass(frozen=True)
+class Explained:
+    """What a better explanation than a plane was found from, corners mended, and the explanation."""
+
+    flat: np.ndarray  # 3×3 homography of the corners as they were
+    mm: np.ndarray
+    px: np.ndarray
+    shape: Shape
+
+
+def explain(
+    corners_px: Mapping[int, np.ndarray],
+    corners_mm: Mapping[int, np.ndarray],
+    size_px: tuple[int, int],
+    focal_px: float | None = None,
+) -> Explained | None:
+    """A cylinder or a lens that explains the corners in a picture of this size; None where a plane does as well."""
+    ids = sorted(corners_px.keys() & corners_mm.keys())
+    if len(ids) < LEAST_MARKERS:
+        return None
+    px = np.concatenate([np.asarray(corners_px[i], float) for i in ids])
+    mm = np.concatenate([np.asarray(corners_mm[i], float) for i in ids])
+    flat = fit_homography(mm, px)
+    plain = _rms(apply_homography(flat, mm) - px)
+    if not plain > FLAT_PX:
+        return None
+    best = _best(flat, mm, px, size_px, focal_px)
+    if best.rms_px > PAYS * plain:
+        return None
+    # the borders were fitted as straight lines, which on strongly bent paper misses the corners where they meet
+    px = px - _chord_shift(best, mm)
+    return Explained(flat, mm, px, _best(flat, mm, px, size_px, focal_px))
+
+
+def unroll(
+    srgb: np.ndarray,
+    corners_px: Mapping[int, np.ndarray],
+    corners_mm: Mapping[int, np.ndarray],
+    sheet_mm,
+    rect_mm,
+    focal_px: float | None = None,
+) -> Unrolled | None:
+    """The sheet (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
+
+    The uncertainty is that of the corners of `rect_mm`.
+    """
+    found = explain(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px)
+    if found is None:
+        return None
+    flat, mm, px, best = found.flat, found.mm, found.px, found.shape
+    grid = _net(sheet_mm)
+    straight = fit_homography(grid, best.px(grid))
+    error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
+    picture = _straightened(srgb, best.px, straight, sheet_mm, margin_px=error)
+    residual_mm = np.linalg.norm(np.einsum("nij,nj->ni", _mm_from_px(best.px, mm), best.px(mm) - px), axis=1)
+    # the covariance of the homography alone says nothing about the bend: `uncertainty_mm` has it all
+    ids = tuple(sorted(corners_px.keys() & corners_mm.keys()))
+    fit = PageFit(straight, np.zeros((8, 8)), best.rms_px * np.sqrt(2), _rms(residual_mm), ids)
+    return Unrolled(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best.radius_mm)
+
+
+def _best(flat, mm, px, size, focal_px) -> Shape:
     """The explanation that leaves least."""
-    found = [_cylinder(flat, mm, px, size, focal_px), _lens(flat, mm, px, size)]
+    found = [rolled(flat, mm, px, size, focal_px), through_lens(flat, mm, px, size)]
     return min((one for one in found if one is not None), key=lambda one: one.rms_px)
 
 
-def _chord_shift(shape: _Shape, mm: np.ndarray) -> np.ndarray:
+def _chord_shift(shape: Shape, mm: np.ndarray) -> np.ndarray:
     """How far corners where straight lines along a marker's bent borders meet lie from the marker's own, N×2 px."""
     quads = mm.reshape(-1, 4, 2)
     corners = shape.px(mm).reshape(-1, 4, 2)
@@ -121,8 +144,8 @@ def _chord_shift(shape: _Shape, mm: np.ndarray) -> np.ndarray:
     return (meet(*ends) - corners).reshape(-1, 2)
 
 
-def _cylinder(flat, mm, px, size, focal_px) -> _Shape | None:
-    """The best of eight starts: four directions of the rulings, bulging and hollow."""
+def rolled(flat, mm, px, size, focal_px) -> Shape | None:
+    """Paper round a cylinder, the best of eight starts: four directions of the rulings, bulging and hollow."""
     center, reach = mm.mean(0), np.ptp(mm, axis=0).max() / 2
     middle = np.array(size) / 2
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
@@ -160,7 +183,7 @@ def _scales(start: np.ndarray) -> np.ndarray:
     return np.array([0.1, 0.1, 0.1, *[0.05 * max(abs(start[5]), 1.0)] * 3, 0.2, 0.2, 0.5])
 
 
-def _lens(flat, mm, px, size) -> _Shape:
+def through_lens(flat, mm, px, size) -> Shape:
     """A plane seen through a lens that bends about the picture's middle by one radial term."""
     middle, half = np.array(size) / 2, np.hypot(*size) / 2
 
@@ -174,15 +197,15 @@ def _lens(flat, mm, px, size) -> _Shape:
     return _shape(project, least_squares(rows, start, max_nfev=40, method="lm"), mm, px, None)
 
 
-def _shape(project: Project, fit, mm, px, radius_mm) -> _Shape:
+def _shape(project: Project, fit, mm, px, radius_mm) -> Shape:
     left = project(fit.x, mm) - px
     noise = max(CORNER_NOISE_PX, float(np.sqrt((left**2).sum() / (left.size - len(fit.x)))))
     scale = np.maximum(np.linalg.norm(fit.jac, axis=0), 1e-12)
     inverse = np.linalg.pinv(fit.jac / scale, rcond=1e-9)
-    return _Shape(project, fit.x, noise**2 * (inverse @ inverse.T) / np.outer(scale, scale), _rms(left), radius_mm)
+    return Shape(project, fit.x, noise**2 * (inverse @ inverse.T) / np.outer(scale, scale), _rms(left), radius_mm)
 
 
-def _uncertainty_mm(shape: _Shape, corners: np.ndarray) -> float:
+def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
     """95 % point of the largest corner error, from 1000 draws of the first-order spread."""
     here, rows = shape.px(corners), []
     spread = np.sqrt(np.maximum(np.diag(shape.covariance), 1e-30))
