@@ -14,13 +14,14 @@ from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.color import linear_from_srgb
 from patchproof.photo.pattern_light import pattern_light
+from patchproof.photo.quality import FrameLight
 from patchproof.report.plots import ledger_plot
 from patchproof.sheet.manifest import Manifest
 from patchproof.verify.ledger import _ledger, shapley
 from patchproof.verify.print_fit import fit_print
-from patchproof.verify.reproject import deblurred
+from patchproof.verify.reproject import Shot, deblurred, light_fit
 from patchproof.verify.run import gather_evidence
-from patchproof.verify.surface import piece_picture, promised_of, surface_of
+from patchproof.verify.surface import Promised, piece_picture, promised_of, surface_of
 from test_photo_synthetic import CONDITION, make_manifest, page_raster, photograph, save, view
 
 SIZE, PHOTOS = (640, 480), 5
@@ -74,6 +75,27 @@ def test_the_print_is_read_from_swatches_and_needs_eight_of_them():
     few = faded.copy()
     few[7:] = np.nan
     assert fit_print([few], corners, ink, ink) is None
+    gray = fit_print([np.maximum(faded, 0.1)], corners, np.full(3, 0.1), ink)  # black became lighter, too
+    assert gray(ink[None]) == pytest.approx(np.full((1, 3), 0.1), abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("darkest", "ink", "seen_ink"),
+    [
+        (0, 0.16, 0.2),  # nothing veils black things beside it: the ink itself is lighter
+        (120, 0.16, 0.02),  # it may be a veil, and is taken for one
+        (0, 0.0, 0.0),  # no veil takes light away
+    ],
+)
+def test_a_veil_is_no_lighter_than_the_darkest_place(darkest, ink, seen_ink):
+    square = np.full((40, 40, 3), 150, np.uint8)
+    square[:20] = darkest
+    light = FrameLight(np.full(3, 0.8), np.full(3, ink), 0.8 - ink, 0.0)
+    shot = Shot("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((0, 3)), 1.0)
+    promised = Promised(None, np.zeros((0, 3)), np.full(3, 0.02))
+    fit = light_fit(shot, promised)
+    assert fit.apply(light.paper) == pytest.approx(np.ones(3))
+    assert fit.apply(light.ink) == pytest.approx(np.full(3, seen_ink), abs=1e-6)
 
 
 @functools.cache

@@ -89,7 +89,7 @@ def calibrate_chart(
     ]
     if choice.width < WIDE:
         warnings.append(
-            f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in its "
+            f"the {choice.colors} readable swatches hardly spread over the color cube ({choice.width:.2f} in their "
             f"thinnest direction, whole charts 0.3): the errors stated are of colors like these, others are a guess"
         )
     provenance = {

@@ -31,7 +31,7 @@ Map = Callable[[Colors], Colors]
 FOLDS = 10
 LEAST_HELD_OUT = 6  # with fewer, a mean says nothing of a rung
 # Rms distance of the colors from their flattest plane; charts have 0.30 and more. With the chart's colors drawn towards
-# gray, held-out errors said 1.4 where others were off by 3 at 0.13, 4 at 0.06, 11 to 14 at 0.03, and 35 at 0.001.
+# gray, held-out errors said 1.0 to 1.5 where others were off by up to 3 at 0.13, 4 at 0.06, 14 at 0.03, 35 at 0.001.
 WIDE, FLAT = 0.15, 0.05
 SMOOTHING = 1e-3  # of splines: from 1e-4 to 1e-2 held-out errors differ by less than 0.05
 _LAB_SCALE = 60.0  # CIELAB units that count as much as the whole range of one sRGB channel

@@ -72,7 +72,7 @@ def _draw_ledger(axes, ledger: Mapping) -> None:
             axes.plot(ends, [row, row], color=_INK, linewidth=1.2)
     levels = [
         f"{100 * ideal:.0f} %",
-        *(f"{100 * change:+.1f}" for change in after - before),
+        *(f"{round(100 * change, 1) + 0:+.1f}" for change in after - before),
         f"{100 * after[-1]:.0f} %",
     ]
     for row, level in enumerate(levels):

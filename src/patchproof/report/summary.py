@@ -45,6 +45,9 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.prediction_interval is not None:
         k_low, k_high = summary.prediction_interval
         lines.append(f"promised: {k_low} to {k_high} of {summary.judged}")
+    if summary.culprit is not None:
+        share = summary.ledger[summary.culprit].share
+        lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
     codes: dict[str, int] = {}
     for photo in report.photos:
         if photo.code:

@@ -40,7 +40,7 @@ class LedgerSettings(Strict):
 
     runs: Annotated[tuple[str, ...], Field(min_length=1)]
     trials: Annotated[int, Field(ge=1, le=10_000)] = 60
-    photos: Annotated[int, Field(ge=5, le=100)] = 8
+    photos: Annotated[int, Field(ge=5, le=100)] = 12
     photo_px: tuple[int, int] | None = None
     seed: int = 0
 
