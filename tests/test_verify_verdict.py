@@ -6,9 +6,10 @@ import pytest
 
 from patchproof.claims import prediction_interval
 from patchproof.sheet.manifest import ConditionClaim
-from patchproof.verify.ranges import matched_rate, promised_ranges
+from patchproof.verify.ranges import matched_rate, promised_ranges, promised_side_px
 from patchproof.verify.results import PhotoEntry
 from patchproof.verify.verdict import compare, effect_of, judge
+from test_photo_synthetic import make_manifest
 
 
 def test_the_rule_at_both_sides_of_the_interval():
@@ -86,6 +87,14 @@ def test_ranges_have_a_tenth_of_margin_and_ignore_what_is_unknown():
     cannot = ranges.violated(entry(px_per_mm=0.7), True)
     assert (cannot.code, cannot.figure) == ("out_of_range", 0.7) and "come closer" in cannot.advice
     assert ranges.violated(entry(), True) is None
+
+
+def test_a_photograph_with_more_pixels_is_compared_at_the_promised_size():
+    ranges = promised_ranges(conditions([1.0, 3.0], [True, True]), side_px=1200)
+    assert ranges.violated(entry(px_per_mm=7.5, photo_px=(4000, 3000)), True) is None  # 3.0 at 1200 px
+    cannot = ranges.violated(entry(px_per_mm=9.0, photo_px=(3000, 4000)), True)
+    assert cannot.figure == pytest.approx(3.6) and "1200 px" in cannot.advice
+    assert promised_side_px(make_manifest()) is None
 
 
 def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():

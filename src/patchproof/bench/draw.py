@@ -56,6 +56,9 @@ def _draw(chart: Chart, axes) -> None:
     costs = [point.cost for series in chart.series for point in series.points]
     if max(costs) > 4 * min(costs):
         _plain_log(axes)
+    errors = [point.error for series in chart.series for point in series.points]
+    if 0 < 20 * min(errors) < max(errors) < np.inf:
+        axes.set_yscale("log")
     if chart.target is not None:
         axes.axhline(chart.target, color="0.5", lw=1, ls=":", label=f"target {chart.target:g}")
 

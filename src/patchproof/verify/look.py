@@ -25,7 +25,7 @@ from patchproof.verify.journal import Journal, file_sha256
 from patchproof.verify.ledger import usable
 from patchproof.verify.measure import measure
 from patchproof.verify.pictures import thumbnail
-from patchproof.verify.ranges import PromisedRanges, promised_ranges
+from patchproof.verify.ranges import PromisedRanges, promised_ranges, promised_side_px
 from patchproof.verify.reproject import Shot, shot_of
 from patchproof.verify.results import PhotoEntry, Prediction
 from patchproof.verify.surface import Promised, Surface, promised_of, surface_of
@@ -95,7 +95,8 @@ def set_task(manifest, models, printer, scan_dpi, camera, card) -> Task:
     ledger_px = None
     if manifest.promise and promised is not None:
         ledger_px = next(m.input_px for m in models if m.name == manifest.promise.models[0].name)
-    return Task(surface, promised, promised_ranges(conditions), sizes, scan_dpi, camera, card, ledger_px)
+    ranges = promised_ranges(conditions, promised_side_px(manifest))
+    return Task(surface, promised, ranges, sizes, scan_dpi, camera, card, ledger_px)
 
 
 def look_at_all(

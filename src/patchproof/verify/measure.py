@@ -76,7 +76,8 @@ def measure(
         found, surface = identify(photo.srgb, surface)
     except CannotJudge as cannot:
         return Measured(_coded(PhotoEntry(file=name, status="rejected"), cannot), False, {})
-    entry = PhotoEntry(file=name, status="judged", markers_found=len(found.markers))
+    size_px = photo.srgb.shape[1], photo.srgb.shape[0]
+    entry = PhotoEntry(file=name, status="judged", photo_px=size_px, markers_found=len(found.markers))
     fit = _fit(found, surface)
     if fit is None:
         few = CannotJudge(

@@ -1,7 +1,8 @@
 """What the promise covered, and which photographs lie outside of it or near to which of its conditions.
 
 In: the promise's conditions, as far as a photograph can show them. Out: `PromisedRanges` (smallest and largest with a
-margin of 10 %), and `matched_rate`, the promised rate at the conditions nearest to the photographs.
+margin of 10 %), and `matched_rate`, the promised rate at the conditions nearest to the photographs. A network sees
+every photograph at one size, so a photograph with more pixels than the promised ones is compared as if it had theirs.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
-from patchproof.sheet.manifest import ConditionClaim
+from patchproof.sheet.manifest import ConditionClaim, Manifest
 from patchproof.verify.results import PhotoEntry
 
 MARGIN = 0.10  # of the range's width
@@ -29,12 +30,17 @@ _ADVICE = {
 
 @dataclass(frozen=True)
 class PromisedRanges:
-    """Allowed (low, high) by figure, margins included; figures that no condition has are not limited."""
+    """Allowed (low, high) by figure, margins included; figures that no condition has are not limited.
+
+    Pixels are those of photographs whose shorter side has `side_px`, where that is known.
+    """
 
     limits: dict[str, tuple[float, float]]
+    side_px: float | None = None
 
     def violated(self, entry: PhotoEntry, trust_angles: bool) -> CannotJudge | None:
         """The first figure of the photo that the promise does not cover."""
+        entry = at_side(entry, self.side_px)
         for name, (low, high) in self.limits.items():
             value = getattr(entry, name)
             if value is None or (name != "px_per_mm" and not trust_angles):
@@ -45,12 +51,30 @@ class PromisedRanges:
                 continue
             below = value < low
             do = _ADVICE[name][0 if below else 1]
-            advice = f"{name} is {value:.3g}, the promise covers {low:.3g} to {high:.3g}: {do}"
+            unit = f" at {self.side_px:g} px of the shorter side" if name == "px_per_mm" and self.side_px else ""
+            advice = f"{name} is {value:.3g}{unit}, the promise covers {low:.3g} to {high:.3g}: {do}"
             return CannotJudge("out_of_range", value, low if below else high, advice)
         return None
 
 
-def promised_ranges(conditions: Sequence[ConditionClaim]) -> PromisedRanges:
+def promised_side_px(manifest: Manifest) -> float | None:
+    """Pixels of the shorter side of the photographs that were promised; None where the settings do not say."""
+    camera = manifest.settings.get("camera")
+    sides = camera.get("photo_px") if isinstance(camera, dict) else None
+    known = isinstance(sides, list | tuple) and sides and all(isinstance(v, int | float) and v >= 1 for v in sides)
+    return float(min(sides)) if known else None
+
+
+def at_side(entry: PhotoEntry, side_px: float | None) -> PhotoEntry:
+    """The entry with pixels per millimetre and blur as a photograph of that shorter side would show them."""
+    if side_px is None or entry.photo_px is None:
+        return entry
+    figures = {name: getattr(entry, name) for name in ("px_per_mm", "blur_px")}
+    scale = side_px / min(entry.photo_px)
+    return entry.model_copy(update={name: scale * value for name, value in figures.items() if value is not None})
+
+
+def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None = None) -> PromisedRanges:
     """The span of the promised conditions with its margin."""
     limits = {}
     for name in _ADVICE:
@@ -64,7 +88,7 @@ def promised_ranges(conditions: Sequence[ConditionClaim]) -> PromisedRanges:
         else:
             margin = max(margin, _LEAST_ANGLE_MARGIN_DEG)
             limits[name] = low - margin, high + margin
-    return PromisedRanges(limits)
+    return PromisedRanges(limits, side_px)
 
 
 def matched_rate(entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim]) -> float | None:

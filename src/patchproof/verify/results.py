@@ -42,6 +42,7 @@ class PhotoEntry(Strict):
     file: str
     status: Status
     sha256: str | None = None  # of the file's bytes
+    photo_px: tuple[int, int] | None = None  # width and height, upright
     code: str | None = None
     figure: Finite | None = None
     threshold: Finite | None = None

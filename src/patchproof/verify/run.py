@@ -24,7 +24,7 @@ from patchproof.verify.classify import check_primary, predict, target_indices
 from patchproof.verify.journal import Journal, settings_key
 from patchproof.verify.ledger import Ledger, ledger_of
 from patchproof.verify.look import Glanced, Task, glance_at_all, in_ledger, look_at_all, set_task, shot_again
-from patchproof.verify.ranges import matched_rate
+from patchproof.verify.ranges import at_side, matched_rate, promised_side_px
 from patchproof.verify.reproject import Shot
 from patchproof.verify.results import Control, Evidence, ModelRate, Prediction, Report, Summary
 from patchproof.verify.verdict import Verdict, compare, effect_of, judge
@@ -136,7 +136,9 @@ def _evidence(manifest, models, indices, entries, counts: Sequence[bool], glance
         without = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
         goal = promise.target.goal
         verdict = judge(sum(results.values()), len(results), promise.rate, promise.n, goal, without)
-        rate, matched = rates[primary], matched_rate((e for e in counted if e.status == "measured"), promise.conditions)
+        side_px = promised_side_px(manifest)
+        measured = (at_side(entry, side_px) for entry in counted if entry.status == "measured")
+        rate, matched = rates[primary], matched_rate(measured, promise.conditions)
         controls, effect = _compared(primary, results, glances, goal)
     summary = Summary(
         photos=len(entries),
