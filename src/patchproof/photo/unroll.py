@@ -30,7 +30,9 @@ PAYS = 0.5  # of the plane's residual
 LEAST_MARKERS = 4
 _TYPICAL_FOCAL = 0.7  # of the picture's diagonal, between a phone's 26 mm (0.6) and 35 mm (0.8)
 _FOCAL_SPREAD = {True: 0.1, False: 0.5}  # of its logarithm: by whether the file names a focal length
-_FIRST_BEND = 0.3  # radians over half the sheet, either way, from which the fit starts
+_FIRST_BEND = (0.02, 0.6)  # radians over half the sheet, least and most, from which fits start
+_ANY_BEND = [(bend, direction) for direction in np.radians([0, 45, 90, 135]) for bend in (-0.3, 0.3)]
+_LOST_PX = 1.0  # rms of a fit that ended in the wrong place, as 2 of 378 did, all of strong bends, before _ANY_BEND
 
 Project = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -145,7 +147,7 @@ def _chord_shift(shape: Shape, mm: np.ndarray) -> np.ndarray:
 
 
 def rolled(flat, mm, px, size, focal_px) -> Shape | None:
-    """Paper round a cylinder, the best of eight starts: four directions of the rulings, bulging and hollow."""
+    """Paper round a cylinder, the best of the fits from `_starts`."""
     center, reach = mm.mean(0), np.ptp(mm, axis=0).max() / 2
     middle = np.array(size) / 2
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
@@ -167,15 +169,51 @@ def rolled(flat, mm, px, size, focal_px) -> Shape | None:
     prior = CORNER_NOISE_PX / _FOCAL_SPREAD[focal_px is not None]
     rows = lambda p: np.append((project(p, mm) - px).ravel(), prior * p[6])  # noqa: E731
     fits = []
-    for direction in np.radians([0, 45, 90, 135]):
-        for bend in (-_FIRST_BEND, _FIRST_BEND):
+    for starts in (_starts(flat, mm, px, matrix @ pose[:3], center, reach), _ANY_BEND):
+        for bend, direction in starts:
             start = np.array([*begin, bend, direction])
             fits.append(least_squares(rows, start, x_scale=_scales(start), max_nfev=40, method="lm"))
-    best = min(fits, key=lambda fit: fit.cost)
+        best = min(fits, key=lambda fit: fit.cost)
+        if _rms(best.fun) < _LOST_PX:
+            break
     bend = best.x[7]
     if abs(bend) < 1e-6 or abs(bend) > np.pi / 2:
         return None
     return _shape(project, best, mm, px, reach / bend)
+
+
+def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
+    """Bends, in radians over half the sheet, and their directions, from which to fit.
+
+    A little bent, paper lies off its plane by a quadratic form of where one is on it, which moves pixels in proportion:
+    form and homography come from one linear fit. Of a cylinder's form one eigenvalue is 0; what noise makes of that is
+    tried too, and so is the first one's other sign, which a distant camera hardly tells apart.
+    """
+    at = mm - center
+    base = np.column_stack([at, np.zeros(len(at))])
+    moved = [_projected(camera, base + off) for off in (reach * 0.01 * np.eye(3)[2], -reach * 0.01 * np.eye(3)[2])]
+    by_depth = (moved[0] - moved[1]) / (0.02 * reach)
+    x, y = at.T / reach
+    form = [by_depth * (term * reach)[:, None] for term in (x * x, x * y, y * y)]
+    seen = apply_homography(flat, mm)
+    left = px - seen
+    u, v = ((seen - seen.mean(0)) / np.ptp(seen, axis=0).max()).T
+    ones, no = np.ones_like(u), np.zeros_like(u)
+    plane = [ones, u, v, no, no, no, u * u, u * v], [no, no, no, ones, u, v, u * v, v * v]  # near homographies
+    columns = [np.column_stack([np.array(plane[i]).T, *[f[:, i] for f in form]]) for i in (0, 1)]
+    xx, xy, yy = np.linalg.lstsq(np.concatenate(columns), left.T.ravel(), rcond=1e-6)[0][8:]
+    values, vectors = np.linalg.eigh([[xx, xy / 2], [xy / 2, yy]])
+    order = np.argsort(-np.abs(values))
+    found = []
+    for i, sign in ((order[0], 1), (order[0], -1), (order[1], 1)):
+        bend = sign * np.copysign(np.clip(abs(2 * values[i]), *_FIRST_BEND), values[i])
+        found.append((float(bend), float(np.arctan2(vectors[1, i], vectors[0, i]))))
+    return found
+
+
+def _projected(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    seen = points @ camera[:, :3].T + camera[:, 3]
+    return seen[:, :2] / seen[:, 2:]
 
 
 def _scales(start: np.ndarray) -> np.ndarray:

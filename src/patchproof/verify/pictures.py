@@ -17,7 +17,8 @@ def thumbnail(srgb: np.ndarray, entry: PhotoEntry, surface: Surface) -> np.ndarr
     """The photograph reduced, with the outline of the design and of the piece's markers where they were found."""
     shrink = min(1.0, THUMBNAIL_PX / max(srgb.shape[:2]))
     size = max(1, round(srgb.shape[1] * shrink)), max(1, round(srgb.shape[0] * shrink))
-    small = cv2.resize(srgb, size, interpolation=cv2.INTER_AREA)
+    sparse = max(1, int(0.5 / shrink))  # all of 12 megapixels took a tenth of the whole measurement's time
+    small = cv2.resize(srgb[::sparse, ::sparse], size, interpolation=cv2.INTER_AREA)
     if entry.homography_px_from_mm is None:
         return small
     small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.array(entry.homography_px_from_mm)
