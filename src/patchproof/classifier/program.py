@@ -100,6 +100,10 @@ class InBatches(torch.nn.Module):
         super().__init__()
         self.network, self.low, self.high = network, low, high
 
+    def train(self, mode: bool = True) -> InBatches:
+        """Nothing to switch: a program stays as it was exported, and torch's own refuses `eval()`, too."""
+        return self
+
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×K logits."""
         logits = []
