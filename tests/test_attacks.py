@@ -11,7 +11,7 @@ import torch
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.load import load_classifier
 from patchproof.optimize import attacks
-from patchproof.optimize.attacks import cross_entropy, fgsm, margin, pgd, right, steering, survives_fgsm, survives_pgd
+from patchproof.optimize.attacks import cross_entropy, even_loss, fgsm, margin, pgd, right, survives_fgsm, survives_pgd
 from patchproof.optimize.harden import squares
 from patchproof.photo.read import read_photo
 
@@ -99,7 +99,7 @@ def test_steering_has_the_direction_of_the_mean_loss():
     generator = torch.Generator().manual_seed(0)
     logits = [torch.randn(5, 4, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2)]
     labels = [torch.tensor([0, 1, 2, 3, 0]), torch.tensor([3, 2, 1, 0, 0])]
-    steered = torch.cat(torch.autograd.grad(steering(logits, labels, cross_entropy), logits), 1)
+    steered = torch.cat(torch.autograd.grad(even_loss(logits, labels, cross_entropy), logits), 1)
     mean = sum(cross_entropy(one, truth).sum() for one, truth in zip(logits, labels, strict=True)) / 2
     plain = torch.cat(torch.autograd.grad(mean, logits), 1)
     assert torch.allclose(steered, plain / plain.abs().amax(1, keepdim=True))

@@ -11,8 +11,9 @@ import torch
 from PIL import Image
 
 from patchproof.bench import chart as charts
-from patchproof.bench import measure, render, run, speed
+from patchproof.bench import measure, render, run, speed, texture
 from patchproof.bench.chart import Chart, Check, Growth, Point, Series, Shares
+from patchproof.bench.world import set_world
 from patchproof.optimize import loop
 
 LOOKED_AT = (45, 60)  # px wide, degrees
@@ -33,7 +34,7 @@ def quiet(stage, done, total):
 
 @pytest.fixture(scope="module")
 def world():
-    return render.set_world(1, quiet)
+    return set_world(1, quiet)
 
 
 def test_a_point_that_another_beats_is_not_on_the_front():
@@ -105,21 +106,21 @@ def test_an_unknown_benchmark_is_refused_with_the_nearest(tmp_path):
 
 
 def test_one_tap_is_further_off_than_the_default(world):
-    look = render.look(world.problem.scene.piece, world.shown("noise"), *LOOKED_AT)
-    noise = render.texels(world.shown("noise"))
-    few, default = (measure.psnr(noise.seen(look, n).detach(), look.truth) for n in (1, render.DESIGN_TAPS))
-    assert default > render.LEAST_PSNR > few + 5
+    look = texture.look(world.problem.scene.piece, world.shown("noise"), *LOOKED_AT)
+    noise = texture.texels(world.shown("noise"))
+    few, default = (measure.psnr(noise.seen(look, n).detach(), look.truth) for n in (1, texture.DESIGN_TAPS))
+    assert default > texture.LEAST_PSNR > few + 5
 
 
 def test_the_reference_is_the_mean_of_what_a_pixel_sees(world):
     """A slow twin for one pixel: 256 samples one by one."""
     piece, picture = world.problem.scene.piece, world.shown("noise")
-    pose = render._pose(piece, *LOOKED_AT)
-    side = render.PICTURE_PX
+    pose = texture._pose(piece, *LOOKED_AT)
+    side = texture.PICTURE_PX
     matrix = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
     homography = matrix @ pose[:3, [0, 1, 3]]
     x, y = side // 2 + 5, side // 2 - 4
-    mean, inside = render.reference(homography, piece, picture, torch.tensor([y * side + x, 0]))
+    mean, inside = texture.reference(homography, piece, picture, torch.tensor([y * side + x, 0]))
     total = np.zeros(3)
     x0, y0, x1, y1 = picture.box_px
     for i in range(16):

@@ -12,7 +12,7 @@ import torch
 from patchproof.bench import evidence, measure, numbers, sheets, train
 from patchproof.bench.chart import Chart, Point, Series, with_default_checks, with_front
 from patchproof.bench.detect import PIECE_MM, corners_mm
-from patchproof.bench.render import demo_problem, with_settings
+from patchproof.bench.world import demo_problem, with_settings
 from patchproof.optimize import loop
 from patchproof.settings import OptimizeSettings
 from patchproof.verify.verdict import judge

@@ -12,7 +12,8 @@ import card_photo
 from patchproof.channel import lens
 from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, intrinsics, look_at, normalized, plane_homography
-from patchproof.photo.card import CARD_MM, LEAST_PX_PER_MM, NoCard, _sizes, card_scale
+from patchproof.photo.card import _sizes, card_scale
+from patchproof.photo.card_lines import CARD_MM, LEAST_PX_PER_MM, NoCard
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import find_markers
 from patchproof.photo.quality import blur_px, frame_light

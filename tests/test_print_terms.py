@@ -26,12 +26,12 @@ from patchproof.optimize.problem import set_problem
 from patchproof.render.photograph import expose, photograph, shade
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
-from patchproof.scene.scene import build_scene
-from patchproof.settings import Refused, SceneSettings, validated
+from patchproof.settings import Refused
 from patchproof.study.gamut import UNPRINTED, WAYS, Outcomes, gamut_cell, gamut_rows, other_printers, way_problem
 from patchproof.study.plan_terms import Setup, scene_terms
 from patchproof.study.reprint import scaled_print
 from patchproof.study.study import run_study
+from test_plan import scene_with
 from test_views import WHITE, area, box_scene, outline, piece_of, posed
 
 
@@ -81,27 +81,11 @@ def test_where_what_is_shown_is_out_of_gamut_too_a_mix_with_gray_is_taken():
     torch.testing.assert_close(identity_printer().into_gamut(sent), sent, rtol=0, atol=0)
 
 
-def scene_with(folder, **changes):
-    """A carton before "red against blue"; keys are table__name."""
-    data = {
-        "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
-        "patch": {"side": "+z", "width_mm": 90, "height_mm": 90},
-        "target": {"label": "red", "models": ["module:fake_networks.red_against_blue"]},
-        "view": {"azimuth_deg": [-30, 30], "elevation_deg": [0, 20], "distance_mm": [500, 600]},
-        "camera": {"photo_px": [400, 300], "blur_px": [0, 0], "noise": [0, 0]},
-        "optimize": {"steps": 6, "views": 2},
-    }
-    for key, value in changes.items():
-        table, name = key.split("__")
-        data.setdefault(table, {})[name] = value
-    return build_scene(validated(SceneSettings, data, "test"), folder)
-
-
 def test_every_step_of_an_optimization_in_gamut_is_in_gamut(tmp_path):
     worst = {}
     for in_gamut in (False, True):
         given = {"optimize__in_gamut": in_gamut, "optimize__gamut": 0.0}
-        problem = set_problem(scene_with(tmp_path, printer__profile="uncoated", **given))
+        problem = set_problem(scene_with(tmp_path, optimize__steps=6, printer__profile="uncoated", **given))
         designs = torch.stack([step.state.design for step in steps(problem)])
         worst[in_gamut] = float(problem.printer.gamut_distance(designs).max())
     assert worst[True] <= IN_GAMUT + 1e-4 < 8 < worst[False]
@@ -110,7 +94,7 @@ def test_every_step_of_an_optimization_in_gamut_is_in_gamut(tmp_path):
 @pytest.mark.parametrize(("miss", "refused"), [(2.9, False), (3.2, True)])
 def test_a_printer_that_misses_even_gray_is_refused(tmp_path, miss, refused):
     save_printer(ball_printer(miss, slope=0), tmp_path)
-    scene = scene_with(tmp_path, optimize__in_gamut=True, printer__profile="ball.npz")
+    scene = scene_with(tmp_path, optimize__steps=6, optimize__in_gamut=True, printer__profile="ball.npz")
     if not refused:
         set_problem(scene)
         return
@@ -154,7 +138,7 @@ def test_printable_colors_are_colors_of_the_printer_and_the_same_each_time():
 def test_nps_pulls_a_design_towards_printable_colors(tmp_path):
     scores = []
     for weight in (0.0, 100.0):
-        problem = set_problem(scene_with(tmp_path, optimize__nps=weight, optimize__gamut=0.0))
+        problem = set_problem(scene_with(tmp_path, optimize__steps=6, optimize__nps=weight, optimize__gamut=0.0))
         *_, last = steps(problem)
         scores.append(float(non_printability(last.state.design, printable_colors(problem.printer))))
     assert scores[1] < scores[0] / 10

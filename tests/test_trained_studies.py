@@ -17,8 +17,8 @@ from patchproof.report.tables import Estimate, mean
 from patchproof.scene.scene import load_scene
 from patchproof.settings import Refused, validated
 from patchproof.study import deceive, transfer
-from patchproof.study.study import Cell, Result, run_study
-from patchproof.study.trained import Told, TrainedSettings, cell_of, networks_of, scenes_of, short_name, verdict
+from patchproof.study.study import Cell, Result, run_study, short_name
+from patchproof.study.trained import Told, TrainedSettings, cell_of, networks_of, scenes_of, verdict
 from patchproof.study.turntable import attributions, from_sides, goal_log, mean_color, three_views
 from test_textures_optimized import scene_file
 

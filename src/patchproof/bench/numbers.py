@@ -21,7 +21,7 @@ from torch import Tensor
 
 from patchproof.bench.chart import Chart, OnStage, Point, Series, Table
 from patchproof.bench.measure import mean_interval, ratio, timed
-from patchproof.bench.render import demo_problem
+from patchproof.bench.world import demo_problem
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.view import center_square

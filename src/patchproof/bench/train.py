@@ -21,7 +21,7 @@ from torch import Tensor
 
 from patchproof.bench.chart import Chart, Interval, OnStage, Point, Series, Table
 from patchproof.bench.measure import mean_interval, median_interval, paired_means, timed
-from patchproof.bench.render import demo_problem, set_world, with_settings
+from patchproof.bench.world import demo_problem, set_world, with_settings
 from patchproof.claims import CONFIDENCE
 from patchproof.optimize.goals import target_loss
 from patchproof.optimize.loop import SELECT_EVERY, SELECT_VIEWS, State, start, steps

@@ -90,7 +90,7 @@ def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: flo
 ATTACKS = {"fgsm": survives_fgsm, "pgd": survives_pgd}
 
 
-def steering(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) -> Tensor:
+def even_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) -> Tensor:
     """A number with the gradient of the networks' mean loss, scaled per picture so that none of it is lost.
 
     `logits[m]` and `labels[m]` are network m's. The gradient with respect to a picture's logits has 1 as its largest
@@ -108,7 +108,7 @@ def steering(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) -> 
 def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: Loss) -> Tensor:
     pictures = pictures.detach().requires_grad_(True)
     with torch.enable_grad():
-        return torch.autograd.grad(steering([network(pictures)], [labels], loss), pictures)[0]
+        return torch.autograd.grad(even_loss([network(pictures)], [labels], loss), pictures)[0]
 
 
 def _right(network: Logits, pictures: Tensor, labels: Tensor) -> Tensor:

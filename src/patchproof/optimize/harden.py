@@ -9,7 +9,7 @@ of the square stays as it is. The loss of several networks is their mean.
     fgsm   the same with α = ε/steps: iterated FGSM, which ends where FGSM would if the gradient stayed
     adam   Adam on the pixels at rate ε/4, then Π
 
-Gradients are scaled per photograph (attacks.steering), so that steps go on where a float32 softmax is saturated. Π
+Gradients are scaled per photograph (attacks.even_loss), so that steps go on where a float32 softmax is saturated. Π
 keeps the ε-ball (none where it is unbounded) and [0, 1].
 
 Sources: Pestana et al., Physical world assistive signals for deep neural network classifiers, algorithm 1; Kurakin et
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.view import center_square
-from patchproof.optimize.attacks import Loss, cross_entropy, steering
+from patchproof.optimize.attacks import Loss, cross_entropy, even_loss
 
 Method = Literal["pgd", "fgsm", "adam"]
 # Without ε. On ten photographs and a MobileNetV1 0.25, 50 to 100 steps, PGD of 0.01 (20 steps) left of them: with sign
@@ -55,7 +55,7 @@ def harden(
     step = step_size or _step(method, epsilon, steps)
     adam = torch.optim.Adam(pixels, lr=step) if method == "adam" else None
     for _ in range(steps):
-        gradients = torch.autograd.grad(_steering(pixels, truth, classifiers, loss), pixels)
+        gradients = torch.autograd.grad(_evened_loss(pixels, truth, classifiers, loss), pixels)
         with torch.no_grad():
             for one, gradient in zip(pixels, gradients, strict=True):
                 if adam is None:
@@ -84,11 +84,11 @@ def moved(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
     return float((a - b).double().square().mean().sqrt()), sum(similar) / 3
 
 
-def _steering(
+def _evened_loss(
     pixels: Sequence[Tensor], truth: Sequence[Tensor], classifiers: Sequence[Classifier], loss: Loss
 ) -> Tensor:
     seen = [torch.cat([center_square(one, classifier.input_px) for one in pixels]) for classifier in classifiers]
-    return steering([c.network(squares) for c, squares in zip(classifiers, seen, strict=True)], truth, loss)
+    return even_loss([c.network(squares) for c, squares in zip(classifiers, seen, strict=True)], truth, loss)
 
 
 def _step(method: Method, epsilon: float | None, steps: int) -> float:

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from patchproof.optimize.promise import judged, shown_with_controls
 from patchproof.report.tables import Drawing, Table
-from patchproof.study.study import Cell, Result, Study
+from patchproof.study.study import Cell, Result, Study, short_name
 from patchproof.study.trained import (
     Told,
     TrainedSettings,
@@ -35,7 +35,6 @@ from patchproof.study.trained import (
     problem_of,
     said,
     scenes_of,
-    short_name,
     tested_in,
     train,
     trained_on,

@@ -30,17 +30,13 @@ from patchproof.optimize.attacks import ATTACKS, right
 from patchproof.optimize.harden import Method, harden, moved, squares
 from patchproof.output import write_whole
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.read import read_photo
 from patchproof.report.tables import Drawing, Table, difference, rate
-from patchproof.scene.image_scene import label_rows
 from patchproof.settings import Positive, Refused, Share, Strict, expand
-from patchproof.study.study import Cell, Finished, Result, Study, carry_out
+from patchproof.study.labeled import in_blocks, labeled_files, read_large_enough
+from patchproof.study.study import Cell, Finished, Result, Study, carry_out, short_name
 
 Attack = Literal["fgsm", "pgd"]
-BLOCK_PHOTOS, BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
-SMALLEST_PX = 8  # of a photograph's shorter side
 CLEAN = "clean"
-_HEADS = {"file", "filename", "file_name", "image", "name"}
 
 
 def _epsilon(value: Any) -> float | None:
@@ -109,13 +105,13 @@ def harden_images(
 def cells(settings: HardenSettings, base: Path) -> list[Cell]:
     """Originals by network, and every variant, in blocks of photographs; networks and labels are checked here."""
     folder = Path(expand(settings.images, base))
-    rows = _labeled(folder, Path(expand(settings.labels, base)))
+    rows = labeled_files(folder, Path(expand(settings.labels, base)))
     indices = {}
     for name in dict.fromkeys((*settings.models, *settings.judges)):
         labels = _classifier(name, base).labels
         indices[name] = {label: find_labels(labels, _number(label))[0] for _, _, label in rows}
     variants, work = _variants(settings), []
-    for number, block in enumerate(_blocks(folder, rows)):
+    for number, block in enumerate(in_blocks(folder, rows)):
         photos = [{"file": file, "png": png, "label": label} for file, png, label in block]
         for at, name in enumerate(indices):
             values = {"photos": photos, "judges": [name], "indices": {name: _of(indices[name], photos)}}
@@ -139,7 +135,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     said, originals, unread = [], [], []
     for at, photo in enumerate(values["photos"]):
         try:
-            originals.append(_read(folder / photo["file"]))
+            originals.append(read_large_enough(folder / photo["file"]))
             said.append(photo | {"at": at})
         except CannotJudge as cannot:
             unread.append({"file": photo["file"], "reason": cannot.advice})
@@ -231,7 +227,7 @@ def _variants(settings: HardenSettings) -> list[dict[str, Any]]:
 
 
 def _words(variant: Mapping[str, Any]) -> tuple[str, str, str]:
-    return ", ".join(map(_short, variant["models"])), variant["method"], _epsilon_words(variant["epsilon"])
+    return ", ".join(map(short_name, variant["models"])), variant["method"], _epsilon_words(variant["epsilon"])
 
 
 def _named(at: int, variant: Mapping[str, Any]) -> str:
@@ -246,47 +242,6 @@ def _epsilon_words(epsilon: float | None) -> str:
     return f"{codes:.0f}/255" if abs(codes - round(codes)) < 1e-6 else f"{epsilon:g}"
 
 
-def _short(name: str) -> str:
-    """A model's name as people call it: without folders."""
-    return name.rpartition("/")[2].removesuffix(".pt2")
-
-
-def _labeled(folder: Path, table: Path) -> list[tuple[str, str, str]]:
-    """(file, its PNG's name, label) of every line; two files of one stem keep their suffixes in the PNG's name."""
-    rows = label_rows(table)
-    if rows and rows[0][0].casefold() in _HEADS and not (folder / rows[0][0]).is_file():
-        rows = rows[1:]
-    missing = [file for file, _ in rows if not (folder / file).is_file()]
-    if missing or not rows:
-        got = f"{len(missing)} missing ({missing[0]})" if missing else "none"
-        raise Refused(f"the images that {table.name} names in {folder}", got, "copy them there, or mend the table")
-    twice = next((file for file in (f for f, _ in rows) if [f for f, _ in rows].count(file) > 1), None)
-    if twice:
-        raise Refused(f"each file once in {table}", f"{twice} twice", "remove a line")
-    stems = [Path(file).with_suffix("").as_posix() for file, _ in rows]
-    return [
-        (file, (stem if stems.count(stem) == 1 else file) + ".png", label)
-        for (file, label), stem in zip(rows, stems, strict=True)
-    ]
-
-
-def _blocks(folder: Path, rows) -> Iterator[list]:
-    """Rows in their order, in blocks that fit into memory; sizes from the files' heads."""
-    block, pixels = [], 0
-    for row in rows:
-        try:
-            with Image.open(folder / row[0]) as image:
-                size = image.width * image.height
-        except Exception:  # what is no image is reported when it is read
-            size = 0
-        if block and (len(block) == BLOCK_PHOTOS or pixels + size > BLOCK_PX):
-            yield block
-            block, pixels = [], 0
-        block.append(row)
-        pixels += size
-    yield block
-
-
 def _of(indices: Mapping[str, int], photos) -> list[int]:
     return [indices[photo["label"]] for photo in photos]
 
@@ -298,14 +253,6 @@ def _number(label: str) -> str | int:
 @lru_cache(maxsize=4)  # a process works through one study: its networks stay loaded
 def _classifier(name: str, base: Path) -> Classifier:
     return load_classifier(name, base)
-
-
-def _read(path: Path) -> np.ndarray:
-    srgb = read_photo(path).srgb
-    if min(srgb.shape[:2]) < SMALLEST_PX:
-        shape = "×".join(map(str, srgb.shape[1::-1]))
-        raise CannotJudge("too_small", min(srgb.shape[:2]), SMALLEST_PX, f"{shape} px are too few: use a larger one")
-    return srgb
 
 
 def _hardened(settings, base: Path, values, said, originals) -> tuple[list[np.ndarray], dict[str, bytes]]:
@@ -369,7 +316,7 @@ def _accuracy_rows(settings, results, variant, photos, name: str) -> list[tuple]
         words = CLEAN if condition[0] == CLEAN else _condition(*condition)
         row = (words, rate(old), rate(new), difference(new, old), ", ".join(flagged))
         group, *how = _words(variant)
-        rows.append((_short(name), "itself" if variant["models"] == [name] else group, *how, *row))
+        rows.append((short_name(name), "itself" if variant["models"] == [name] else group, *how, *row))
     return rows if files else []
 
 
@@ -396,6 +343,6 @@ def _draw_panel(axes, settings, results, name: str, attack: str) -> None:
             y = [float(np.mean([one[key] for one in outcomes])) for key in keys]
             axes.plot(x, y, "--o" if variant is None else "-o", color="0.4" if variant is None else None, label=label)
     axes.set_ylim(-0.05, 1.05)
-    axes.set_title(f"{_short(name)}, {attack}", fontsize=9)
+    axes.set_title(f"{short_name(name)}, {attack}", fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)

@@ -23,7 +23,7 @@ from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.promise import judged
 from patchproof.report.tables import Drawing, Table
 from patchproof.settings import SceneSettings, validated
-from patchproof.study.study import Cell, Result, Study
+from patchproof.study.study import Cell, Result, Study, short_name
 from patchproof.study.trained import (
     Told,
     TrainedSettings,
@@ -36,7 +36,6 @@ from patchproof.study.trained import (
     problem_of,
     said,
     scenes_of,
-    short_name,
     tested_in,
     train,
     trained_on,

@@ -9,7 +9,6 @@ so that cells differ in pose and light alone.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, Conditions
 from patchproof.scene.scene import build_scene
 from patchproof.settings import Refused, SceneSettings, Strict, expand, read_toml, validated
-from patchproof.study.study import Cell
+from patchproof.study.study import Cell, short_name
 
 PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
 LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
@@ -79,12 +78,6 @@ class Said:
 
     recognized: np.ndarray
     confidence: np.ndarray
-
-
-def short_name(name: str) -> str:
-    """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
-    word = name.rpartition(":")[2]
-    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
 
 
 def scene_cells(settings: ScenesSettings, base: Path) -> list[Cell]:

@@ -106,6 +106,12 @@ def load_study(name: str) -> Study:
     return import_module(STUDIES[name]).STUDY
 
 
+def short_name(name: str) -> str:
+    """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
+    word = name.rpartition(":")[2]
+    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
+
+
 def run_study(
     name: str,
     config: str | Path,

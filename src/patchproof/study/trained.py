@@ -30,7 +30,7 @@ from patchproof.report.tables import Estimate, difference, mean, rate
 from patchproof.scene.export import write_glb
 from patchproof.scene.scene import build_scene
 from patchproof.settings import Refused, SceneSettings, Strict, expand, read_toml, validated
-from patchproof.study.study import Cell, Result
+from patchproof.study.study import Cell, Result, short_name
 
 Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
 Word = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
@@ -48,13 +48,6 @@ class TrainedSettings(Strict):
     ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)
     seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)
     n: Annotated[int, Field(ge=2)] = 400
-
-
-def short_name(network: str) -> str:
-    """A network's name as tables and files say it: a file's stem, a registry's entry."""
-    kind, _, rest = network.partition(":")
-    word = Path(rest).stem if kind == "file" else rest or kind
-    return re.sub(r"[^\w.+-]", "-", word)[-40:]
 
 
 def networks_of(settings: TrainedSettings, base: Path) -> tuple[str, ...]:

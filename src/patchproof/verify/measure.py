@@ -15,7 +15,8 @@ import numpy as np
 
 from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.card import NoCard, card_scale
+from patchproof.photo.card import card_scale
+from patchproof.photo.card_lines import NoCard
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import Found, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page

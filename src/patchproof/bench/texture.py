@@ -1,0 +1,173 @@
+"""How many taps a pixel's footprint needs: the design in views against 16 × 16 samples in each of their pixels.
+
+In: the piece as it is printed, at widths and tilts. Out: one chart, time against signal-to-noise ratio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from patchproof import geometry
+from patchproof.bench.chart import Chart, Check, OnStage, Point, Series, Table
+from patchproof.bench.measure import psnr, ratio, timed
+from patchproof.bench.world import World
+from patchproof.render.fragments import Cameras
+from patchproof.render.pixels import DESIGN_TAPS, PiecePicture
+from patchproof.render.raster import rasterize
+from patchproof.render.texture import Layout, footprint, layout, look_up, texel_table
+from patchproof.sheet.piece import Piece
+
+TAPS = tuple(sorted({1, 2, 4, 6, 8, 12, DESIGN_TAPS}))
+WIDTHS_PX, QUICK_WIDTHS_PX, TILTS_DEG = (20, 45, 70, 110, 200), (20, 70, 200), (0, 60)
+PICTURE_PX = 224
+SUBSAMPLES = 16  # along each side of a pixel, in the references
+LEAST_PSNR = 38.0  # dB over the design's own pixels
+
+
+@dataclass(frozen=True)
+class Look:
+    """A view of a piece: the uv (and its change per pixel) of P pixels that lie within the design, and the mean P×3 of
+    16×16 samples in each.
+    """
+
+    uv: tuple[Tensor, Tensor, Tensor]
+    truth: Tensor
+
+
+@dataclass(frozen=True)
+class Texels:
+    """A piece's picture as the renderer looks it up."""
+
+    where: Layout
+    table: Tensor
+
+    def seen(self, look: Look, taps: int) -> Tensor:
+        """The P×3 that a view's pixels see."""
+        first = torch.zeros(len(look.truth), dtype=torch.long)
+        return look_up(footprint(self.where, first, *look.uv, taps, blocks=True), self.table)
+
+
+def texels(picture: PiecePicture) -> Texels:
+    """The mip levels of a picture of the piece, which gradients reach."""
+    height, width, _ = picture.srgb.shape
+    table = texel_table([picture.srgb.detach()], wrap=False).requires_grad_()
+    return Texels(layout([(width, height)], wrap=False), table)
+
+
+def texture_chart(world: World, widths_px: Sequence[int], rounds: int, on_stage: OnStage) -> Chart:
+    """Taps along a footprint's shorter side against the error to 16×16 samples per pixel."""
+    kinds = {"optimized design": world.shown(tiled=3), "noise control": world.shown("noise")}
+    views = [(width, tilt) for width in widths_px for tilt in TILTS_DEG]
+    quality, seconds = {}, {}
+    for kind, picture in kinds.items():
+        looks, content = [], texels(picture)
+        for view in views:
+            looks.append(look(world.problem.scene.piece, picture, *view))
+            on_stage("texture", len(quality) // len(TAPS) * len(views) + len(looks), len(kinds) * len(views))
+        for taps in TAPS:
+            with torch.no_grad():
+                quality[kind, taps] = np.array([psnr(content.seen(one, taps), one.truth) for one in looks])
+
+        def work(taps: int, looks=looks, content=content) -> None:
+            for one in looks:
+                torch.autograd.grad(content.seen(one, taps).sum(), content.table)
+
+        seconds[kind] = timed({taps: lambda taps=taps, work=work: work(taps) for taps in TAPS}, rounds)
+    rows = tuple((f"{kind}, {taps}", *(f"{q:.1f}" for q in values)) for (kind, taps), values in quality.items())
+    milliseconds = 1e3 * np.median(seconds["optimized design"][DESIGN_TAPS]) / len(views)
+    return Chart(
+        "texture",
+        "Texture: taps along the shorter side of a pixel's footprint",
+        "footprint + look-up + backward, relative to the default",
+        f"PSNR of the design's pixels, dB (median and range of {len(views)} views)",
+        tuple(
+            Series(kind, tuple(_over_views(taps, seconds[kind], quality[kind, taps]) for taps in TAPS))
+            for kind in kinds
+        ),
+        (
+            "truth: 16 × 16 samples per pixel of printed blocks, averaged as code values; pixels wholly on the design",
+            "design: the optimized one three by three, as fine as one for a classifier with three times the pixels",
+            f"the default takes {milliseconds:.2f} ms per view",
+        ),
+        tuple(
+            Check(
+                f"worst PSNR of the {kind} at the default, dB",
+                float(quality[kind, DESIGN_TAPS].min()),
+                LEAST_PSNR,
+                at_least=True,
+            )
+            for kind in kinds
+        ),
+        (Table(("PSNR in dB, by taps", *(f"{width} px {tilt}°" for width, tilt in views)), rows),),
+        higher_is_better=True,
+        target=LEAST_PSNR,
+    )
+
+
+def _over_views(taps: int, seconds: dict, quality: np.ndarray) -> Point:
+    cost, interval = ratio(seconds, taps, DESIGN_TAPS)
+    spread = (float(quality.min()), float(quality.max()))
+    return Point(f"{taps}", cost, float(np.median(quality)), interval, spread, taps == DESIGN_TAPS)
+
+
+def look(piece: Piece, picture: PiecePicture, width_px: float, tilt_deg: float) -> Look:
+    """A piece whose design is seen `width_px` wide in the middle of a picture."""
+    pose, matrix = _pose(piece, width_px, tilt_deg), np.diag([PICTURE_PX, PICTURE_PX, 1.0])
+    matrix[:2, 2] = PICTURE_PX / 2
+    plane = np.pad(geometry.rect_corners([0, 0, *piece.size_mm]), ((0, 0), (0, 1)))
+    faces = torch.tensor([[0, 3, 2], [0, 2, 1]])
+    cameras = Cameras(torch.tensor(pose)[None], torch.tensor(matrix)[None], (PICTURE_PX, PICTURE_PX))
+    fragments = rasterize(torch.tensor(plane), faces, cameras, 1.0)
+    homography = geometry.plane_homography(matrix, pose, np.eye(4))
+    truth, inside = reference(homography, piece, picture, fragments.pixel)
+    fragments = fragments.where(inside)
+    corner_uv = torch.tensor(_uv(picture, piece, plane[:, :2]), dtype=torch.float32)[faces][fragments.face]
+    weights = (fragments.barycentric, fragments.barycentric_dx, fragments.barycentric_dy)
+    uv = tuple((weight[..., None] * corner_uv).sum(1) for weight in weights)
+    return Look(uv, truth[inside])
+
+
+def _pose(piece: Piece, width_px: float, tilt_deg: float) -> np.ndarray:
+    """4×4 from piece to camera: tilted about x, turned and shifted a little, so that nothing lies along the pixels."""
+    distance = PICTURE_PX * piece.design_rect_mm[2] / width_px  # the focal length is the picture's side
+    (cos_x, cos_z), (sin_x, sin_z) = (f(np.radians([tilt_deg, 11.5])) for f in (np.cos, np.sin))
+    tilt = np.array([[1, 0, 0], [0, cos_x, -sin_x], [0, sin_x, cos_x]])
+    turn = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3] = turn @ tilt
+    middle = np.array([*np.array(piece.size_mm) / 2, 0])
+    shift = np.array([0.37, 0.11, PICTURE_PX]) * distance / PICTURE_PX
+    pose[:3, 3] = shift - pose[:3, :3] @ middle
+    return pose
+
+
+def reference(homography: np.ndarray, piece: Piece, picture: PiecePicture, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Means P×3 of 16×16 samples in each of P pixels, and whether all of them lie within the design."""
+    texture = picture.srgb.detach().permute(2, 0, 1)[None]
+    x, y, width, height = piece.design_rect_mm
+    corner = np.stack([pixel % PICTURE_PX, pixel // PICTURE_PX], 1)[:, None]  # P×1×2
+    along = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES
+    total, inside = torch.zeros(len(pixel), 3), np.ones(len(pixel), bool)
+    for down in along:
+        at = corner + np.stack([along, np.full(SUBSAMPLES, down)], 1)
+        mm = geometry.apply_homography(np.linalg.inv(homography), at.reshape(-1, 2))
+        within = (mm >= [x, y]).all(1) & (mm <= [x + width, y + height]).all(1)
+        inside &= within.reshape(-1, SUBSAMPLES).all(1)
+        grid = torch.tensor(2 * _uv(picture, piece, mm) - 1, dtype=torch.float32).view(1, 1, -1, 2)
+        # texels are blocks of one color, as printed
+        values = F.grid_sample(texture, grid, mode="nearest", padding_mode="border", align_corners=False)[0, :, 0]
+        total += values.view(3, len(pixel), SUBSAMPLES).sum(2).T
+    return total / SUBSAMPLES**2, torch.tensor(inside)
+
+
+def _uv(picture: PiecePicture, piece: Piece, mm: np.ndarray) -> np.ndarray:
+    """Where the piece's millimetres lie on its picture, from 0 to 1."""
+    height, width, _ = picture.srgb.shape
+    box = np.array(picture.box_px, float)
+    return (box[:2] + mm / np.array(piece.size_mm) * (box[2:] - box[:2])) / [width, height]
