@@ -19,10 +19,11 @@ from patchproof.report.plots import ledger_plot
 from patchproof.sheet.manifest import Manifest
 from patchproof.verify.ledger import _ledger, shapley
 from patchproof.verify.print_fit import fit_print
-from patchproof.verify.reproject import Shot, deblurred, light_fit
+from patchproof.verify.reproject import Shot, deblurred, light_fit, shot_of
 from patchproof.verify.run import gather_evidence
 from patchproof.verify.surface import Promised, piece_picture, promised_of, surface_of
 from test_photo_synthetic import CONDITION, make_manifest, page_raster, photograph, save, view
+from test_verify_run import measured
 
 SIZE, PHOTOS = (640, 480), 5
 
@@ -191,6 +192,16 @@ def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
     turned = homography @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
     lost = pattern_light(srgb, turned, on_piece, surface.dictionary, 0.9 * sigma)
     assert lost is None or lost.agreement < 0.6
+
+
+def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_left_out():
+    surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
+    srgb = photograph(raster(False), homography, SIZE, blur_px=0.5, light=0.75, fine=2)
+    found = measured(srgb, manifest=sheet())
+    assert shot_of(srgb, found.entry, found.light, surface, 96) is not None
+    turned = np.array(found.entry.homography_px_from_mm) @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
+    wrong = found.entry.model_copy(update={"homography_px_from_mm": tuple(map(tuple, turned))})
+    assert shot_of(srgb, wrong, found.light, surface, 96) is None
 
 
 def test_the_piece_is_drawn_as_the_page_shows_it():
