@@ -132,7 +132,7 @@ def test_torchvision_is_wrapped_with_its_own_figures(tmp_path, monkeypatch):
     by_hand = (photos - torch.tensor([0.4, 0.5, 0.6])[:, None, None]) / torch.tensor([0.2, 0.3, 0.4])[:, None, None]
     torch.testing.assert_close(classifier.logits(photos), network(by_hand))
     assert not network.training and not any(parameter.requires_grad for parameter in network.parameters())
-    assert classifier.sha256 == weights_sha256(classifier.network)
+    assert classifier.sha256 == weights_sha256(classifier.network.network)
     with pytest.raises(Refused, match='"resnet5": did you mean "resnet50"'):
         load_classifier("torchvision:resnet5", tmp_path)
     fake_torchvision(monkeypatch, network, broken=True)

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from patchproof.classifier import load_classifier, program
-from patchproof.classifier.program import InBatches, load_program, no_pickle
+from patchproof.classifier.program import load_program, no_pickle
 from patchproof.settings import Refused
 
 LABELS = ["red", "green", "blue", "none"]
@@ -361,18 +361,6 @@ def test_labels_may_lie_in_a_list_beside_the_card(tmp_path, honest):
     (tmp_path / "n.json").write_text('{"input_px": 16, "labels": "list.json"}')
     (tmp_path / "list.json").write_text(json.dumps(LABELS))
     assert load_program(tmp_path / "n.pt2").labels == tuple(LABELS)
-
-
-def test_batches_are_cut_and_filled_up():
-    seen = []
-
-    def network(photos):
-        seen.append(len(photos))
-        return photos.mean((2, 3))
-
-    photos = torch.rand(7, 3, 2, 2)
-    assert torch.equal(InBatches(network, 2, 3)(photos), photos.mean((2, 3)))
-    assert seen == [3, 3, 2]
 
 
 def test_real_networks_recognize_a_photograph(data):

@@ -1,4 +1,4 @@
-"""How a network's numbers are stored: float32 or bfloat16, and in which order its pictures lie in memory.
+"""How a network's numbers are stored: float32 or bfloat16, in which order pictures lie in memory, how many at a time.
 
 In: views of the demo's scene; the built-in network and, where the environment names a folder of real networks
 (PATCHPROOF_DATA), MobileNet v2. Out: a chart: time of a forward and backward pass to the pictures against the error of
@@ -22,6 +22,7 @@ from torch import Tensor
 from patchproof.bench.chart import Chart, OnStage, Point, Series, Table
 from patchproof.bench.measure import mean_interval, ratio, timed
 from patchproof.bench.world import demo_problem
+from patchproof.classifier.batches import MAX_BATCH, InBatches, few_on_cpu
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.view import center_square
@@ -34,23 +35,28 @@ REAL = "models/mobilenet_v2_1.0_224.pt2"
 
 @dataclass(frozen=True)
 class Way:
-    """A type to compute in and an order of memory."""
+    """A type to compute in, an order of memory, and whether as few pictures at a time as `batches.py` takes."""
 
-    type_name: str
     bfloat16: bool
-    order_name: str
     order: torch.memory_format
+    few: bool
 
     @property
     def name(self) -> str:
         """As it stands in a chart."""
-        return f"{self.type_name} {self.order_name}"
+        order = "channels last" if self.order is torch.channels_last else "rows"
+        return f"{'bfloat16' if self.bfloat16 else 'float32'} {order}{', few at a time' if self.few else ''}"
 
 
-WAYS = tuple(
-    Way(type_name, bfloat16, order_name, order)
-    for type_name, bfloat16 in (("float32", False), ("bfloat16", True))
-    for order_name, order in (("rows", torch.contiguous_format), ("channels last", torch.channels_last))
+USUAL = Way(False, torch.channels_last, True)  # as `load_classifier` gives it
+WAYS = (
+    Way(False, torch.contiguous_format, False),
+    Way(False, torch.contiguous_format, True),
+    Way(False, torch.channels_last, False),
+    USUAL,
+    Way(True, torch.contiguous_format, False),
+    Way(True, torch.channels_last, False),
+    Way(True, torch.channels_last, True),
 )
 
 
@@ -81,7 +87,7 @@ def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on
     photos, series, rows = _photos(problem), [], []
     for number, classifier in enumerate(classifiers):
         pictures = center_square(photos, classifier.input_px)
-        network = classifier.network
+        network = classifier.network.network  # without the batches that it is loaded in
         with torch.no_grad():
             label = network(pictures).argmax(1)
         truth = answer(_copy(network).double(), pictures.double(), label)
@@ -89,12 +95,11 @@ def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on
         for way in WAYS:
             work = _work(network, way, pictures, label)
             answers[way], calls[way] = work(), work
-        usual = _usual(network)
         seconds, points = timed(calls, rounds), []
         for way in WAYS:
             off = _off(answers[way].logits, truth.logits, label)
-            (cost, span), (error, interval) = ratio(seconds, way, usual), mean_interval(off)
-            points.append(Point(way.name, cost, error, span, interval, way is usual))
+            (cost, span), (error, interval) = ratio(seconds, way, USUAL), mean_interval(off)
+            points.append(Point(way.name, cost, error, span, interval, way is USUAL))
             rows.append((f"{classifier.name.rpartition('/')[2]}: {way.name}", *_figures(answers[way], truth)))
         series.append(Series(classifier.name.rpartition("/")[2], tuple(points)))
         on_stage("numbers", number + 1, len(classifiers))
@@ -107,6 +112,7 @@ def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on
         (
             f"{VIEWS} views of the demo's scene; bfloat16 by torch.autocast, gradients in float32 at the pictures",
             "rows: N×3×H×W in that order; channels last: the colors of a pixel side by side",
+            "few at a time: at most 4 pictures of 224 px, 12 of 128 px; all of 64 px at once",
         ),
         tables=(Table(("", "mean |logit - float64's|", "largest", "cosine of the gradient"), tuple(rows)),),
     )
@@ -129,21 +135,14 @@ def _copy(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def _work(network, way: Way, pictures: Tensor, label: Tensor) -> Callable[[], Answer]:
-    own = _copy(network).to(memory_format=way.order)
-    pictures = pictures.contiguous(memory_format=way.order)
+    own = InBatches(_copy(network))
+    own.order, own.high = way.order, few_on_cpu(pictures.shape[-1]) if way.few else MAX_BATCH
 
     def work() -> Answer:
         with torch.autocast("cpu", dtype=torch.bfloat16) if way.bfloat16 else nullcontext():
             return answer(own, pictures, label)
 
     return work
-
-
-def _usual(network: torch.nn.Module) -> Way:
-    """How the tool runs the network: the order that its weights are loaded in, and float32."""
-    kernels = [p for p in network.state_dict().values() if p.dim() == 4 and min(p.shape[1], p.shape[2]) > 1]
-    last = bool(kernels) and all(p.is_contiguous(memory_format=torch.channels_last) for p in kernels)
-    return next(w for w in WAYS if not w.bfloat16 and (w.order is torch.channels_last) == last)
 
 
 def _photos(problem: Problem) -> Tensor:

@@ -26,7 +26,7 @@ HARDLY = 1e-3  # trained ones differ by a tenth
 
 def check_network(classifier: Classifier, device: torch.device | str = "cpu") -> None:
     """Refuse a network that cannot be trusted; see the module's head."""
-    photos = _pictures(classifier.input_px).to(device)
+    photos = smooth_pictures(classifier.input_px).to(device)
     name = f"the network {classifier.name}"
     try:
         with torch.no_grad():
@@ -89,7 +89,7 @@ def _doubts(logits: Tensor, swapped: Tensor, spread: float) -> list[str]:
     return doubts
 
 
-def _pictures(size_px: int) -> Tensor:
+def smooth_pictures(size_px: int) -> Tensor:
     """Three smooth colored pictures in [0, 1], 3×3×S×S, the same every time."""
     coarse = torch.rand(3, 3, 6, 6, generator=torch.Generator().manual_seed(0))
     return torch.nn.functional.interpolate(coarse, (size_px, size_px), mode="bilinear", align_corners=False)

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import torch
 
-from patchproof.classifier.check import check_network
+from patchproof.classifier.batches import fastest
+from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.network import Classifier
 from patchproof.settings import Refused, expand
 
@@ -51,4 +52,5 @@ def load_classifier(name: str, base: Path, device: torch.device | str = "cpu") -
     if isinstance(classifier.network, torch.nn.Module):
         classifier.network.requires_grad_(False)
     check_network(classifier, device)
-    return classifier
+    pictures = smooth_pictures(classifier.input_px).to(device)
+    return replace(classifier, network=fastest(classifier.network, pictures))

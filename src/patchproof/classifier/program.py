@@ -28,11 +28,11 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.archive import harmless_copy
+from patchproof.classifier.batches import MAX_BATCH, InBatches
 from patchproof.classifier.network import Classifier
 from patchproof.settings import Refused
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
-MAX_BATCH = 4096  # where a program sets no limit of its own
 
 
 def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
@@ -91,27 +91,6 @@ def _network(copy: io.BytesIO, path: Path, device: torch.device | str) -> Callab
         raise Refused("a torch.export program", got, do) from error
     low, high = _batch_range(program)
     return InBatches(module, low, high)
-
-
-class InBatches(torch.nn.Module):
-    """`network` for any N, though itself it takes from `low` to `high` pictures; short batches repeat their last."""
-
-    def __init__(self, network: Callable[[Tensor], Tensor], low: int, high: int):
-        super().__init__()
-        self.network, self.low, self.high = network, low, high
-
-    def train(self, mode: bool = True) -> InBatches:
-        """Nothing to switch: a program stays as it was exported, and torch's own refuses `eval()`, too."""
-        return self
-
-    def forward(self, photos: Tensor) -> Tensor:
-        """N×3×S×S → N×K logits."""
-        logits = []
-        for batch in photos.split(self.high):
-            missing = self.low - len(batch)
-            padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
-            logits.append(self.network(padded)[: len(batch)])
-        return torch.cat(logits)
 
 
 def _batch_range(program: torch.export.ExportedProgram) -> tuple[int, int]:
