@@ -142,7 +142,7 @@ def test_samples_at_edges_bring_the_bare_object_nearer_to_the_truth(world, monke
 
 def test_the_pool_is_refreshed_as_asked_and_its_default_is_the_reference(world, monkeypatch):
     monkeypatch.setattr(render, "REFRESHES", (1, 4))
-    monkeypatch.setattr(loop, "SELECT_EVERY", 1)  # so that every step has a loss
+    monkeypatch.setattr(loop, "SELECT_AFTER", 1)  # so that every step has a loss
     made = render.refresh_chart(world.problem, 2, 2, 1, quiet)
     first, *others = made.series[0].points
     assert first.default and first.cost == 1 and first.error > 0

@@ -72,8 +72,7 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     seen = []
     score = loop._score
     monkeypatch.setattr(loop, "_score", lambda *a: seen.append(len(a[1])) or score(*a))
-    monkeypatch.setattr(loop, "SELECT_EVERY", 2)
-    monkeypatch.setattr(train, "SELECT_EVERY", 2)
+    monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     train.trained(with_settings(problem, views=3, steps=2), [2])
     assert sum(seen) == train.seen(3, 2)
 

@@ -185,7 +185,8 @@ def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
     assert step.gradient == 0 and torch.equal(step.state.design, start(problem).design)
 
 
-def test_the_design_kept_is_the_best_on_the_selection_set(tmp_path):
+def test_the_design_kept_is_the_best_on_the_selection_set(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "SELECT_AFTER", 40)
     problem = set_problem(scene_with(tmp_path, optimize__steps=30))
     tried = [step for step in steps(problem) if step.select_loss is not None]
     assert [step.state.number for step in tried] == [10, 20, 30]
@@ -196,7 +197,7 @@ def test_variation_and_gamut_terms_do_what_they_say(tmp_path):
     """From noise in strong colors: the one smooths it, the other draws it towards what can be printed."""
 
     def after(**weights):
-        problem = set_problem(scene_with(tmp_path, optimize__step_size=0.02, **weights))
+        problem = set_problem(scene_with(tmp_path, optimize__step_size=0.05, optimize__steps=24, **weights))
         noise = torch.rand(start(problem).design.shape, generator=torch.Generator().manual_seed(0)).round()
         return problem, list(steps(problem, replace(start(problem), design=noise)))[-1].state.design
 
@@ -236,6 +237,7 @@ def few_views(monkeypatch):
     """Fewer views to select by and to promise from, where rates do not matter."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 16)
+    monkeypatch.setattr(loop, "SELECT_AFTER", 40)
 
 
 def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png")):

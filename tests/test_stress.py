@@ -62,7 +62,7 @@ def problem_with(tmp_path, **tables):
 def few_views(monkeypatch):
     monkeypatch.setattr(run, "PROMISE_VIEWS", 4)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
-    monkeypatch.setattr(loop, "SELECT_EVERY", 2)
+    monkeypatch.setattr(loop, "SELECT_AFTER", 4)
 
 
 def rows_of(conditions, names):
@@ -149,7 +149,7 @@ def test_a_mined_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_
 
 
 def test_equal_cost_by_hand(monkeypatch):
-    monkeypatch.setattr(mining, "SELECT_EVERY", 10)
+    monkeypatch.setattr(loop, "SELECT_AFTER", 80)
     monkeypatch.setattr(mining, "SELECT_VIEWS", 64)
     plain = OptimizeSettings(steps=40, views=8)
     # 40 · 8 views, and 4 selections of 64 views forward only
@@ -282,7 +282,6 @@ def test_the_stress_study_leaves_tables_maps_and_a_page_twice_alike(tmp_path):
 
 
 def test_the_mining_study_compares_at_equal_cost_on_the_same_conditions(tmp_path, monkeypatch):
-    monkeypatch.setattr(mining, "SELECT_EVERY", 2)
     monkeypatch.setattr(mining, "SELECT_VIEWS", 4)
     toml(tmp_path / "scene.toml", patch=PRINTED)
     (tmp_path / "mining.toml").write_text(MINING)

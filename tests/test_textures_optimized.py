@@ -54,7 +54,7 @@ PATCHES = {
 def small(monkeypatch):
     """A promise of few views, where its rate does not matter, and a checkpoint every other step."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
-    monkeypatch.setattr(loop, "SELECT_EVERY", 2)
+    monkeypatch.setattr(loop, "SELECT_AFTER", 4)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
 
 

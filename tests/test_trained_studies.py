@@ -27,7 +27,7 @@ RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(loop, "SELECT_EVERY", 4)
+    monkeypatch.setattr(loop, "SELECT_AFTER", 8)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
     monkeypatch.setattr(run, "PROMISE_VIEWS", 2)
 

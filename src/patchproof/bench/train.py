@@ -24,7 +24,7 @@ from patchproof.bench.measure import mean_interval, median_interval, paired_mean
 from patchproof.bench.world import demo_problem, set_world, with_settings
 from patchproof.claims import CONFIDENCE
 from patchproof.optimize.goals import target_loss
-from patchproof.optimize.loop import SELECT_EVERY, SELECT_VIEWS, State, start, steps
+from patchproof.optimize.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, start, steps
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
@@ -92,7 +92,7 @@ def _training_chart(
     settings = {name: OptimizeSettings().model_copy(update=dict(run)) for name, run in runs.items()}
     # the last steps of other numbers would not have been selected from
     ends = {
-        name: [n for n in (effort.views // 2, effort.views) if n // one.views % SELECT_EVERY == 0]
+        name: [n for n in (effort.views // 2, effort.views) if selects(one, n // one.views)]
         for name, one in settings.items()
     }
     losses: list[list[float]] = []
@@ -120,7 +120,7 @@ def _training_chart(
         (
             f"the gray design before the first step: {before:.3f}",
             "intervals are for comparing settings: what all settings of a seed share is taken out",
-            f"a selection set of {SELECT_VIEWS} views is seen every {SELECT_EVERY} steps",
+            f"a selection set of {SELECT_VIEWS} views is seen every {SELECT_AFTER} training views",
         ),
         one_front=True,
     )
@@ -128,7 +128,8 @@ def _training_chart(
 
 def seen(views: int, steps_done: int) -> int:
     """Views that a network sees in so many steps, selection included."""
-    return views * steps_done + SELECT_VIEWS * -(-steps_done // SELECT_EVERY)
+    settings = OptimizeSettings(views=views, steps=steps_done)
+    return views * steps_done + SELECT_VIEWS * selections(settings)
 
 
 @lru_cache(maxsize=512)
@@ -329,5 +330,5 @@ def _only(problem: Problem, team: Sequence[int]) -> Problem:
 
 def _one_step(problem: Problem, team: Sequence[int]):
     """A call that takes one step without selection's."""
-    loop = steps(with_settings(_only(problem, team), steps=SELECT_EVERY - 1))
+    loop = steps(with_settings(_only(problem, team), steps=SELECT_AFTER))
     return lambda: next(loop)

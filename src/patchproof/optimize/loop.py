@@ -1,9 +1,10 @@
 """The loop: draw conditions, photograph the piece, descend.
 
 In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's
-business. The design starts at mid-gray. Adam, or signed steps as in FGSM and PGD (Goodfellow et al. 2015, Madry et al.
-2018), always clipped to [0, 1]. Every few steps the design is tried on a fixed selection set, and the best one is kept:
-a design that suited its last twelve views only is not what gets printed. The promise set is never touched here.
+business. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
+PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every so many views the design is tried on a
+fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
+promise set is never touched here.
 
 A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes.
 """
@@ -21,11 +22,12 @@ from patchproof.optimize.goals import target_loss
 from patchproof.optimize.mining import training_conditions
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
+from patchproof.optimize.pyramid import joined
 from patchproof.render.photograph import expose
 from patchproof.render.views import Seen, relit
-from patchproof.settings import Refused
+from patchproof.settings import OptimizeSettings, Refused
 
-SELECT_EVERY = 10
+SELECT_AFTER = 120  # training views
 SELECT_VIEWS = 64
 SELECT_CHUNK = 16
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
@@ -33,12 +35,12 @@ _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
 
 @dataclass(frozen=True)
 class State:
-    """Everything that the next step depends on; tensors 3×h×w."""
+    """Everything that the next step depends on; designs 3×h×w, and Adam's moments, a tensor per level of the gradient."""
 
     number: int
     design: Tensor
-    mean: Tensor  # Adam's running mean and square of the gradient
-    square: Tensor
+    mean: tuple[Tensor, ...]
+    square: tuple[Tensor, ...]
     best: Tensor
     best_loss: float = float("inf")
 
@@ -62,8 +64,19 @@ class Step:
 def start(problem: Problem) -> State:
     """The state before the first step."""
     design = problem.subject.start()
-    zero = torch.zeros_like(design)
-    return State(0, design, zero, zero, design)
+    zeros = tuple(torch.zeros_like(level) for level in problem.subject.levels(design))
+    return State(0, design, zeros, zeros, design)
+
+
+def selects(settings: OptimizeSettings, number: int) -> bool:
+    """Whether the design is tried on the selection set after step `number`, counted from 1."""
+    done, before = (n * settings.views // SELECT_AFTER for n in (number, number - 1))
+    return done > before or number == settings.steps
+
+
+def selections(settings: OptimizeSettings) -> int:
+    """How often that is in all steps."""
+    return sum(selects(settings, number) for number in range(1, settings.steps + 1))
 
 
 def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
@@ -80,7 +93,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
             poses = conditions[first : first + settings.views]
             pool = problem.see(problem.subject.shown(state.design), poses, problem.training_px)
         step = _step(problem, state, relit(pool, drawn) if settings.refresh > 1 else pool)
-        if step.state.number % SELECT_EVERY == 0 or step.state.number == settings.steps:
+        if selects(settings, step.state.number):
             step = _select(problem, selection, step)
         state = step.state
         yield step
@@ -109,11 +122,14 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
     if settings.optimizer == "sign":
         design = clipped(state.design - settings.step_size * gradient.sign())
         return replace(state, number=number, design=design)
-    mean = torch.lerp(gradient, state.mean, _BETAS[0])
-    square = torch.lerp(gradient**2, state.square, _BETAS[1])
-    unbiased = mean / (1 - _BETAS[0] ** number)
-    scale = (square / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON
-    design = clipped(state.design - settings.step_size * unbiased / scale)
+    levels = problem.subject.levels(gradient)
+    mean = tuple(torch.lerp(now, old, _BETAS[0]) for now, old in zip(levels, state.mean, strict=True))
+    square = tuple(torch.lerp(now**2, old, _BETAS[1]) for now, old in zip(levels, state.square, strict=True))
+    updates = [
+        (m / (1 - _BETAS[0] ** number)) / ((v / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON)
+        for m, v in zip(mean, square, strict=True)
+    ]
+    design = clipped(state.design - settings.step_size * joined(updates))
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 

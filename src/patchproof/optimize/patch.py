@@ -18,6 +18,7 @@ from torch import Tensor
 from patchproof.channel.printer import Printer
 from patchproof.optimize.goals import non_printability, total_variation
 from patchproof.optimize.pixels import as_pixels
+from patchproof.optimize.pyramid import levels
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.scene import Scene
 from patchproof.sheet.piece import FrameImage, control_design, frame_image, lay_out_piece
@@ -49,6 +50,10 @@ class Patch:
         if self.scene.settings.optimize.in_gamut:
             return self.printer.into_gamut(design[None])[0]
         return design.clamp(0, 1)
+
+    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+        """The gradient's pyramid: patches are optimized coarse to fine."""
+        return levels(gradient)
 
     def penalty(self, design: Tensor) -> Tensor | float:
         """What the scene's settings charge a design for: total variation, colors that the printer misses, NPS."""

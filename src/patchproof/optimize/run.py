@@ -1,4 +1,4 @@
-"""A run's folder: what an optimization leaves behind, written so that a kill at any moment loses ten steps at most.
+"""A run's folder: what an optimization leaves behind, written so that a kill at any moment loses 120 views at most.
 
 In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
 (one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically). Nothing in it depends on
@@ -22,7 +22,7 @@ import torch
 from PIL import Image
 
 import patchproof
-from patchproof.optimize.loop import SELECT_EVERY, State, Step, start, steps
+from patchproof.optimize.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
 from patchproof.optimize.result import RESULT_FILES, read_result, save_result
@@ -50,7 +50,7 @@ class Run:
 
 
 def optimize_scene(
-    scene_path: str | Path,
+    scene: str | Path | Scene,
     out: str | Path,
     *,
     seed: int | None = None,
@@ -61,11 +61,14 @@ def optimize_scene(
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
 ) -> Run:
-    """Optimize the scene's patch into the folder `out` and promise its rate; `resume` goes on from its checkpoint."""
+    """Optimize the patch of a scene or its file into the folder `out` and promise its rate.
+
+    `seed` replaces the file's; `resume` goes on from the checkpoint.
+    """
     out = Path(out)
     if not resume:
         check_folder(out, OWN, overwrite)
-    scene = load_scene(scene_path, seed)
+    scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     on_scene(scene)
     problem = set_problem(scene, device)
     if not resume:
@@ -75,7 +78,7 @@ def optimize_scene(
     design = _loop(problem, state, out, on_step)
     save_result(problem, design, out)
     promise = _promise(problem, design, on_promise)
-    details = _details(problem, promise, Path(scene_path).resolve().parent, out, device)
+    details = _details(problem, promise, out, device)
     write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
     return Run(out, scene, design, promise, details)
 
@@ -165,7 +168,10 @@ def _log_line(step: Step) -> dict[str, Any]:
 def _save(state: State, problem: Problem, path: Path) -> None:
     from safetensors.torch import save_file
 
-    tensors = {name: getattr(state, name).cpu().contiguous().clone() for name in ("design", "mean", "square", "best")}
+    tensors = {"design": state.design, "best": state.best}
+    tensors |= {f"mean{level}": one for level, one in enumerate(state.mean)}
+    tensors |= {f"square{level}": one for level, one in enumerate(state.square)}
+    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
     # the loss as text keeps every bit; the sheet id tells whose checkpoint this is
     note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
     # one key: safetensors writes several in an order of its own
@@ -182,8 +188,10 @@ def _resumed(out: Path, problem: Problem) -> State:
     try:
         with safe_open(path, framework="pt", device=str(problem.device)) as file:
             note = json.loads((file.metadata() or {})["state"])
-            tensors = {name: file.get_tensor(name) for name in ("design", "mean", "square", "best")}
-        state = State(note["number"], **tensors, best_loss=float.fromhex(note["best_loss"]))
+            design, best = file.get_tensor("design"), file.get_tensor("best")
+            levels = range(len(start(problem).mean))
+            mean, square = (tuple(file.get_tensor(f"{name}{n}") for n in levels) for name in ("mean", "square"))
+        state = State(note["number"], design, mean, square, best, float.fromhex(note["best_loss"]))
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise Refused(
             "a checkpoint", f"{path} that cannot be read ({error})", "start anew in another folder"
@@ -203,7 +211,7 @@ def _cut_log(path: Path, number: int) -> None:
     write_whole(path, lambda part: part.write_text("".join(lines), encoding="utf-8"))
 
 
-def _details(problem: Problem, promise: Promise, scene_folder: Path, out: Path, device: str) -> dict[str, Any]:
+def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict[str, Any]:
     scene = problem.scene
     packages = ("torch", "numpy", "kornia", "trimesh")  # those that pixels depend on
     return {
@@ -213,12 +221,12 @@ def _details(problem: Problem, promise: Promise, scene_folder: Path, out: Path, 
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
         "versions": {"patchproof": patchproof.__version__} | {name: version(name) for name in packages},
-        "scene_folder": os.path.relpath(scene_folder, out.resolve()),
+        "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
         "settings": scene.settings.model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
         "placement": _placement(scene),
         "warnings": list(scene.warnings),
-        "select_every": SELECT_EVERY,
+        "select_after_views": SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }
 

@@ -42,6 +42,10 @@ class Texture:
         reach = np.floor(epsilon * 255 + 1e-6) / 255
         return torch.minimum(torch.maximum(design, self._start - reach), self._start + reach).clamp(0, 1)
 
+    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+        """The gradient alone: texels stand in a row, in which neighbors need not be neighbors on the object."""
+        return (gradient,)
+
     def penalty(self, design: Tensor) -> Tensor | float:
         """Total variation within the changed texels of each row or column of the textures, where settings ask."""
         weight = self.scene.settings.optimize.tv

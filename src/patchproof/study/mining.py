@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from patchproof.optimize.loop import SELECT_EVERY, SELECT_VIEWS, start, steps
+from patchproof.optimize.loop import SELECT_VIEWS, selections, start, steps
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import Shown
@@ -98,8 +98,8 @@ def equal_steps(plain: OptimizeSettings, mine: int) -> int:
 
 
 def _thirds(settings: OptimizeSettings) -> int:
-    selections = -(-settings.steps // SELECT_EVERY)
-    return BOTH * settings.steps * settings.views + FORWARD * (selections * SELECT_VIEWS + settings.mine)
+    forward = selections(settings) * SELECT_VIEWS + settings.mine
+    return BOTH * settings.steps * settings.views + FORWARD * forward
 
 
 def _trained(problem: Problem) -> Shown:

@@ -39,6 +39,7 @@ STUDIES: dict[str, str] = {
     "mining": "patchproof.study.mining",
     "patch2d": "patchproof.study.patch2d",
     "patch3d": "patchproof.study.patch3d",
+    "promises": "patchproof.study.promises",
     "robust": "patchproof.study.robust",
     "stress": "patchproof.study.stress",
     "transfer": "patchproof.study.transfer",

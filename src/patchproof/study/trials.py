@@ -37,7 +37,7 @@ def best_design(problem: Problem) -> np.ndarray:
 def passes(problem: Problem) -> int:
     """Views that each network sees in training and selection."""
     settings = problem.scene.settings.optimize
-    return settings.steps * settings.views + -(-settings.steps // loop.SELECT_EVERY) * loop.SELECT_VIEWS
+    return settings.steps * settings.views + loop.selections(settings) * loop.SELECT_VIEWS
 
 
 def logits_of(problem: Problem, shown: dict[str, Shown], conditions: Conditions) -> dict[str, Tensor]:

@@ -1,0 +1,70 @@
+"""Promises against photographs: the shares and the correction by hand, and one cell from scene to verdict."""
+
+import json
+
+import numpy as np
+import pytest
+
+from patchproof.claims import prediction_interval
+from patchproof.optimize import loop, run
+from patchproof.study import promises
+from patchproof.study.study import Cell, Result, run_study
+from test_optimize import SCENE
+
+
+def found(rate, recognized, judged=40, n=400):
+    return {"rate": rate, "n": n, "best_control": 0.1, "judged": judged, "recognized": recognized, "verdict": "kept"}
+
+
+def result(scene, one):
+    values = {"name": scene, "network": "builtin", "printer": "coated", "seed": 0}
+    return Result(Cell(f"{scene}{one['recognized']}", values), one, None)
+
+
+def test_an_interval_holds_up_to_its_ends_and_not_beyond():
+    low, high = prediction_interval(320, 400, 40)
+    assert [promises.held(found(0.8, count)) for count in (low - 1, low, high, high + 1)] == [False, True, True, False]
+    assert promises.interval_of(found(0.8, 0)) == (low, high)
+
+
+def test_the_shift_of_the_log_odds_is_found_again_and_no_shift_changes_nothing():
+    rates = np.array([0.0, 0.02, 0.5, 0.9, 1.0])
+    assert promises.shifted(rates, 0.0).tolist() == rates.tolist()
+    true = promises.shifted(rates, -0.7)
+    assert promises.shifted(true, 0.7)[1:4] == pytest.approx(rates[1:4])
+    seen = [found(rate, 1000 * p, 1000) for rate, p in zip(rates[1:4], true[1:4], strict=True)]
+    assert promises.fitted_shift(seen) == pytest.approx(-0.7, abs=1e-3)
+
+
+def test_a_correction_is_judged_on_other_scenes_than_it_was_fitted_on():
+    settings = promises.PromisesSettings(scenes=("a", "b"), networks=("builtin",))
+    low = [result("a", found(0.8, count)) for count in (20, 21, 22)]  # promised too much
+    fair = [result("b", found(0.8, count)) for count in (31, 32, 33)]
+    held, correction, each = promises.tables(settings, low + fair)
+    assert [(row[0], row[1].value, row[1].n) for row in held.rows] == [("a", 0, 3), ("b", 1, 3), ("all", 0.5, 6)]
+    assert held.rows[0][3].value == pytest.approx(21 / 40 - 0.8)
+    on_b, on_a = correction.rows
+    assert on_b[:2] == ("a", "b") and on_b[2] < -0.5 and on_b[3].value == 1 > on_b[4].value
+    assert on_a[:2] == ("b", "a") and abs(on_a[2]) < 0.05 and on_a[3].value == 0
+    assert len(each.rows) == 6
+
+
+def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
+    data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [480, 360]}}
+    data["optimize"] |= {"steps": 2}
+    lines = [
+        line
+        for table, values in data.items()
+        for line in (f"[{table}]", *(f"{key} = {json.dumps(value)}" for key, value in values.items()))
+    ]
+    (tmp_path / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
+    (tmp_path / "study.toml").write_text(
+        'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\nphotos = 10\npath_traced = false\n'
+    )
+    finished = run_study("promises", tmp_path / "study.toml", tmp_path / "out")
+    assert not finished.failed
+    (one,) = finished.results
+    assert one.found["n"] == 16 and one.found["judged"] <= 10 and 0 <= one.found["recognized"] <= one.found["judged"]
+    assert (tmp_path / "out" / "promises_calibration.png").is_file() or not one.found["judged"]
