@@ -13,6 +13,7 @@ from patchproof.bench.chart import Chart, Point, Series, with_default_checks, wi
 from patchproof.bench.detect import PIECE_MM, corners_mm
 from patchproof.bench.world import demo_problem, with_settings
 from patchproof.optimize import loop
+from patchproof.optimize.patch import Patch
 from patchproof.settings import OptimizeSettings
 from patchproof.verify.verdict import judge
 
@@ -82,7 +83,7 @@ def test_training_charts_have_one_default_and_its_real_settings(problem, monkeyp
     effort, usual = train.Effort(240, 2, 16), OptimizeSettings()
     views = train.views_chart(problem, train.QUICK_VIEWS, effort, quiet)
     moves = train.optimizer_chart(problem, train.QUICK_STEP_SIZES, effort, quiet)
-    for chart, name in ((views, f"{usual.views}"), (moves, f"{usual.optimizer} {usual.step_size:g}")):
+    for chart, name in ((views, f"{usual.views}"), (moves, f"{usual.optimizer} {Patch.STEP_SIZE:g}")):
         (default,) = (p for one in chart.series for p in one.points if p.default)
         assert default.setting == name and default.cost == train.seen(usual.views, 240 // usual.views)
     assert [p.error for p in moves.series[-1].points][:3] == list(train.QUICK_STEP_SIZES["adam"])

@@ -60,9 +60,8 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
         for line in (f"[{table}]", *(f"{key} = {json.dumps(value)}" for key, value in values.items()))
     ]
     (tmp_path / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
-    (tmp_path / "study.toml").write_text(
-        'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\nphotos = 10\npath_traced = false\n'
-    )
+    names = 'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\n'
+    (tmp_path / "study.toml").write_text(names + "photos = 10\npath_traced = false\n")
     finished = run_study("promises", tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
     (one,) = finished.results

@@ -223,13 +223,14 @@ class CameraSettings(Strict):
 class OptimizeSettings(Strict):
     """The loop: `views` conditions in each of `steps` steps."""
 
-    steps: Annotated[int, Field(ge=1)] = 120
-    views: Annotated[int, Field(ge=1)] = 12
+    steps: Annotated[int, Field(ge=1)] = 240
+    views: Annotated[int, Field(ge=1)] = 4  # many small steps: as many views, 12 at a time, got less far in 3 scenes
     refresh: Annotated[int, Field(ge=1)] = 1  # steps for which views keep their poses, lit and printed anew
     mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on come from the worst
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
-    step_size: Annotated[Positive, Field(le=1)] = 0.1  # of sRGB's range; what is larger than it only jumps to its ends
+    # of sRGB's range, in which a larger one only jumps to the ends; by default 0.05 for a patch, 0.015 for a texture
+    step_size: Annotated[Positive, Field(le=1)] | None = None
     tv: NotNegative = 0.0
     # Loss for colors that the printer misses, per 100 ΔE00. At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
     # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).

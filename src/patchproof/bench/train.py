@@ -25,6 +25,7 @@ from patchproof.bench.world import demo_problem, set_world, with_settings
 from patchproof.claims import CONFIDENCE
 from patchproof.optimize.goals import target_loss
 from patchproof.optimize.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, start, steps
+from patchproof.optimize.patch import Patch
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
@@ -34,9 +35,9 @@ from patchproof.scene.scene import build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings
 
 CHUNK = 16
-VIEWS, QUICK_VIEWS = (4, 8, 12, 24, 48), (4, 6, 12)
-STEP_SIZES = {"adam": (0.02, 0.05, 0.1, 0.2, 0.4), "sign": (0.01, 0.03, 0.1)}
-QUICK_STEP_SIZES = {"adam": (0.03, 0.1, 0.3), "sign": (0.03,)}
+VIEWS, QUICK_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
+STEP_SIZES = {"adam": (0.01, 0.025, 0.05, 0.1, 0.2), "sign": (0.01, 0.03, 0.1)}
+QUICK_STEP_SIZES = {"adam": (0.025, 0.05, 0.1), "sign": (0.03,)}
 ENSEMBLE_STEPS, ENSEMBLE_SEEDS = 20, 3
 SAMPLES, QUICK_SAMPLES = (8, 16, 32, 64, 128, 256), (8, 16, 32, 64)
 NETWORKS = ("mobilenet_v1_0.25_128", "mobilenet_v1_0.75_192", "squeezenet1.1_224")
@@ -81,7 +82,7 @@ def optimizer_chart(problem: Problem, sizes: Mapping[str, Sequence[float]], effo
     """Optimizer and step size against the loss of what has been trained on as many views."""
     runs = {f"{kind} {size:g}": {"optimizer": kind, "step_size": size} for kind in sizes for size in sizes[kind]}
     usual = OptimizeSettings()
-    chart = _training_chart(problem, runs, f"{usual.optimizer} {usual.step_size:g}", effort, on_stage)
+    chart = _training_chart(problem, runs, f"{usual.optimizer} {Patch.STEP_SIZE:g}", effort, on_stage)
     return replace(chart, name="optimizer", title="Optimizer and step size")
 
 
@@ -100,7 +101,7 @@ def _training_chart(
         losses.append([])
         for i, (name, one) in enumerate(settings.items()):
             numbers = tuple(end // one.views for end in ends[name])
-            how = one.views, one.optimizer, one.step_size
+            how = one.views, one.optimizer, one.step_size or Patch.STEP_SIZE
             losses[seed] += trained_losses(problem, effort.judged, seed, *how, numbers)
             on_stage("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     points: dict[int, list[Point]] = {}

@@ -22,7 +22,6 @@ from patchproof.optimize.goals import target_loss
 from patchproof.optimize.mining import training_conditions
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
-from patchproof.optimize.pyramid import joined
 from patchproof.render.photograph import expose
 from patchproof.render.views import Seen, relit
 from patchproof.settings import OptimizeSettings, Refused
@@ -35,7 +34,7 @@ _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
 
 @dataclass(frozen=True)
 class State:
-    """Everything that the next step depends on; designs 3×h×w, and Adam's moments, a tensor per level of the gradient."""
+    """Everything that the next step depends on; designs 3×h×w, Adam's moments by level."""
 
     number: int
     design: Tensor
@@ -118,9 +117,9 @@ def _step(problem: Problem, state: State, seen: Seen) -> Step:
 def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
     """One update of the design, clipped to what it may become."""
     clipped, settings = problem.subject.clipped, problem.scene.settings.optimize
-    number = state.number + 1
+    number, step_size = state.number + 1, settings.step_size or problem.subject.STEP_SIZE
     if settings.optimizer == "sign":
-        design = clipped(state.design - settings.step_size * gradient.sign())
+        design = clipped(state.design - step_size * gradient.sign())
         return replace(state, number=number, design=design)
     levels = problem.subject.levels(gradient)
     mean = tuple(torch.lerp(now, old, _BETAS[0]) for now, old in zip(levels, state.mean, strict=True))
@@ -129,7 +128,7 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
         (m / (1 - _BETAS[0] ** number)) / ((v / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON)
         for m, v in zip(mean, square, strict=True)
     ]
-    design = clipped(state.design - settings.step_size * joined(updates))
+    design = clipped(state.design - step_size * problem.subject.joined(updates))
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 

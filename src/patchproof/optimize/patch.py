@@ -8,17 +8,19 @@ printer.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from patchproof.channel.printer import Printer
+from patchproof.optimize import pyramid
 from patchproof.optimize.goals import non_printability, total_variation
 from patchproof.optimize.pixels import as_pixels
-from patchproof.optimize.pyramid import levels
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.scene import Scene
 from patchproof.sheet.piece import FrameImage, control_design, frame_image, lay_out_piece
@@ -38,6 +40,7 @@ class Patch:
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
+    STEP_SIZE: ClassVar[float] = 0.05
     printable: Tensor | None = None  # P×3 colors that stand for the printer's, where the settings ask for NPS
 
     def start(self) -> Tensor:
@@ -52,8 +55,12 @@ class Patch:
         return design.clamp(0, 1)
 
     def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
-        """The gradient's pyramid: patches are optimized coarse to fine."""
-        return levels(gradient)
+        """The gradient's pyramid."""
+        return pyramid.levels(gradient)
+
+    def joined(self, updates: Sequence[Tensor]) -> Tensor:
+        """The update of a design that the pyramid's own add up to."""
+        return pyramid.joined(updates)
 
     def penalty(self, design: Tensor) -> Tensor | float:
         """What the scene's settings charge a design for: total variation, colors that the printer misses, NPS."""

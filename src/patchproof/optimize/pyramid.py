@@ -1,10 +1,10 @@
 """Coarse to fine: a step that moves large parts of a design as readily as single pixels.
 
-In: the gradient at a design C×h×w. Out: its means over blocks of 1, 2, 4 … pixels, each of which the optimizer scales
-on its own, and the sum of the scaled levels as one update. The gradient of a pixel is mostly that of the few views it
-was drawn from; the mean over a block shares it with every view, so that color and large shapes, which count in small
-and blurred views, come first. Laplacian pyramid normalization of DeepDream (Mordvintsev et al., TensorFlow tutorial,
-2015) scales levels likewise, by their spread instead of Adam's.
+In: the gradient at a picture C×H×W, and which of its pixels may change. Out: its means over blocks of 1, 2, 4 … pixels,
+each level of which the optimizer scales on its own, and the sum of the scaled levels as one update. The gradient of a
+pixel is mostly that of the few views it was drawn from; the mean over a block shares it with every view, so that color
+and large shapes, which count in small and blurred views, come first. Laplacian pyramid normalization of DeepDream
+(Mordvintsev et al., TensorFlow tutorial, 2015) scales levels likewise, by their spread instead of Adam's.
 """
 
 from __future__ import annotations
@@ -12,20 +12,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-LEVELS = 5
-_FEWEST = 4  # blocks along the shorter side of the coarsest level
+FEWEST = 8  # blocks along the shorter side of the coarsest level
 
 
-def levels(gradient: Tensor) -> tuple[Tensor, ...]:
-    """C×h×w → C×⌈h/2ˡ⌉×⌈w/2ˡ⌉ for l = 0, 1, …: means over blocks of 2ˡ pixels, of what there is of them at the edge."""
-    shorter = min(gradient.shape[1:])
-    count = min(LEVELS, 1 + max(0, int(math.log2(max(shorter, 1) / _FEWEST)))) if shorter > _FEWEST else 1
-    pooled = (avg_pool2d(gradient[None], 2**level, ceil_mode=True)[0] for level in range(1, count))
+def levels(gradient: Tensor, mask: Tensor | None = None) -> tuple[Tensor, ...]:
+    """C×H×W → C×⌈H/2ˡ⌉×⌈W/2ˡ⌉ for l = 0, 1, …: means over those of a block's pixels that are there and in the mask.
+
+    `mask` is H×W, 1 where the picture may change; the gradient is 0 elsewhere.
+    """
+    weights = None if mask is None else mask[None, None].to(gradient)
+    pooled = []
+    for level in range(1, level_count(gradient.shape[1:])):
+        mean = avg_pool2d(gradient[None], 2**level, ceil_mode=True)[0]
+        if weights is not None:
+            mean = mean / avg_pool2d(weights, 2**level, ceil_mode=True)[0].clamp(min=1e-6)
+        pooled.append(mean)
     return (gradient, *pooled)
+
+
+def level_count(size_px: Sequence[int]) -> int:
+    """How many levels a picture of that size has, its own among them."""
+    return 1 + max(0, int(math.log2(max(1, min(size_px)) / FEWEST)))
 
 
 def joined(updates: Sequence[Tensor]) -> Tensor:

@@ -9,13 +9,16 @@ Source: Pestana et al., algorithms "Full Texture" and "Masked Textures and 3D Pa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.optimize import pyramid
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.render.photograph import ObjectTextures
 from patchproof.scene.mesh_scene import MeshScene
@@ -26,6 +29,9 @@ from patchproof.sheet.piece import CELLS, control_design
 class Texture:
     """Designs are 3×1×M in [0, 1]: the texels that may change, texture by texture, by rows."""
 
+    # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
+    # 60 % as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
+    STEP_SIZE: ClassVar[float] = 0.015
     scene: MeshScene
     device: torch.device
 
@@ -43,8 +49,22 @@ class Texture:
         return torch.minimum(torch.maximum(design, self._start - reach), self._start + reach).clamp(0, 1)
 
     def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
-        """The gradient alone: texels stand in a row, in which neighbors need not be neighbors on the object."""
-        return (gradient,)
+        """The gradient's pyramids, texture by texture."""
+        return tuple(
+            level
+            for image, mask in zip(self._images(gradient), self._masks, strict=True)
+            for level in pyramid.levels(image, mask)
+        )
+
+    def joined(self, updates: Sequence[Tensor]) -> Tensor:
+        """The update of a design that the pyramids' own add up to."""
+        parts, first = [], 0
+        for mask in self._masks:
+            count = pyramid.level_count(mask.shape)
+            whole = pyramid.joined(updates[first : first + count])
+            parts.append(whole[:, mask])
+            first += count
+        return torch.cat(parts, 1)[:, None]
 
     def penalty(self, design: Tensor) -> Tensor | float:
         """Total variation within the changed texels of each row or column of the textures, where settings ask."""
@@ -119,6 +139,14 @@ class Texture:
     def _originals(self) -> tuple[Tensor, ...]:
         materials = self.scene.canvas.mesh.materials
         return tuple(torch.tensor(m.texture_srgb, dtype=torch.float32, device=self.device) / 255 for m in materials)
+
+    def _images(self, design: Tensor) -> list[Tensor]:
+        """3×H×W per material, 0 where nothing may change."""
+        parts = design[:, 0].split([int(mask.sum()) for mask in self._masks], 1)
+        return [
+            part.new_zeros(3, *mask.shape).masked_scatter(mask, part)
+            for mask, part in zip(self._masks, parts, strict=True)
+        ]
 
     def _filled(self, design: Tensor) -> list[Tensor]:
         """H×W×3 per material."""

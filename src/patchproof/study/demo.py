@@ -58,8 +58,8 @@ blur_px = [0, 1.2]
 noise = [0, 0.02]
 
 [optimize]
-steps = 120
-views = 16
+steps = 240
+views = 4
 seed = 1
 """
 

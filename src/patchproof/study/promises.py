@@ -1,9 +1,9 @@
 """Whether promises hold: many runs, each promised, printed, photographed by a renderer that is not ours, and verified.
 
 In: scene files, networks, printers, seeds. Out: for every combination the promised rate, the interval of counts that
-its photographs should show, and the count that they did show; the share of intervals that held with its own interval,
-their widths, the bias of each scene, and what a correction would be worth: a shift of the promise's log odds, fitted on
-every other scene and judged on the rest. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
+its photographs should show, and the count that they did show; the share of intervals that held, their widths, the bias
+of each scene, and what a correction would be worth: a shift of the promise's log odds, fitted on every other scene and
+judged on the rest. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
 
 Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; without
 `path_traced = true` they are ours, and only sampling and the page in between are tested.
