@@ -30,6 +30,7 @@ from patchproof.workers import Workers, one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is, imported when asked for
 STUDIES: dict[str, str] = {
+    "ablation": "patchproof.study.ablation",
     "deceive": "patchproof.study.deceive",
     "detection": "patchproof.study.detection",
     "envelope": "patchproof.study.envelope.sweeps",

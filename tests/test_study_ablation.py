@@ -1,0 +1,64 @@
+"""Training without an effect: the views that it sees, what is refused, and what an effect has earned, by hand."""
+
+import pytest
+import torch
+
+from patchproof.channel.printer import load_printer
+from patchproof.optimize.problem import set_problem
+from patchproof.settings import Refused
+from patchproof.study import ablation
+from patchproof.study.ablation import ALL, PRINTER, AblationSettings, without
+from patchproof.study.study import Cell, Result
+from test_optimize import scene_with
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    return set_problem(scene_with(folder, camera__noise=[0.01, 0.02], camera__photo_px=[160, 120]))
+
+
+def seen(problem):
+    return problem.see(problem.subject.shown(problem.subject.start()), problem.scene.draw("train", 4), 96)
+
+
+def test_views_are_seen_without_the_effect_and_otherwise_alike(problem):
+    plain, less = seen(problem).conditions, seen(without(problem, "noise")).conditions
+    assert (plain.noise > 0).all() and (less.noise == 0).all()
+    assert (plain.azimuth_deg == less.azimuth_deg).all() and (plain.exposure_ev == less.exposure_ev).all()
+    both = seen(without(problem, "noise + exposure")).conditions
+    assert (both.noise == 0).all() and (both.exposure_ev == 0).all()
+
+
+def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
+    subject = without(problem, PRINTER).subject
+    green = torch.tensor([0.0, 1.0, 0.0])
+    design = green[:, None, None].expand_as(subject.start())
+    x0, y0, x1, y1 = (round(v) for v in subject.shown(design).design_px)
+    middle = subject.shown(design).srgb[(y0 + y1) // 2, (x0 + x1) // 2]
+    assert middle.tolist() == pytest.approx(green.tolist(), abs=1e-3)
+    assert load_printer("coated").apply(design[None])[0, :, 5, 5].tolist() != pytest.approx(green.tolist(), abs=0.1)
+
+
+@pytest.mark.parametrize(("effect", "says"), [("lamp", "with lamp in it"), ("smell", "this kind of scene has")])
+def test_an_effect_that_is_not_there_is_refused(problem, effect, says):
+    with pytest.raises(Refused, match=says):
+        without(problem, effect)
+
+
+def test_what_an_effect_earned_by_hand():
+    settings = AblationSettings(scenes=("s",), networks=("n",), seeds=(0, 1), effects=("noise",), n=10, photos=0)
+    results = []
+    for seed, counts in enumerate(((8, 6), (9, 5))):
+        for effect, count in zip((ALL, "noise"), counts, strict=True):
+            hits = [1] * count + [0] * (10 - count)
+            found = {"hits": hits, "confidence": [count / 20] * 10, "traced_hits": [], "traced_confidence": []}
+            values = {"name": "s", "network": "n", "seed": seed, "effect": effect}
+            results.append(Result(Cell(f"{seed}{effect}", values), found, None))
+    earned, designs = ablation.tables(settings, results)
+    ((effect, groups, rate, confidence, *traced),) = earned.rows
+    assert (effect, groups, traced) == ("noise", 2, [None, None])
+    assert rate.value == pytest.approx(0.3) and confidence.value == pytest.approx(0.15)
+    # Student's t of one degree of freedom, 12.706, times 0.1
+    assert rate.high - rate.value == pytest.approx(1.2706, rel=1e-3)
+    assert len(designs.rows) == 4 and designs.rows[0][4] == 0.8
