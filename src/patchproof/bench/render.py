@@ -42,11 +42,11 @@ REFRESHES = (1, 2, 4, 8)
 
 def render_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     """Every chart of the renderer, one after the other."""
-    world, rounds = set_world(20 if quick else 40, on_stage), 2 if quick else 15
+    world, rounds = set_world(80 if quick else 160, on_stage), 2 if quick else 15
     yield texture_chart(world, QUICK_WIDTHS_PX if quick else WIDTHS_PX, rounds, on_stage)
     yield edges_chart(world, 2 if quick else 8, rounds, on_stage)
     yield resolution_chart(world, 6 if quick else 40, rounds, on_stage)
-    yield refresh_chart(world.problem, *((10, 6, 2) if quick else (40, 12, 3)), on_stage)
+    yield refresh_chart(world.problem, *((30, 4, 2) if quick else (120, 4, 3)), on_stage)
     yield growth_chart(quick, on_stage)
     yield step_chart(world.problem, rounds, on_stage)
 

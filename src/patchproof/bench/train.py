@@ -38,7 +38,7 @@ CHUNK = 16
 VIEWS, QUICK_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
 STEP_SIZES = {"adam": (0.01, 0.025, 0.05, 0.1, 0.2), "sign": (0.01, 0.03, 0.1)}
 QUICK_STEP_SIZES = {"adam": (0.025, 0.05, 0.1), "sign": (0.03,)}
-ENSEMBLE_STEPS, ENSEMBLE_SEEDS = 20, 3
+ENSEMBLE_STEPS, ENSEMBLE_SEEDS = 60, 3
 SAMPLES, QUICK_SAMPLES = (8, 16, 32, 64, 128, 256), (8, 16, 32, 64)
 NETWORKS = ("mobilenet_v1_0.25_128", "mobilenet_v1_0.75_192", "squeezenet1.1_224")
 ENSEMBLE_MESH, ENSEMBLE_LABEL = "gz_suv.glb", "jeep"
@@ -187,7 +187,7 @@ def judge_of(problem: Problem, count: int) -> Judge:
 def draws_chart(quick: bool, on_stage: OnStage) -> Chart:
     """How far the loss of n views lies from that of all views, by how their conditions were drawn."""
     counts, scrambles, single = (QUICK_SAMPLES, 10, 256) if quick else (SAMPLES, 40, 2048)
-    world = set_world(10 if quick else 40, lambda stage, done, total: None)
+    world = set_world(40 if quick else 160, lambda stage, done, total: None)
     problem, shown = world.problem, world.shown()
     sobol = np.zeros((3, scrambles, counts[-1]))
     for seed in range(scrambles):

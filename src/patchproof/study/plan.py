@@ -18,7 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from patchproof.geometry import local_scale
-from patchproof.optimize.loop import SELECT_VIEWS, steps
+from patchproof.optimize.loop import SELECT_VIEWS, selects, steps
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.scene.bend import place_bent
@@ -32,7 +32,6 @@ from patchproof.sheet.piece import MODULES, SMALLEST_MARKER_MM
 from patchproof.study.plan_cost import Cost, measure_cost
 from patchproof.study.plan_errors import TermError, Terms, measure_terms
 
-DRAFT_STEPS = 10
 TERM_VIEWS = 16
 _VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
 
@@ -248,8 +247,9 @@ def _texture_texels(scene: MeshScene) -> tuple[int, float]:
 
 
 def _draft(problem: Problem, on_stage: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
-    """The loop's design after a few steps, in 8-bit colors."""
-    total = min(DRAFT_STEPS, problem.scene.settings.optimize.steps)
+    """The loop's design when it is first tried on the selection set, in 8-bit colors."""
+    settings = problem.scene.settings.optimize
+    total = next(number for number in range(1, settings.steps + 1) if selects(settings, number))
     for step in islice(steps(problem), total):
         on_stage("draft", step.state.number, total)
     design = from_pixels(as_pixels(step.state.design), problem.device)
