@@ -13,7 +13,7 @@ from test_optimize import SCENE
 
 
 def found(rate, recognized, judged=40, n=400):
-    return {"rate": rate, "n": n, "best_control": 0.1, "judged": judged, "recognized": recognized, "verdict": "kept"}
+    return {"rate": rate, "n": n, "judged": judged, "recognized": recognized, "verdict": "kept"}
 
 
 def result(scene, one):

@@ -40,10 +40,14 @@ class Outcomes:
 
 
 def try_out(
-    problem: Problem, design: np.ndarray, conditions: Conditions, progress: Callable[[int], None] = lambda n: None
+    problem: Problem,
+    design: np.ndarray,
+    conditions: Conditions,
+    progress: Callable[[int], None] = lambda n: None,
+    controls: Sequence[str] = CONTROLS,
 ) -> Outcomes:
     """Show the design and its controls under every condition to every classifier."""
-    return judged(problem, shown_with_controls(problem, design, CONTROLS), conditions, progress)
+    return judged(problem, shown_with_controls(problem, design, controls), conditions, progress)
 
 
 def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Shown]:
@@ -106,7 +110,7 @@ def promise_from(problem: Problem, outcomes: Outcomes) -> Promise:
 def control_claims(outcomes: Outcomes, model: int) -> dict[str, ControlClaim]:
     """Each control beside the design on the same conditions, for one classifier."""
     design, claims = outcomes.recognized["design"][model], {}
-    for kind in CONTROLS:
+    for kind in (kind for kind in CONTROLS if kind in outcomes.recognized):
         control = outcomes.recognized[kind][model]
         difference, interval = paired_difference(design.tolist(), control.tolist())
         claims[kind] = ControlClaim(

@@ -11,7 +11,7 @@ import json
 import os
 import platform
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,7 +24,7 @@ from PIL import Image
 import patchproof
 from patchproof.optimize.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimize.problem import Problem, set_problem
-from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimize.promise import CONTROLS, PROMISE_VIEWS, promise_from, try_out
 from patchproof.optimize.result import RESULT_FILES, read_result, save_result
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.scene import Scene, build_scene, load_scene
@@ -57,13 +57,14 @@ def optimize_scene(
     device: str = "cpu",
     resume: bool = False,
     overwrite: bool = False,
+    controls: Sequence[str] = CONTROLS,
     on_step: Callable[[Step, int], None] = lambda step, total: None,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
 ) -> Run:
     """Optimize the patch of a scene or its file into the folder `out` and promise its rate.
 
-    `seed` replaces the file's; `resume` goes on from the checkpoint.
+    `seed` replaces the file's; `resume` goes on from the checkpoint. A page names the best of `controls`, one at least.
     """
     out = Path(out)
     if not resume:
@@ -77,7 +78,7 @@ def optimize_scene(
     state = _resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
     save_result(problem, design, out)
-    promise = _promise(problem, design, on_promise)
+    promise = _promise(problem, design, controls, on_promise)
     details = _details(problem, promise, out, device)
     write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
     return Run(out, scene, design, promise, details)
@@ -141,7 +142,9 @@ def _doubt(moved: float, gradient: float | None) -> None:
     warnings.warn(f"the design is still what it began as: {why}", stacklevel=3)
 
 
-def _promise(problem: Problem, design: np.ndarray, on_promise: Callable[[int, int], None]) -> Promise:
+def _promise(
+    problem: Problem, design: np.ndarray, controls: Sequence[str], on_promise: Callable[[int, int], None]
+) -> Promise:
     done = 0
 
     def progress(n: int) -> None:
@@ -149,7 +152,8 @@ def _promise(problem: Problem, design: np.ndarray, on_promise: Callable[[int, in
         done += n
         on_promise(done, PROMISE_VIEWS)
 
-    return promise_from(problem, try_out(problem, design, problem.scene.draw("promise", PROMISE_VIEWS), progress))
+    conditions = problem.scene.draw("promise", PROMISE_VIEWS)
+    return promise_from(problem, try_out(problem, design, conditions, progress, controls))
 
 
 def _log_line(step: Step) -> dict[str, Any]:
