@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -181,3 +182,16 @@ def test_tables_that_will_not_do(folder, tmp_path, table, words):
     with pytest.raises(Refused, match=words):
         harden_images(options(folder), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_steps_that_fall_settle_where_the_loss_is_least():
+    """The loss is least at a gray of 0.6; steps of 0.05 to the end would swing between 0.563 and 0.613."""
+
+    def near(photos):
+        off = (photos.mean((1, 2, 3)) - 0.6).square()[:, None]
+        return torch.cat([-100 * off, torch.zeros_like(off)], 1)
+
+    classifier = replace(RED, network=near)
+    photo = np.full((32, 32, 3), 118, np.uint8)
+    (picture,) = harden([photo], [[0]], [classifier], "pgd", 0.2, 40)
+    assert abs(squares([picture], classifier).mean().item() - 0.6) < 0.006

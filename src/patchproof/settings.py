@@ -226,7 +226,7 @@ class OptimizeSettings(Strict):
     steps: Annotated[int, Field(ge=1)] = 240
     views: Annotated[int, Field(ge=1)] = 4  # many small steps: as many views, 12 at a time, got less far in 3 scenes
     refresh: Annotated[int, Field(ge=1)] = 1  # steps for which views keep their poses, lit and printed anew
-    mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on come from the worst
+    mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on are like the worst
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
     # of sRGB's range, in which a larger one only jumps to the ends; by default 0.05 for a patch, 0.015 for a texture
