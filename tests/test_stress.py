@@ -97,9 +97,11 @@ def test_mined_views_take_pose_and_light_of_expectedly_bad_draws_and_nothing_els
     others = [field.name for field in fields(drawn) if field.name not in names]
     np.testing.assert_array_equal(rows_of(mined, others), rows_of(drawn[:12], others))
     np.testing.assert_array_equal(rows_of(mined, names)[::2], rows_of(drawn[:12], names)[::2])
-    fresh = rows_of(drawn[76:], names).reshape(6, CANDIDATES, -1)  # one of each eight, and draws that no try has used
-    for row, group in zip(rows_of(mined, names)[1::2], fresh, strict=True):
-        assert (row == group).all(1).sum() == 1
+    fresh, tried = drawn[76:], drawn[12:76]  # the worst of each eight draws that no try has used
+    expected = expected_losses(tried, clean_losses(problem, tried), fresh).reshape(6, CANDIDATES)
+    groups = zip(rows_of(mined, names)[1::2], rows_of(fresh, names).reshape(6, CANDIDATES, -1), expected, strict=True)
+    for row, group, losses in groups:
+        assert (row == group).all(1).nonzero()[0].tolist() == [losses.argmax()]
 
 
 def test_the_fit_finds_what_is_hard_and_ignores_what_does_not_vary(tmp_path):
