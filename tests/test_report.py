@@ -160,7 +160,7 @@ def test_difference_maps_have_one_scale_and_show_what_was_not_measured():
     assert colors[1, 1, 3] == 0 and colors[0, 0, 3] == 255
 
 
-PROBE = """<script>
+PROBE = """<script>addEventListener("load", () => {  // before the frame's own: by now every fetch has ended
 const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg"));
 const wide = all.filter(e => e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName);
 const small = all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length;
@@ -168,7 +168,7 @@ const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.compl
 const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"));
 document.title = JSON.stringify({wide, small, broken, fetched, width: document.documentElement.scrollWidth,
   inner: innerWidth, images: document.images.length, errors: window.troubles});
-</script></body>"""
+});</script></body>"""
 EARLY = "<head><script>window.troubles = []; window.onerror = m => { window.troubles.push(String(m)) }</script>"
 
 
