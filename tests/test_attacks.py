@@ -95,7 +95,7 @@ def test_a_network_that_shouts_is_not_taken_for_a_robust_one():
         assert not survives_pgd(network, pictures, labels, epsilon)
 
 
-def test_steering_has_the_direction_of_the_mean_loss():
+def test_even_loss_has_the_direction_of_the_mean_loss():
     generator = torch.Generator().manual_seed(0)
     logits = [torch.randn(5, 4, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2)]
     labels = [torch.tensor([0, 1, 2, 3, 0]), torch.tensor([3, 2, 1, 0, 0])]

@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,6 +97,14 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
             step = _select(problem, selection, step)
         state = step.state
         yield step
+
+
+def best_design(problem: Problem) -> np.ndarray:
+    """Run the whole loop; the pixels of the design that the selection set liked best."""
+    state = start(problem)
+    for step in steps(problem, state):
+        state = step.state
+    return problem.subject.pixels(state.best)
 
 
 def _step(problem: Problem, state: State, seen: Seen) -> Step:

@@ -24,6 +24,7 @@ from pydantic import Field
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.network import recognized
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.patch import Patch
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import Problem, set_problem
@@ -33,12 +34,11 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Seen, see
 from patchproof.report.tables import Drawing, Estimate, Table, mean
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import build_scene
 from patchproof.settings import Refused, SceneSettings, Strict, expand, read_toml, validated
 from patchproof.study.path_traced import photograph_traced
 from patchproof.study.plan_terms import Setup, scene_terms
 from patchproof.study.study import Cell, Result, Study, short_name
-from patchproof.study.trials import best_design
+from patchproof.study.trained import scene_of
 
 ALL, PRINTER = "all", "printer's colors"
 EFFECTS = (
@@ -127,9 +127,7 @@ def cells(settings: AblationSettings, base: Path) -> list[Cell]:
 
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train without the effect; hits and confidences in the whole world."""
-    values = cell.values
-    folder = Path(expand(values["file"], base)).resolve().parent
-    scene = build_scene(validated(SceneSettings, values["scene"], values["file"]), folder, values["seed"])
+    values, scene = cell.values, scene_of(base, cell)
     problem = set_problem(scene, models=(expand(values["network"], base),))
     design = best_design(problem if values["effect"] == ALL else without(problem, values["effect"]))
     shown = problem.subject.shown(from_pixels(design, problem.device))

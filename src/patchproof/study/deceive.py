@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.promise import judged, shown_with_controls
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.study import Cell, Result, Study, short_name
@@ -36,7 +37,6 @@ from patchproof.study.trained import (
     said,
     scenes_of,
     tested_in,
-    train,
     trained_on,
 )
 from patchproof.study.turntable import contact_sheet, pictures, sides
@@ -70,7 +70,7 @@ def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, show design and controls to all."""
     problem = problem_of(base, cell)
-    design = train(trained_on(problem, cell))
+    design = best_design(trained_on(problem, cell))
     things = shown_with_controls(problem, design, CONTROLS)
     found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))
     sheet = f"{cell.name}.sheet.png"

@@ -26,7 +26,7 @@ from pydantic import Field
 from patchproof.channel.printer import IN_GAMUT, Printer, identity_printer, load_printer, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimize.goals import printable_colors
-from patchproof.optimize.loop import steps
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.render.photograph import expose
@@ -108,7 +108,7 @@ def gamut_cell(
     """A design for each way, all from this seed, in the same `views` conditions by every printer."""
     problem, designs = set_problem(build_scene(scene.settings, scene.base, seed)), []
     for way in ways:
-        designs.append(_optimized(way_problem(problem, way)))
+        designs.append(best_design(way_problem(problem, way)))
     missed = np.array([_missed(problem.printer, design) for design in designs])
     outcomes = _reprinted(problem, designs, printers, views)
     return Outcomes(tuple(w.name for w in ways), tuple(p.name for p in printers), outcomes, missed)
@@ -146,14 +146,6 @@ def way_problem(problem: Problem, way: Way) -> Problem:
     printable = printable_colors(problem.printer).to(problem.device) if way.nps else None
     subject = replace(problem.subject, scene=scene, printer=printer, printable=printable)
     return replace(problem, scene=scene, printer=printer, subject=subject)
-
-
-def _optimized(problem: Problem) -> np.ndarray:
-    """The pixels of the best design that the loop finds."""
-    state = None
-    for step in steps(problem):
-        state = step.state
-    return problem.subject.pixels(state.best)
 
 
 def _reprinted(problem: Problem, designs: Sequence[np.ndarray], printers, views: int) -> np.ndarray:

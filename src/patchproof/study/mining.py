@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from patchproof.optimize.loop import SELECT_VIEWS, selections, start, steps
+from patchproof.optimize.loop import SELECT_VIEWS, best_design, selections
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import Shown
@@ -104,10 +104,7 @@ def _thirds(settings: OptimizeSettings) -> int:
 
 def _trained(problem: Problem) -> Shown:
     """The best design of the whole loop, in 8 bits."""
-    state = start(problem)
-    for step in steps(problem, state):
-        state = step.state
-    return problem.subject.shown(from_pixels(problem.subject.pixels(state.best), problem.device))
+    return problem.subject.shown(from_pixels(best_design(problem), problem.device))
 
 
 def _hits(problem: Problem, things: dict[str, Shown], conditions: Conditions) -> dict[str, str]:

@@ -30,6 +30,7 @@ from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.patch import Patch
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
@@ -59,7 +60,7 @@ from patchproof.settings import (
 from patchproof.sheet.piece import Piece
 from patchproof.study.image_classes import ImageClass, classes_of, render_class
 from patchproof.study.study import Cell, Result, Study
-from patchproof.study.trials import best_design, clustered, enlarged, grouped, logits_of, png_of, short
+from patchproof.study.trials import clustered, enlarged, grouped, logits_of, png_of, short
 
 KINDS = ("bare", "grey", "noise", "patch")
 _TILE_PX = 192

@@ -28,6 +28,7 @@ from pydantic import Field
 from torch import Tensor
 
 from patchproof.geometry import local_scale
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.patch import Patch
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem, set_problem
@@ -52,7 +53,7 @@ from patchproof.settings import (
 from patchproof.sheet.piece import sheet_id
 from patchproof.study.image_classes import write_labels, write_renders
 from patchproof.study.study import Cell, Result, Study
-from patchproof.study.trials import best_design, clustered, enlarged, grouped, logits_of, passes, png_of, short
+from patchproof.study.trials import clustered, enlarged, grouped, logits_of, passes, png_of, short
 
 KINDS = ("bare", "grey", "noise", "2d", "3d")
 HARD = 0.2  # clean rate up to which an object counts as misread

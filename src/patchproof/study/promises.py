@@ -65,17 +65,16 @@ def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise and count of one combination."""
     from patchproof.optimize.run import optimize_scene
-    from patchproof.scene.scene import build_scene
     from patchproof.study.reprint import reprint
     from patchproof.study.sheet import sheet_of
+    from patchproof.study.trained import scene_of
     from patchproof.study.verify import verify_photos
 
-    values = cell.values
-    scene_folder = Path(expand(values["file"], base)).resolve().parent
-    scene = build_scene(validated(SceneSettings, values["scene"], values["file"]), scene_folder, values["seed"])
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = optimize_scene(scene, folder / "run", controls=("bare",))  # all of them take most of a promise's time
+        made = optimize_scene(
+            scene_of(base, cell), folder / "run", controls=("bare",)
+        )  # all of them take most of a promise's time
         sheet_of(made, folder / "sheet.pdf")
         pdf, photos = folder / "sheet.pdf", folder / "photos"
         reprint(pdf, made, settings.photos, photos, path_traced=settings.path_traced)

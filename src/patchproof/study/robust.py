@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.promise import judged
 from patchproof.report.tables import Drawing, Table
@@ -37,7 +38,6 @@ from patchproof.study.trained import (
     said,
     scenes_of,
     tested_in,
-    train,
     trained_on,
     verdict,
 )
@@ -80,7 +80,7 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train for one class on one network; rates on all, pictures, mean color, attributions."""
     problem = problem_of(base, cell)
     training, subject = trained_on(problem, cell), problem.subject
-    design = train(training)
+    design = best_design(training)
     things = {"start": subject.shown(subject.start()), "design": subject.shown(from_pixels(design, problem.device))}
     found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))
     views = sides(problem, _SIDES)

@@ -22,13 +22,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.optimize.loop import start, steps
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.optimize.promise import Outcomes
 from patchproof.optimize.texture import Texture
 from patchproof.report.tables import Estimate, difference, mean, rate
 from patchproof.scene.export import write_glb
-from patchproof.scene.scene import build_scene
+from patchproof.scene.scene import Scene, build_scene
 from patchproof.settings import Refused, SceneSettings, Strict, expand, read_toml, validated
 from patchproof.study.study import Cell, Result, short_name
 
@@ -93,10 +92,14 @@ def cell_of(values: Mapping[str, Any], row: str, trained: Sequence[str], tested:
 
 def problem_of(base: Path, cell: Cell) -> Problem:
     """The cell's scene before all the networks that test it."""
+    return set_problem(scene_of(base, cell), models=tuple(expand(name, base) for name in cell.values["tested"]))
+
+
+def scene_of(base: Path, cell: Cell) -> Scene:
+    """The scene that a cell's values hold, its paths relative to the scene file's folder."""
     values = cell.values
     folder = Path(expand(values["file"], base)).resolve().parent
-    scene = build_scene(validated(SceneSettings, values["scene"], values["file"]), folder, values["seed"])
-    return set_problem(scene, models=tuple(expand(name, base) for name in values["tested"]))
+    return build_scene(validated(SceneSettings, values["scene"], values["file"]), folder, values["seed"])
 
 
 def trained_on(problem: Problem, cell: Cell) -> Problem:
@@ -107,14 +110,6 @@ def trained_on(problem: Problem, cell: Cell) -> Problem:
         classifiers=tuple(problem.classifiers[i] for i in chosen),
         indices=tuple(problem.indices[i] for i in chosen),
     )
-
-
-def train(problem: Problem) -> np.ndarray:
-    """Run the whole loop; the best design's pixels."""
-    state = start(problem)
-    for step in steps(problem, state):
-        state = step.state
-    return problem.subject.pixels(state.best)
 
 
 def said(outcomes: Outcomes) -> dict[str, Any]:

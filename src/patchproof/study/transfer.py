@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchproof.optimize.loop import best_design
 from patchproof.optimize.promise import judged, shown_with_controls
 from patchproof.report.tables import Drawing, Estimate, Table, rate
 from patchproof.scene.mesh_scene import MeshScene
@@ -36,7 +37,6 @@ from patchproof.study.trained import (
     said,
     scenes_of,
     tested_in,
-    train,
     trained_on,
     verdict,
 )
@@ -72,7 +72,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem = problem_of(base, cell)
     files, things = {}, {"design": None}
     if cell.values["trained"]:
-        design = train(trained_on(problem, cell))
+        design = best_design(trained_on(problem, cell))
         things = shown_with_controls(problem, design, ())
         files[f"{cell.name}.{'glb' if problem.scene.piece is None else 'png'}"] = object_file(problem, design)
     found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))

@@ -26,14 +26,6 @@ from patchproof.study.study import Result
 _CHUNK = 16
 
 
-def best_design(problem: Problem) -> np.ndarray:
-    """Run the whole loop; the pixels, as printed, of the design that the selection set liked best."""
-    state = loop.start(problem)
-    for step in loop.steps(problem):
-        state = step.state
-    return problem.subject.pixels(state.best)
-
-
 def passes(problem: Problem) -> int:
     """Views that each network sees in training and selection."""
     settings = problem.scene.settings.optimize
