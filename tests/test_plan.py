@@ -25,6 +25,7 @@ from patchproof.sheet.piece import lay_out_piece
 from patchproof.study.plan import Plan, marker_plan, other_surface, plan_lines, plan_scene, resolution_plan, scales
 from patchproof.study.plan_cost import measure_cost
 from patchproof.study.plan_errors import measure_terms
+from patchproof.study.plan_samples import sample_plan
 from patchproof.study.plan_terms import Setup, scene_terms
 
 
@@ -90,6 +91,17 @@ def test_what_can_go_adds_up_to_less_than_selection_can_tell(plan):
     assert gone and sum(gone) < plan.terms.threshold
     assert all(abs(error.bias) <= error.confidence + 1e-12 for error in errors if error.verdict != "off")
     assert plan.terms.together is not None
+
+
+def test_four_times_the_samples_would_halve_what_chance_leaves(plan):
+    selection, promise, photos = plan.samples
+    assert (selection.n, promise.n) == (64, 400) and selection.half_width == pytest.approx(1.96 * plan.terms.threshold)
+    for one in plan.samples:
+        assert one.next_n == 4 * one.n and one.next_half_width <= one.half_width
+    _, promise, photos = sample_plan(0.8, 0.02)
+    assert promise.half_width == pytest.approx(0.039, abs=1e-3)
+    assert promise.next_half_width == pytest.approx(0.0196, abs=1e-3)
+    assert photos.half_width > 1.96 * (0.8 * 0.2 / 40) ** 0.5  # the promise's own chance is in it
 
 
 def test_terms_that_are_off_are_named_with_the_key_that_turns_them_on(plan):

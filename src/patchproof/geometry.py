@@ -28,18 +28,20 @@ def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray
 
 
 def look_at(eye_mm, target_mm, roll_deg=0.0, up=(0.0, 1.0, 0.0)) -> np.ndarray:
-    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by roll."""
-    eye, target = np.asarray(eye_mm, float), np.asarray(target_mm, float)
+    """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by roll.
+
+    Arrays, N×3 and N, give N×4×4.
+    """
+    eye, target, roll = np.asarray(eye_mm, float), np.asarray(target_mm, float), np.radians(roll_deg)[..., None]
     z = _unit(target - eye)
     side = np.cross(z, _unit(up))
-    if np.linalg.norm(side) < 1e-9:  # straight up or down: any right hand will do, take world x
-        side = np.cross(z, [0.0, 0.0, 1.0])
+    # straight up or down: any right hand will do, take world x
+    side = np.where(np.linalg.norm(side, axis=-1, keepdims=True) < 1e-9, np.cross(z, [0.0, 0.0, 1.0]), side)
     x = _unit(side)
     y = np.cross(z, x)  # down
-    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
-    rotation = np.stack([c * x - s * y, s * x + c * y, z])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    rotation = np.stack([np.cos(roll) * x - np.sin(roll) * y, np.sin(roll) * x + np.cos(roll) * y, z], -2)
+    pose = np.zeros((*eye.shape[:-1], 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3:], pose[..., 3, 3] = rotation, -rotation @ eye[..., None], 1
     return pose
 
 
@@ -154,4 +156,4 @@ def _conditioner(points) -> np.ndarray:
 
 def _unit(vector) -> np.ndarray:
     vector = np.asarray(vector, float)
-    return vector / np.linalg.norm(vector)
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)

@@ -161,12 +161,7 @@ def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, co
     directions = geometry.orbit(conditions.azimuth_deg, conditions.elevation_deg, frame.normal, frame.up)
     eyes = targets + conditions.distance_mm[:, None] * directions
     _refuse_inside(mesh, eyes)
-    return np.stack(
-        [
-            geometry.look_at(eye, target, roll, frame.up)
-            for eye, target, roll in zip(eyes, targets, conditions.roll_deg, strict=True)
-        ]
-    )
+    return geometry.look_at(eyes, targets, conditions.roll_deg, frame.up)
 
 
 def _smallest_scales(settings: SceneSettings, mesh: Mesh, frame: Frame, card: Placement, camera) -> np.ndarray:

@@ -1,9 +1,9 @@
 """`plan`: what of a scene is modeled, what is not, and why, each time with the figure that decided it.
 
 In: a scene file. Out: `Plan`: where the piece lies and what a simpler or richer surface would do, the pixels that views
-have for design and markers, the error that each term of light, camera and renderer would leave, and the cost of a step.
-All of it comes from the code that optimizes: a draft of a few steps is what the terms are measured with, because a
-classifier that a design says nothing to would miss none of them.
+have for design and markers, the error that each term of light, camera and renderer would leave, what chance leaves, and
+the cost of a step. All of it comes from the code that optimizes: a draft of a few steps is what the terms are measured
+with, because a classifier that a design says nothing to would miss none of them.
 
 Left out on purpose: deciding for the user. The plan says what can go; the scene file says what is modeled.
 """
@@ -31,6 +31,7 @@ from patchproof.settings import Refused, Strict
 from patchproof.sheet.piece import MODULES, SMALLEST_MARKER_MM
 from patchproof.study.plan_cost import Cost, measure_cost
 from patchproof.study.plan_errors import TermError, Terms, measure_terms
+from patchproof.study.plan_samples import Sample, sample_lines, sample_plan
 
 TERM_VIEWS = 16
 _VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
@@ -100,6 +101,7 @@ class Plan(Strict):
     markers: Markers | None
     draft: Draft
     terms: Terms
+    samples: tuple[Sample, ...]
     omitted: tuple[str, ...]
     cost: Cost | None
     warnings: tuple[str, ...]
@@ -135,6 +137,7 @@ def plan_scene(
         markers=None if scene.piece is None else marker_plan(scene),
         draft=draft,
         terms=terms,
+        samples=sample_plan(draft.rate, terms.threshold),
         omitted=_OMITTED_MESH if isinstance(scene, MeshScene) else _OMITTED_PICTURES,
         cost=cost,
         warnings=scene.warnings,
@@ -270,6 +273,7 @@ def plan_lines(plan: Plan) -> list[str]:
     if plan.markers is not None:
         lines += ["markers", *_marker_lines(plan.markers)]
     lines += _term_lines(plan)
+    lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)", *sample_lines(plan.samples)]
     lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
     return lines if plan.cost is None else [*lines, *_cost_lines(plan.cost)]
 
