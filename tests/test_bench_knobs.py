@@ -69,6 +69,12 @@ def test_paired_intervals_leave_out_what_settings_share():
     assert (high - low) / 2 == pytest.approx(4.303 * 0.5 * math.sqrt(2 / 3), rel=1e-3)
 
 
+def test_the_luckiest_setting_is_judged_on_the_seeds_that_did_not_choose_it():
+    errors = np.array([[1.0, 0.8, 0.1], [1.0, 1.6, 0.1], [1.0, 0.8, 0.1], [1.0, 1.6, 0.1]])
+    assert measure.checked_pick(errors, [2, 1, 3], 0) == (1, pytest.approx(1 / 1.6 - 1))
+    assert measure.checked_pick(errors, [2, 3, 3], 0) == (0, 0)
+
+
 def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     seen = []
     score = loop._score
