@@ -1,0 +1,49 @@
+"""The command line: verbs only. Each one reads its arguments, calls one function, and prints a short summary.
+
+Heavy imports happen inside the verbs, so that help is quick. What a user can cause ends in one sentence and exit code
+1.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+import typer
+
+from patchproof.cli.calibrate import camera, printer
+from patchproof.cli.experiments import bench, harden, study
+from patchproof.cli.journey import demo, evaluate, optimize, plan, reprint, sheet, verify
+from patchproof.settings import Refused
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Optimise a patch on a 3D object, print it at true size, photograph it, and judge the photographs.",
+)
+_calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
+
+for _verb in (demo, plan, optimize, evaluate, sheet, reprint, verify):
+    app.command()(_verb)
+app.add_typer(_calibrate, name="calibrate")
+for _verb in (printer, camera):
+    _calibrate.command()(_verb)
+for _verb in (harden, study, bench):
+    app.command()(_verb)
+
+
+def main() -> None:
+    """Run the command line; a refusal is one sentence on standard error and exit code 1."""
+    warnings.formatwarning = lambda message, *where: f"warning: {message}\n"
+    try:
+        app()
+    except Refused as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from None
+    except OSError as error:
+        print(f"Expected files that can be read and written, got {error}: mend that and try again.", file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("Stopped.", file=sys.stderr)
+        raise SystemExit(130) from None

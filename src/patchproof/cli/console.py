@@ -1,0 +1,93 @@
+"""What all commands share: options, progress, and how things are said.
+
+Summaries go to standard output; warnings, failures and progress to standard error.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Annotated
+
+import typer
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
+Device = Annotated[str, typer.Option(help="cpu or cuda.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on where a run that was stopped left off.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Local processes that share the work.")]
+Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, in place of local processes.")]
+Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar with time left on standard error: call it with a stage's name, what is done, and the total."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description:>12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        tasks: dict[str, int] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def say(*lines: str) -> None:
+    """A summary's lines."""
+    for line in lines:
+        print(line)
+
+
+def say_study(finished) -> None:
+    """A study's tables, and on standard error what failed."""
+    from patchproof.report.tables import text_lines
+
+    for table in finished.tables:
+        say(table.title, *(f"  {line}" for line in text_lines(table)))
+    for cell, sentence in finished.failed.items():
+        print(f"failed: {cell}: {sentence}", file=sys.stderr)
+
+
+def warn(lines: tuple[str, ...]) -> None:
+    """One line each, on standard error."""
+    for line in lines:
+        print(f"warning: {line}", file=sys.stderr)
+
+
+def names_of(models: str | None) -> tuple[str, ...] | None:
+    """Names between commas."""
+    return None if models is None else tuple(name.strip() for name in models.split(",") if name.strip())
+
+
+def pair_of(text: str, option: str) -> tuple[float, float]:
+    """A number, or two as XxY."""
+    try:
+        numbers = [float(part) for part in text.lower().split("x")]
+        x, y = numbers * 2 if len(numbers) == 1 else numbers
+        if not (0 < x < float("inf") and 0 < y < float("inf")):
+            raise ValueError
+    except ValueError:
+        raise typer.BadParameter(
+            "takes one or two positive numbers, such as 0.97 or 0.97x0.98", param_hint=option
+        ) from None
+    return x, y

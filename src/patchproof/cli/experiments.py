@@ -1,0 +1,112 @@
+"""Hardened images, the paper's other experiments, and benchmarks."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from patchproof.cli.console import Cluster, Jobs, Overwrite, Resume, names_of, progress, say, say_study
+
+
+class Hardening(str, Enum):
+    """Ways to step towards the true class."""
+
+    pgd = "pgd"
+    fgsm = "fgsm"
+    adam = "adam"
+
+
+def harden(
+    images: Annotated[Path, typer.Argument(help="A folder of images.")],
+    labels: Annotated[Path, typer.Option(help="CSV: file name, label.")],
+    model: Annotated[str, typer.Option(help="Comma-separated classifiers to harden for, all together.")],
+    out: Annotated[Path, typer.Option(help="Folder for the PNGs and the tables.")],
+    method: Annotated[Hardening, typer.Option(help="How to step.")] = Hardening.pgd,
+    eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
+    steps: Annotated[int, typer.Option(min=1, help="Steps.")] = 100,
+    step_size: Annotated[float | None, typer.Option(help="In place of the method's own.")] = None,
+    judges: Annotated[str | None, typer.Option(help="Comma-separated classifiers that only judge.")] = None,
+    evaluate: Annotated[str, typer.Option(help="Attacks to withstand: fgsm, pgd.")] = "",
+    attack_eps: Annotated[str, typer.Option(help="Their ε.")] = "0.01,0.02,0.04",
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """Change labeled images so that classifiers recognize them better, and attack them."""
+    from patchproof.settings import validated
+    from patchproof.study.harden import HardenSettings, harden_images
+
+    given = {
+        "images": str(images),
+        "labels": str(labels),
+        "models": names_of(model),
+        "together": True,
+        "judges": names_of(judges) or (),
+        "methods": (method.value,),
+        "epsilons": (eps,),
+        "steps": steps,
+        "step_size": step_size,
+        "attacks": names_of(evaluate),
+        "attack_epsilons": names_of(attack_eps),
+    }
+    with progress() as bar:
+        finished = harden_images(
+            validated(HardenSettings, given, "the options"),
+            out,
+            resume=resume,
+            overwrite=overwrite,
+            jobs=jobs,
+            cluster=cluster,
+            on_cell=lambda done, total: bar("harden", done, total),
+        )
+    say_study(finished)
+    say(f"images: {out}, tables: {out / 'harden.html'}")
+    raise typer.Exit(0 if finished.results else 1)
+
+
+def study(
+    name: Annotated[str, typer.Argument(help="A study's name.")],
+    config: Annotated[Path, typer.Option(help="What to vary: a TOML file.")],
+    out: Annotated[Path, typer.Option(help="Folder for tables, figures and the page.")],
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """One of the paper's experiments: many cells, tables with intervals, figures and one page."""
+    from patchproof.study.study import run_study
+
+    with progress() as bar:
+        finished = run_study(
+            name,
+            config,
+            out,
+            resume=resume,
+            overwrite=overwrite,
+            jobs=jobs,
+            cluster=cluster,
+            on_cell=lambda done, total: bar("cells", done, total),
+        )
+    say_study(finished)
+    say(f"page: {out / name}.html")
+    raise typer.Exit(0 if finished.results else 1)
+
+
+def bench(
+    name: Annotated[
+        str, typer.Argument(help="A benchmark: render, train, numbers, printer, detect, evidence, or all.")
+    ] = "all",
+    quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for charts, table and JSON.")] = Path("patchproof-bench"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Speed against accuracy of each knob on this machine: charts, a table and JSON."""
+    from patchproof.bench.run import run_bench
+
+    with progress() as bar:
+        lines = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)
+    say(*lines)

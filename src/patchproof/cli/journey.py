@@ -1,0 +1,295 @@
+"""From a scene to a verdict: demo, plan, optimize, evaluate, sheet, reprint, verify."""
+
+from __future__ import annotations
+
+import sys
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from patchproof.cli.console import (
+    Cluster,
+    Device,
+    Jobs,
+    Models,
+    Overwrite,
+    Resume,
+    Seed,
+    names_of,
+    pair_of,
+    progress,
+    say,
+    warn,
+)
+
+
+class Control(str, Enum):
+    """Controls that can be printed."""
+
+    mean = "mean"
+    grey = "grey"
+    noise = "noise"
+    shuffled = "shuffled"
+    blank = "blank"
+
+
+class Shown(str, Enum):
+    """What hangs on the object in place of the design."""
+
+    bare = "bare"
+    mean = "mean"
+    grey = "grey"
+    noise = "noise"
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
+        "patchproof-demo"
+    ),
+    overwrite: Overwrite = False,
+) -> None:
+    """The whole journey, offline, on a built-in object and classifier."""
+    from patchproof.study.demo import run_demo
+
+    with progress() as bar:
+        summary = run_demo(out, overwrite=overwrite, on_stage=bar)
+    say(*summary)
+
+
+def plan(
+    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
+    out: Annotated[Path | None, typer.Option(help="Write the plan as JSON, too.")] = None,
+    no_timing: Annotated[bool, typer.Option("--no-timing", help="Leave out the cost of a step.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """What is modeled, what is not, and why."""
+    from patchproof.output import check_file, write_whole
+    from patchproof.study.plan import plan_lines, plan_scene
+
+    if out is not None:
+        check_file(out, overwrite)
+    with progress() as bar:
+        found = plan_scene(scene, timing=not no_timing, on_stage=bar)
+    warn(found.warnings)
+    say(*plan_lines(found))
+    if out is not None:
+        write_whole(out, lambda path: path.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8"))
+
+
+def optimize(
+    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
+    out: Annotated[Path, typer.Option(help="Folder for the run.")],
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
+    overwrite: Overwrite = False,
+    device: Device = "cpu",
+    seed: Seed = None,
+) -> None:
+    """Optimise the patch of a scene and promise its rate."""
+    from patchproof.optimize.run import optimize_scene
+    from patchproof.report.summary import promise_lines
+
+    with progress() as bar:
+        run = optimize_scene(
+            scene,
+            out,
+            seed=seed,
+            device=device,
+            resume=resume,
+            overwrite=overwrite,
+            on_scene=lambda loaded: warn(loaded.warnings),
+            on_step=lambda step, total: bar("optimise", step.state.number, total),
+            on_promise=lambda done, total: bar("promise", done, total),
+        )
+    say(*promise_lines(run.promise), f"run: {out}")
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="A finished run.")],
+    models: Models = None,
+    n: Annotated[int, typer.Option(min=1, help="Fresh conditions.")] = 400,
+    seed: Seed = None,
+    device: Device = "cpu",
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """Rates on fresh conditions, with controls, on any classifiers."""
+    from patchproof.optimize.evaluate import evaluate_run
+    from patchproof.report.summary import evaluation_lines
+
+    with progress() as bar:
+        result = evaluate_run(
+            run,
+            models=names_of(models),
+            n=n,
+            seed=seed,
+            device=device,
+            jobs=jobs,
+            cluster=cluster,
+            on_view=lambda done, total: bar("evaluate", done, total),
+        )
+    say(*evaluation_lines(result), f"written: {run / 'evaluate.json'}")
+
+
+def sheet(
+    out: Annotated[Path, typer.Option(help="The PDF; its manifest is written beside it.")],
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
+    ] = None,
+    template: Annotated[str | None, typer.Option(help="A template's name or file.")] = None,
+    control: Annotated[Control | None, typer.Option(help="The sheet of a control in place of the design's.")] = None,
+    copies: Annotated[int, typer.Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
+    check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the page: design, markers, chart and rulers at true size."""
+    from patchproof.optimize.run import load_run
+    from patchproof.output import check_file
+    from patchproof.sheet.shop import shop_lines
+    from patchproof.sheet.write import check_sheet, manifest_paths
+    from patchproof.study.sheet import blank_page, sheet_of, sheet_of_several
+
+    runs = runs or []
+    if copies > 1 and len(runs) != 1:
+        raise typer.BadParameter("copies are of one run's sheet", param_hint="--copies")
+    paths = manifest_paths(out, len(runs))
+    for path in (out, *paths):
+        check_file(path, overwrite)
+    kind = control.value if control else None
+    if not runs:
+        manifests = [blank_page(out, template=template, control=kind)]
+    elif len(runs) == 1:
+        manifests = [sheet_of(load_run(runs[0]), out, template=template, control=kind, copies=copies)]
+    else:
+        manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=kind)
+    for manifest, path in zip(manifests, paths, strict=True):
+        say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
+    if check:
+        lines = (line for manifest in manifests for line in check_sheet(manifest))
+        say(*dict.fromkeys(lines), *shop_lines(out))  # what holds for several designs is said once
+
+
+def reprint(
+    pdf: Annotated[Path, typer.Argument(help="A sheet's PDF.")],
+    run: Annotated[Path, typer.Option(help="The run it was made from.")],
+    n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
+    out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
+    seed: Seed = None,
+    printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
+    print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
+    control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
+    scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
+    card: Annotated[
+        bool, typer.Option("--card", help="Photograph the uncut page with a bank card on it instead.")
+    ] = False,
+    path_traced: Annotated[
+        bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
+    ] = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Print the PDF in simulation, put it back on the object, and photograph it."""
+    from patchproof.optimize.run import load_run
+    from patchproof.study.reprint import reprint as reprint_sheet
+    from patchproof.study.reprint import scan
+
+    scale = pair_of(print_scale, "--print-scale")
+    if scan_dpi is not None and control is not None:
+        raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
+    if card and (scan_dpi is not None or control is not None):
+        raise typer.BadParameter("takes the page as it is; leave --scan-dpi and --control out", param_hint="--card")
+    if path_traced and (card or scan_dpi is not None):
+        raise typer.BadParameter(
+            "is of the piece on its object; leave --scan-dpi and --card out", param_hint="--path-traced"
+        )
+    if scan_dpi is not None:
+        truth = scan(pdf, load_run(run), n, out, scan_dpi, printer=printer, print_scale=scale, overwrite=overwrite)
+    elif card:
+        from patchproof.study.card_photo import photograph_cards
+
+        with progress() as bar:
+            truth = photograph_cards(
+                pdf,
+                load_run(run),
+                n,
+                out,
+                seed=seed,
+                printer=printer,
+                print_scale=scale,
+                overwrite=overwrite,
+                on_photo=lambda done, total: bar("photograph", done, total),
+            )
+    else:
+        with progress() as bar:
+            truth = reprint_sheet(
+                pdf,
+                load_run(run),
+                n,
+                out,
+                seed=seed,
+                printer=printer,
+                print_scale=scale,
+                control=control.value if control else None,
+                path_traced=path_traced,
+                jobs=jobs,
+                cluster=cluster,
+                overwrite=overwrite,
+                on_photo=lambda done, total: bar("photograph", done, total),
+            )
+    say(f"{len(truth)} photographs: {out}")
+
+
+def verify(
+    photos: Annotated[Path, typer.Argument(help="A folder of photographs.")],
+    sheet: Annotated[Path, typer.Option(help="The manifest that was written beside the PDF.")],
+    out: Annotated[Path, typer.Option(help="Folder for the report.")],
+    models: Models = None,
+    controls: Annotated[Path | None, typer.Option(help="Photographs of a control, one control per folder.")] = None,
+    scan_dpi: Annotated[
+        float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
+    ] = None,
+    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    card: Annotated[bool, typer.Option("--card", help="A bank card lies in its outline on the uncut page.")] = False,
+    camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
+    require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
+    ledger: Annotated[int, typer.Option(min=0, help="Photographs in the gap ledger at most; 0 for none.")] = 24,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure photographs of the print and judge them against the promise."""
+    from patchproof.report.summary import verdict_lines
+    from patchproof.study.verify import verify_photos
+
+    if require not in (None, "kept"):
+        raise typer.BadParameter('takes "kept" only', param_hint="--require")
+    with progress() as bar:
+        report = verify_photos(
+            photos,
+            sheet,
+            out,
+            models=names_of(models),
+            controls=controls,
+            scan_dpi=scan_dpi,
+            ruler_mm=None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm"),
+            ledger_photos=ledger,
+            card=card,
+            camera=camera,
+            jobs=jobs,
+            cluster=cluster,
+            resume=resume,
+            overwrite=overwrite,
+            on_photo=lambda done, total: bar("verify", done, total),
+        )
+    say(*verdict_lines(report), f"report: {out / 'report.html'}")
+    nothing = report.summary.judged == 0 and report.summary.measured == 0
+    if nothing:
+        print(
+            "Expected photographs that can be judged or measured, got none: see the codes in the report.",
+            file=sys.stderr,
+        )
+    raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)
