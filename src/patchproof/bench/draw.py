@@ -1,12 +1,13 @@
 """Charts of benchmarks as PNG: cost to the right, error upwards with intervals, the front and the default marked.
 
 In: a `Chart`. Out: a file. Points on the Pareto front are filled and joined, the others are hollow; a ring is the
-default. Machine, threads and date stand in the corner.
+default. Settings that all cost the same stand side by side. Machine, threads and date stand in the corner.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import singledispatch
 from pathlib import Path
 from textwrap import fill
@@ -38,7 +39,7 @@ def save_chart(chart: Chart, about: Mapping[str, Any], path: Path) -> None:
         axes = figure.add_subplot()
         _draw(chart, axes)
         figure.suptitle(chart.title, x=0.01, ha="left", fontsize=12)
-        axes.set_xlabel(chart.cost_label)
+        axes.set_xlabel(axes.get_xlabel() or chart.cost_label)
         axes.set_ylabel(fill(chart.error_label, _LINE))
         axes.set_axisbelow(True)
         axes.grid(alpha=0.25)
@@ -51,6 +52,9 @@ def save_chart(chart: Chart, about: Mapping[str, Any], path: Path) -> None:
 
 @singledispatch
 def _draw(chart: Chart, axes) -> None:
+    if len({point.cost for series in chart.series for point in series.points}) == 1:
+        _draw_columns(chart, axes)
+        return
     for series, color, marker in zip(chart.series, _COLORS, _MARKERS, strict=False):
         _draw_points(axes, series, color, marker)
         if not chart.one_front:
@@ -68,6 +72,19 @@ def _draw(chart: Chart, axes) -> None:
     _write_settings(axes, chart)
     if chart.target is not None:
         axes.axhline(chart.target, color="0.5", lw=1, ls=":", label=f"target {chart.target:g}")
+
+
+def _draw_columns(chart: Chart, axes) -> None:
+    """Settings that cost the same, side by side."""
+    points = [point for series in chart.series for point in series.points]
+    place = {id(point): at for at, point in enumerate(points)}
+    for series, color, marker in zip(chart.series, _COLORS, _MARKERS, strict=False):
+        beside = (replace(p, cost=place[id(p)], cost_interval=(place[id(p)],) * 2) for p in series.points)
+        _draw_points(axes, replace(series, points=tuple(beside)), color, marker)
+    axes.plot([], [], "o", ms=11, mfc="none", mec="black", mew=1.3, ls="none", label="default")
+    axes.set_xticks(range(len(points)), [point.setting for point in points])
+    axes.margins(x=0.1)
+    axes.set_xlabel(f"{chart.cost_label}: {points[0].cost:g} for each")
 
 
 def _draw_front(axes, points: Sequence[Point], color: str) -> None:
