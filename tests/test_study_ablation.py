@@ -1,12 +1,14 @@
 """Training without an effect: the views that it sees, what is refused, and what an effect has earned, by hand."""
 
+import time
+
 import pytest
 import torch
 
 from patchproof.channel.printer import load_printer
 from patchproof.optimize.problem import set_problem
 from patchproof.settings import Refused
-from patchproof.study import ablation
+from patchproof.study import ablation, plan_cost
 from patchproof.study.ablation import ALL, PRINTER, AblationSettings, without
 from patchproof.study.study import Cell, Result
 from test_optimize import scene_with
@@ -40,6 +42,14 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
     assert load_printer("coated").apply(design[None])[0, :, 5, 5].tolist() != pytest.approx(green.tolist(), abs=0.1)
 
 
+def test_an_effect_that_takes_time_costs_a_share_of_a_step(problem, monkeypatch):
+    slow = ablation.Without.see
+    monkeypatch.setattr(ablation.Without, "see", lambda *a: (time.sleep(0.5), slow(*a))[1])
+    monkeypatch.setattr(plan_cost, "REPEATS", 1)
+    costs = ablation._costs(problem, ["noise"])
+    assert list(costs) == ["noise"] and costs["noise"] < -0.5  # without it, a step takes half a second longer
+
+
 @pytest.mark.parametrize(("effect", "says"), [("lamp", "with lamp in it"), ("smell", "this kind of scene has")])
 def test_an_effect_that_is_not_there_is_refused(problem, effect, says):
     with pytest.raises(Refused, match=says):
@@ -53,11 +63,12 @@ def test_what_an_effect_earned_by_hand():
         for effect, count in zip((ALL, "noise"), counts, strict=True):
             hits = [1] * count + [0] * (10 - count)
             found = {"hits": hits, "confidence": [count / 20] * 10, "traced_hits": [], "traced_confidence": []}
+            found["cost"] = {"noise": 0.1 + 0.2 * seed} if effect == ALL else {}
             values = {"name": "s", "network": "n", "seed": seed, "effect": effect}
             results.append(Result(Cell(f"{seed}{effect}", values), found, None))
     earned, designs = ablation.tables(settings, results)
-    ((effect, groups, rate, confidence, *traced),) = earned.rows
-    assert (effect, groups, traced) == ("noise", 2, [None, None])
+    ((effect, groups, rate, confidence, *traced, cost),) = earned.rows
+    assert (effect, groups, traced) == ("noise", 2, [None, None]) and cost.value == pytest.approx(0.2)
     assert rate.value == pytest.approx(0.3) and confidence.value == pytest.approx(0.15)
     # Student's t of one degree of freedom, 12.706, times 0.1
     assert rate.high - rate.value == pytest.approx(1.2706, rel=1e-3)

@@ -7,7 +7,7 @@ what `plan` puts there (`plan_terms`): even light for the sun, not darkness. Eff
 
 All designs of a scene, network and seed share their draws, but each is another design: its own luck is in every
 difference, so intervals are over such groups, not over conditions. Views keep their poses for one step. What an effect
-costs is `plan`'s to say.
+costs is the share of a step's time that goes when it is left out, steps taken in turn.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from patchproof.report.tables import Drawing, Estimate, Table, mean
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import Refused, SceneSettings, Strict, expand, read_toml, validated
 from patchproof.study.path_traced import photograph_traced
+from patchproof.study.plan_cost import relative_costs
 from patchproof.study.plan_terms import Setup, scene_terms
 from patchproof.study.study import Cell, Result, Study, short_name
 from patchproof.study.trained import scene_of
@@ -129,7 +130,8 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train without the effect; hits and confidences in the whole world."""
     values, scene = cell.values, scene_of(base, cell)
     problem = set_problem(scene, models=(expand(values["network"], base),))
-    design = best_design(problem if values["effect"] == ALL else without(problem, values["effect"]))
+    whole = values["effect"] == ALL
+    design = best_design(problem if whole else without(problem, values["effect"]))
     shown = problem.subject.shown(from_pixels(design, problem.device))
     outcomes = judged(problem, {"design": shown}, scene.draw("evaluate", settings.n))
     traced = _traced(problem, shown, scene.draw("reprint", settings.photos)) if settings.photos else ([], [])
@@ -138,7 +140,14 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "confidence": np.round(outcomes.confidence["design"][0], 5).tolist(),
         "traced_hits": traced[0],
         "traced_confidence": traced[1],
+        "cost": _costs(problem, settings.effects) if whole else {},
     }
+
+
+def _costs(problem: Problem, effects: Sequence[str]) -> dict[str, float]:
+    """The share of a step's time that goes where each effect is left out."""
+    less = {effect: without(problem, effect) for effect in effects}
+    return {name: 1 - ratio for name, ratio in relative_costs(problem, less, problem.subject.start()).items()}
 
 
 def _traced(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[list[int], list[float]]:
@@ -157,12 +166,14 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
     """What each effect earned over all groups, and in each."""
     groups = _groups(results)
     head = ("trained without", "groups", "rate", "confidence", "rate, path-traced", "confidence, path-traced")
+    cost = "share of a step's time"
     keys = ("hits", "confidence", "traced_hits", "traced_confidence")
     rows = []
     for effect in settings.effects:
         both = [(one[ALL], one[effect]) for one in groups.values() if ALL in one and effect in one]
         if both:
-            rows.append((effect, len(both), *(_earned(both, key) for key in keys)))
+            costs = mean([whole["cost"][effect] for whole, _ in both])
+            rows.append((effect, len(both), *(_earned(both, key) for key in keys), costs))
     about = f"trained with all effects minus without: positive is what the effect earned; {settings.n} conditions and "
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
     every = []
@@ -172,7 +183,7 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
             every.append((name, short_name(network), seed, effect, *means))
     said = ("scene", "network", "seed", "trained without", *head[2:])
     return (
-        Table("earned", "What each effect earns", head, tuple(rows), about),
+        Table("earned", "What each effect earns", (*head, cost), tuple(rows), about),
         Table("designs", "Every design", said, tuple(every), "its own rates and confidences in the whole world"),
     )
 

@@ -7,8 +7,9 @@ predicted but what keeping views for several steps would save, which is their sh
 
 from __future__ import annotations
 
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -58,7 +59,7 @@ def measure_cost(
         conditions = problem.scene.draw("train", settings.views, start=number * settings.views)
         rows.append(_step_ms(problem, design, conditions))
         on_step(number + 1, REPEATS + 1)
-    median = {name: float(torch.tensor([row[name] for row in rows[1:]]).median()) for name in rows[0]}
+    median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
     total = sum(median.values())
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
     see_ms = sum(ms for name, ms in median.items() if name.startswith("see"))
@@ -71,6 +72,17 @@ def measure_cost(
         parts=parts,
         refresh_ms={k: total - see_ms * (1 - 1 / k) for k in REFRESH},
     )
+
+
+def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tensor) -> dict[str, float]:
+    """What a step of each other problem takes, as a multiple of the problem's own: medians of ratios, taken in turn."""
+    views, ratios = problem.scene.settings.optimize.views, {name: [] for name in others}
+    for number in range(REPEATS + 1):
+        conditions = problem.scene.draw("train", views, start=number * views)
+        own_ms = sum(_step_ms(problem, design, conditions).values())
+        for name, other in others.items():
+            ratios[name].append(sum(_step_ms(other, design, conditions).values()) / own_ms)
+    return {name: statistics.median(values[1:]) for name, values in ratios.items()}
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:

@@ -11,8 +11,8 @@ from patchproof.claims import prediction_interval, wilson
 from patchproof.optimize.loop import SELECT_VIEWS
 from patchproof.optimize.promise import PROMISE_VIEWS
 from patchproof.settings import Strict
+from patchproof.study.demo import PHOTOS
 
-PHOTOS = 40  # photographs that make a useful verdict: what the demo takes
 NEXT = 4
 
 
