@@ -22,7 +22,7 @@ from patchproof.channel.printer import (
     vary,
 )
 from patchproof.color import ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
-from patchproof.settings import Refused, shipped
+from patchproof.settings import PrinterSettings, Refused, shipped
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no ICC profiles")
@@ -280,7 +280,7 @@ def test_no_change_leaves_colors_and_paper_stays_white():
 def test_variation_has_the_size_of_print_to_print_differences():
     seen = colors_of(load_printer("coated").apply(image(random_8bit())))
     draws = torch.rand(64, 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2 - 1
-    draws *= torch.tensor([0.04, 0.05, 0.004])  # what the settings give as one print's difference to the next
+    draws *= torch.tensor([PrinterSettings().dot_gain[1], PrinterSettings().density[1], PrinterSettings().black[1]])
     varied = lab_from_linear(vary(torch.tensor(linear_from_srgb(seen)), draws).numpy())
     error = ciede2000(varied, lab_from_srgb(seen)[None])
     assert 0.5 < error.mean() < 2 and error.max() < 6

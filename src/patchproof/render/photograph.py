@@ -121,12 +121,9 @@ def _piece_light(seen: Seen, picture: PiecePicture) -> Tensor:
     reflectance = look_up(footprints, table)
     if seen.reduced:
         reflectance = linear_from_srgb(reflectance)
-    change, light = np.stack([drawn.dot_gain, drawn.density, drawn.black], 1), reflectance
-    if change.any():
-        light = vary(light, torch.as_tensor(change).to(light).index_select(0, view))
-    if (drawn.paper != 1).any():
-        light = light * torch.as_tensor(drawn.paper).to(light).index_select(0, view)
-    light = light * seen.piece_white
+    change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
+    paper = torch.as_tensor(drawn.paper).to(reflectance)
+    light = vary(reflectance, change.index_select(0, view)) * paper.index_select(0, view) * seen.piece_white
     return light if seen.piece_gloss is None else light + seen.piece_gloss
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from textwrap import wrap
 
 import numpy as np
 from torch import Tensor
@@ -334,7 +333,7 @@ def _term_lines(plan: Plan) -> list[str]:
         fits = "" if terms.together < terms.threshold else ": too much, keep some"
         lines.append(f"  {'all that can go, at once':42}   {terms.together:.3f}{fits}")
     off = [f"{term.name} ({term.key})" for term in terms.errors if term.verdict == "off" and term.key]
-    return [*lines, *wrap(", ".join(off), 118, initial_indent="  off: ", subsequent_indent="       ")]
+    return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
 
 
 def _term_line(term: TermError) -> str:
