@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import shlex
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from patchproof.settings import SceneSettings, validated
+from patchproof.settings import SceneSettings, read_toml, validated
 from test_journey import command
 
 try:
@@ -53,6 +54,14 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
         command(*arguments[: 2 if arguments[0] in {"calibrate"} else 1], "--help")
         listed = capsys.readouterr().out
         assert all(option in listed for option in arguments if option.startswith("--")), line
+
+
+@pytest.mark.parametrize(("name", "count"), [("promises", 4 * 2 * 2 * 2), ("ablation", 4 * (1 + 16))])
+def test_the_studies_that_are_quoted_can_be_run_again(name, count):
+    study = import_module(f"patchproof.study.{name}").STUDY
+    folder = README.parent / ".readme" / name
+    settings = validated(study.settings, read_toml(folder / f"{name}.toml"), name)
+    assert len({cell.name for cell in study.cells(settings, folder)}) == count
 
 
 def test_python(tmp_path, here, monkeypatch, capsys):
