@@ -7,7 +7,7 @@ what `plan` puts there (`plan_terms`): even light for the sun, not darkness. Eff
 
 All designs of a scene, network and seed share their draws, but each is another design: its own luck is in every
 difference, so intervals are over such groups, not over conditions. Views keep their poses for one step. What an effect
-costs is the share of a step's time that goes when it is left out, steps taken in turn.
+costs is the share of a step's time that goes when it is left out, steps taken in turn; on a busy machine it is noise.
 """
 
 from __future__ import annotations

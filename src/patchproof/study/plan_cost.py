@@ -75,13 +75,13 @@ def measure_cost(
 
 
 def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tensor) -> dict[str, float]:
-    """What a step of each other problem takes, as a multiple of the problem's own: medians of ratios, taken in turn."""
+    """What a step of each other problem takes, as a multiple of the problem's own just before: medians of ratios."""
     views, ratios = problem.scene.settings.optimize.views, {name: [] for name in others}
     for number in range(REPEATS + 1):
         conditions = problem.scene.draw("train", views, start=number * views)
-        own_ms = sum(_step_ms(problem, design, conditions).values())
         for name, other in others.items():
-            ratios[name].append(sum(_step_ms(other, design, conditions).values()) / own_ms)
+            own_ms, other_ms = (sum(_step_ms(one, design, conditions).values()) for one in (problem, other))
+            ratios[name].append(other_ms / own_ms)
     return {name: statistics.median(values[1:]) for name, values in ratios.items()}
 
 
