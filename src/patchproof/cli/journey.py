@@ -205,40 +205,20 @@ def reprint(
         raise typer.BadParameter(
             "is of the piece on its object; leave --scan-dpi and --card out", param_hint="--path-traced"
         )
+    made, printed = load_run(run), {"printer": printer, "print_scale": scale, "overwrite": overwrite}
     if scan_dpi is not None:
-        truth = scan(pdf, load_run(run), n, out, scan_dpi, printer=printer, print_scale=scale, overwrite=overwrite)
-    elif card:
-        from patchproof.study.card_photo import photograph_cards
-
-        with progress() as bar:
-            truth = photograph_cards(
-                pdf,
-                load_run(run),
-                n,
-                out,
-                seed=seed,
-                printer=printer,
-                print_scale=scale,
-                overwrite=overwrite,
-                on_photo=lambda done, total: bar("photograph", done, total),
-            )
+        truth = scan(pdf, made, n, out, scan_dpi, **printed)
     else:
         with progress() as bar:
-            truth = reprint_sheet(
-                pdf,
-                load_run(run),
-                n,
-                out,
-                seed=seed,
-                printer=printer,
-                print_scale=scale,
-                control=control.value if control else None,
-                path_traced=path_traced,
-                jobs=jobs,
-                cluster=cluster,
-                overwrite=overwrite,
-                on_photo=lambda done, total: bar("photograph", done, total),
-            )
+            taken = {"seed": seed, "on_photo": lambda done, total: bar("photograph", done, total), **printed}
+            if card:
+                from patchproof.study.card_photo import photograph_cards
+
+                truth = photograph_cards(pdf, made, n, out, **taken)
+            else:
+                shown = control.value if control else None
+                workers = {"jobs": jobs, "cluster": cluster}
+                truth = reprint_sheet(pdf, made, n, out, control=shown, path_traced=path_traced, **workers, **taken)
     say(f"{len(truth)} photographs: {out}")
 
 

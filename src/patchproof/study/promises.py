@@ -72,9 +72,8 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        made = optimize_scene(
-            scene_of(base, cell), folder / "run", controls=("bare",)
-        )  # all of them take most of a promise's time
+        # one control is enough for a page, and all of them would take most of a promise's time
+        made = optimize_scene(scene_of(base, cell), folder / "run", controls=("bare",))
         sheet_of(made, folder / "sheet.pdf")
         pdf, photos = folder / "sheet.pdf", folder / "photos"
         reprint(pdf, made, settings.photos, photos, path_traced=settings.path_traced)

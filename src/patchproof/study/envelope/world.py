@@ -25,6 +25,7 @@ from patchproof import geometry
 from patchproof.channel import lens
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimize.promise import CHUNK
 from patchproof.optimize.run import Run, load_run
 from patchproof.photo.read import Photo
 from patchproof.render.photograph import expose
@@ -45,7 +46,6 @@ from patchproof.verify.measure import measure
 from patchproof.verify.ranges import PromisedRanges
 from patchproof.verify.surface import Surface, surface_of
 
-CHUNK = 4  # views at a time: 16 took 1.4 times as long, out of the cache
 _MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
 _TAPE_SRGB = 0.45  # what hides a corner
 
