@@ -10,9 +10,9 @@ import torch
 
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.load import load_classifier
-from patchproof.optimize import attacks
-from patchproof.optimize.attacks import cross_entropy, even_loss, fgsm, margin, pgd, right, survives_fgsm, survives_pgd
-from patchproof.optimize.harden import squares
+from patchproof.harden import attacks
+from patchproof.harden.attacks import cross_entropy, even_loss, fgsm, margin, pgd, right, survives_fgsm, survives_pgd
+from patchproof.harden.harden import squares
 from patchproof.photo.read import read_photo
 
 

@@ -20,7 +20,8 @@ from patchproof.channel.camera import (
 )
 from patchproof.color import linear_from_srgb
 from patchproof.scene.conditions import draw
-from patchproof.settings import SceneSettings, validated
+from patchproof.settings import SceneSettings
+from patchproof.strict import validated
 
 
 def conditions(n, **camera):

@@ -9,9 +9,9 @@ import torch
 
 from patchproof.classifier import confidence, find_labels, load_classifier
 from patchproof.classifier.builtin import HERE, INPUT_PX, load_builtin
-from patchproof.scene import primitives
-from patchproof.settings import Refused
-from patchproof.study import train_builtin
+from patchproof.mesh import primitives
+from patchproof.strict import Refused
+from patchproof.training import train_builtin
 
 FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
 

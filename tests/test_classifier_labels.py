@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from patchproof.classifier import Classifier, center_square, confidence, find_labels, recognized
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 LABELS = ("jeep, landrover", "crane", "crane", "box truck", "maillot", "maillot, tank suit", "mouse, computer mouse")
 

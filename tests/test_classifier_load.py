@@ -12,7 +12,7 @@ from patchproof.classifier import Classifier, load_classifier
 from patchproof.classifier.builtin import SmallNetwork, folded
 from patchproof.classifier.check import check_network
 from patchproof.classifier.network import weights_sha256
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 LABELS = ("a", "b", "c", "d")
 

@@ -14,7 +14,7 @@ from torch import nn
 
 from patchproof.classifier import load_classifier, program
 from patchproof.classifier.program import load_program, no_pickle
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 LABELS = ["red", "green", "blue", "none"]
 

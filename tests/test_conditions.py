@@ -9,7 +9,8 @@ import pytest
 
 from patchproof.color import lab_from_linear, tinted_white
 from patchproof.scene.conditions import draw, with_poses_of
-from patchproof.settings import SceneSettings, validated
+from patchproof.settings import SceneSettings
+from patchproof.strict import validated
 
 SETTINGS = validated(
     SceneSettings,

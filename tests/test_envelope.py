@@ -13,10 +13,11 @@ from patchproof import geometry
 from patchproof.optimize.run import optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import with_value
-from patchproof.settings import Refused
-from patchproof.study.envelope.axes import AXES, conditions_at, placed_at
-from patchproof.study.envelope.sweeps import EnvelopeSettings, cells
-from patchproof.study.envelope.world import (
+from patchproof.strict import Refused
+from patchproof.study.study import run_study
+from patchproof.validation.envelope.axes import AXES, conditions_at, placed_at
+from patchproof.validation.envelope.sweeps import EnvelopeSettings, cells
+from patchproof.validation.envelope.world import (
     _Stages,
     _window,
     measured,
@@ -24,7 +25,6 @@ from patchproof.study.envelope.world import (
     piece_at,
     recognized,
 )
-from patchproof.study.study import run_study
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from patchproof.study.envelope.fit import (
+from patchproof.validation.envelope.fit import (
     BEYOND,
     NOT_MONOTONE,
     _fit,

@@ -23,14 +23,15 @@ from patchproof.geometry import apply_homography, rect_corners
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import set_problem
 from patchproof.optimize.run import Run, load_run
+from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
+from patchproof.reprint.reprint import printed_piece, take_photo
 from patchproof.scene.mesh_scene import MeshScene, load_mesh_scene
 from patchproof.scene.placement import place_card
-from patchproof.settings import Refused, SceneSettings, shipped
+from patchproof.settings import SceneSettings
 from patchproof.sheet.manifest import Manifest, load_manifest
-from patchproof.study.reprint import printed_piece, take_photo
-from patchproof.study.sheet import sheet_of
+from patchproof.strict import Refused, shipped
 from test_journey import command
 
 PHOTO_PX = (800, 600)

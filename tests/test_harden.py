@@ -14,11 +14,11 @@ from PIL import Image
 from fake_networks import RedAgainstBlue
 from patchproof import cli
 from patchproof.classifier.network import Classifier
-from patchproof.optimize.attacks import margin
-from patchproof.optimize.harden import harden, moved, squares
+from patchproof.harden.attacks import margin
+from patchproof.harden.folder import HardenSettings, harden_images, too_strong
+from patchproof.harden.harden import harden, moved, squares
 from patchproof.photo.read import read_photo
-from patchproof.settings import Refused, validated
-from patchproof.study.harden import HardenSettings, harden_images, too_strong
+from patchproof.strict import Refused, validated
 from patchproof.study.study import run_study
 
 FAKE = "module:fake_networks.red_against_blue"

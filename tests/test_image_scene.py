@@ -9,7 +9,8 @@ from PIL import Image
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.scene import flat
 from patchproof.scene.image_scene import ERASED_AREA, SPLIT_FROM, erase, load_image_scene
-from patchproof.settings import Refused, SceneSettings
+from patchproof.settings import SceneSettings
+from patchproof.strict import Refused
 
 PHOTO = (320, 240)
 

@@ -13,9 +13,9 @@ import pytest
 from conftest import SCENE
 from patchproof import cli, geometry
 from patchproof.optimize import run as run_module
-from patchproof.settings import shipped
 from patchproof.sheet.manifest import load_manifest
 from patchproof.sheet.raster import attached_manifest
+from patchproof.strict import shipped
 
 PHOTOS = 8
 
@@ -284,8 +284,8 @@ def test_require_kept_makes_any_other_verdict_exit_with_1(journey, tmp_path):
 
 
 def test_bad_meshes_end_in_one_sentence_or_a_warning(data, tmp_path, capsys):
-    from patchproof.scene.load_mesh import load_mesh
-    from patchproof.settings import Refused
+    from patchproof.mesh.load_mesh import load_mesh
+    from patchproof.strict import Refused
 
     names = sorted(path.name for path in (data / "meshes" / "bad").iterdir() if path.suffix in {".obj", ".glb", ".stl"})
     refused = 0

@@ -9,8 +9,8 @@ import pytest
 
 from patchproof.channel.printer import identity_printer
 from patchproof.color import linear_from_srgb
-from patchproof.study import ledger_trials
 from patchproof.study.study import Result, load_study
+from patchproof.validation import ledger_trials
 
 SETTINGS = ledger_trials.LedgerSettings(runs=("a/run", "b/run"), trials=10)
 

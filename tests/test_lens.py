@@ -20,7 +20,7 @@ from patchproof.channel.lens import (
     pinhole_frame,
     undistort_points,
 )
-from patchproof.settings import Refused, shipped
+from patchproof.strict import Refused, shipped
 
 ORIGIN = {"when": "2020-01-01", "instrument": "a board", "uncertainty": "1 px"}
 BARREL = {"k1": -0.12, "k2": 0.02, "p1": 1e-3, "p2": -2e-3, "k3": -0.003}

@@ -10,7 +10,8 @@ import torch
 
 from patchproof.channel.light import Gloss, Lamp, Light, highlight, irradiance, light_of
 from patchproof.scene.conditions import draw
-from patchproof.settings import SceneSettings, validated
+from patchproof.settings import SceneSettings
+from patchproof.strict import validated
 
 
 @pytest.fixture(autouse=True)

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from patchproof.color import linear_from_srgb
-from patchproof.scene.load_mesh import load_mesh
-from patchproof.scene.mesh import Material, Part, from_parts
-from patchproof.settings import Refused
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.strict import Refused
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no meshes from outside")

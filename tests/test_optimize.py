@@ -21,7 +21,8 @@ from patchproof.optimize.promise import CONTROLS, judged, promise_from, try_out
 from patchproof.optimize.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.scene import build_scene
-from patchproof.settings import Refused, SceneSettings, validated
+from patchproof.settings import SceneSettings
+from patchproof.strict import Refused, validated
 
 SCENE = {
     "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},

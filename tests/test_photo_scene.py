@@ -15,11 +15,12 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.scene import flat
 from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import _digest, load_photo_scene, see
-from patchproof.settings import Refused, SceneSettings, shipped
+from patchproof.settings import SceneSettings
 from patchproof.sheet.blank import blank_sheet
 from patchproof.sheet.manifest import Manifest, dump_manifest
 from patchproof.sheet.piece import lay_out_piece, sheet_id
 from patchproof.sheet.raster import piece_pixels
+from patchproof.strict import Refused, shipped
 
 SIZE = (800, 600)
 FINE = 3  # samples per pixel and axis

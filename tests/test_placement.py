@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from patchproof.scene.load_mesh import load_mesh
+from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.placement import LIFT_MM, patch_frame, place_card
-from patchproof.settings import PatchSettings, Refused
+from patchproof.settings import PatchSettings
+from patchproof.strict import Refused
 
 
 @pytest.fixture(scope="module")

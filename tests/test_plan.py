@@ -16,17 +16,18 @@ from patchproof import cli
 from patchproof.optimize import loop
 from patchproof.optimize.pixels import from_pixels
 from patchproof.optimize.problem import set_problem
+from patchproof.plan.cost import measure_cost
+from patchproof.plan.errors import measure_terms
+from patchproof.plan.plan import Plan, marker_plan, other_surface, plan_lines, plan_scene, resolution_plan, scales
+from patchproof.plan.samples import sample_plan
+from patchproof.plan.terms import Setup, scene_terms
 from patchproof.scene.flat import Picture
 from patchproof.scene.paper_light import PaperLight
 from patchproof.scene.photo_scene import PhotoScene, Seen
 from patchproof.scene.scene import build_scene, load_scene
-from patchproof.settings import SceneSettings, validated
+from patchproof.settings import SceneSettings
 from patchproof.sheet.piece import lay_out_piece
-from patchproof.study.plan import Plan, marker_plan, other_surface, plan_lines, plan_scene, resolution_plan, scales
-from patchproof.study.plan_cost import measure_cost
-from patchproof.study.plan_errors import measure_terms
-from patchproof.study.plan_samples import sample_plan
-from patchproof.study.plan_terms import Setup, scene_terms
+from patchproof.strict import validated
 
 
 def scene_with(tmp_path, **changes):
@@ -261,7 +262,7 @@ def test_the_parts_of_a_step_add_up(tmp_path):
 
 
 def test_the_verb_prints_and_writes_and_does_not_overwrite(scene_file, tmp_path, monkeypatch, capsys, plan):
-    import patchproof.study.plan as study
+    import patchproof.plan.plan as study
 
     monkeypatch.setattr(study, "plan_scene", lambda path, timing, on_stage: plan)
     out = tmp_path / "plan.json"

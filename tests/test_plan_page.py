@@ -9,10 +9,10 @@ import pytest
 import trimesh
 
 from conftest import SCENE
-from patchproof.settings import Refused
+from patchproof.printing.hung import hang
 from patchproof.sheet.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
 from patchproof.sheet.template import load_template
-from patchproof.study.hung import hang
+from patchproof.strict import Refused
 from test_scene import scene_of
 
 A4 = load_template("a4")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from patchproof.scene import primitives, solids
-from patchproof.scene.load_mesh import load_mesh
-from patchproof.settings import Refused
+from patchproof.mesh import primitives, solids
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.strict import Refused
 
 ALL_PARTS = [(name, seed) for name in primitives.names() for seed in range(4)]
 

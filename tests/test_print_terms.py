@@ -23,14 +23,14 @@ from patchproof.optimize.goals import non_printability, printable_colors
 from patchproof.optimize.loop import steps
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import set_problem
+from patchproof.plan.terms import Setup, scene_terms
 from patchproof.render.photograph import expose, photograph, shade
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
-from patchproof.settings import Refused
-from patchproof.study.gamut import UNPRINTED, WAYS, Outcomes, gamut_cell, gamut_rows, other_printers, way_problem
-from patchproof.study.plan_terms import Setup, scene_terms
-from patchproof.study.reprint import scaled_print
+from patchproof.reprint.reprint import scaled_print
+from patchproof.strict import Refused
 from patchproof.study.study import run_study
+from patchproof.validation.gamut import UNPRINTED, WAYS, Outcomes, gamut_cell, gamut_rows, other_printers, way_problem
 from test_plan import scene_with
 from test_views import WHITE, area, box_scene, outline, piece_of, posed
 

@@ -22,7 +22,8 @@ from patchproof.channel.printer import (
     vary,
 )
 from patchproof.color import ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
-from patchproof.settings import PrinterSettings, Refused, shipped
+from patchproof.settings import PrinterSettings
+from patchproof.strict import Refused, shipped
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no ICC profiles")

@@ -13,7 +13,7 @@ import torch
 from patchproof.render import raster
 from patchproof.render.fragments import Cameras
 from patchproof.render.raster import rasterize
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 from test_raster import SIZE, assert_same, cameras, sphere
 
 

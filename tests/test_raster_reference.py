@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from patchproof import geometry
+from patchproof.mesh.load_mesh import load_mesh
 from patchproof.render.fragments import Cameras
 from patchproof.render.raster import rasterize
-from patchproof.scene.load_mesh import load_mesh
 from test_raster import cameras, picture, slow_twin
 
 INSIDE_PX = 0.01  # both round: nearer to an edge than this they may differ

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from patchproof.settings import SceneSettings, read_toml, validated
+from patchproof.settings import SceneSettings
+from patchproof.strict import read_toml, validated
 from test_journey import command
 
 try:
@@ -58,7 +59,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
 
 @pytest.mark.parametrize(("name", "count"), [("promises", 4 * 2 * 2 * 2), ("ablation", 4 * (1 + 16))])
 def test_the_studies_that_are_quoted_can_be_run_again(name, count):
-    study = import_module(f"patchproof.study.{name}").STUDY
+    study = import_module(f"patchproof.validation.{name}").STUDY
     folder = README.parent / ".readme" / name
     settings = validated(study.settings, read_toml(folder / f"{name}.toml"), name)
     assert len({cell.name for cell in study.cells(settings, folder)}) == count

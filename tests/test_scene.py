@@ -16,8 +16,8 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.scene import load_scene
-from patchproof.settings import Refused
 from patchproof.sheet.piece import MODULES, frame_image
+from patchproof.strict import Refused
 
 QUIET = """
 exposure_ev = [0, 0]

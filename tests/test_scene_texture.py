@@ -9,11 +9,12 @@ from PIL import Image
 from scipy.spatial import Delaunay
 
 from patchproof.color import linear_from_srgb
-from patchproof.scene.load_mesh import load_mesh
-from patchproof.scene.mesh import Material, Part, from_parts
-from patchproof.scene.texels import coverage, face_counts
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.mesh.texels import coverage, face_counts
 from patchproof.scene.texture import texture_canvas
-from patchproof.settings import PatchSettings, Refused
+from patchproof.settings import PatchSettings
+from patchproof.strict import Refused
 from tolerances import CODE
 
 HERE = Path(".")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from patchproof import settings
-from patchproof.settings import Refused, SceneSettings, Strict, expand, load_scene_settings, nearest, shipped, validated
+from patchproof import strict
+from patchproof.settings import SceneSettings, load_scene_settings
+from patchproof.strict import Refused, Strict, expand, nearest, shipped, validated
 
 SCENE = """
 [object]
@@ -210,7 +211,7 @@ def test_shipped_data_is_found_in_checkout_and_in_package(tmp_path, monkeypatch,
     assert shipped(folder).is_dir()
     for root in (tmp_path / "site" / "patchproof", tmp_path / "checkout" / "src" / "patchproof"):
         root.mkdir(parents=True)
-        monkeypatch.setattr(settings, "__file__", str(root / "settings.py"))
+        monkeypatch.setattr(strict, "__file__", str(root / "strict.py"))
         with pytest.raises(Refused, match=folder):
             shipped(folder)
         home = root if "site" in root.parts else root.parents[1]

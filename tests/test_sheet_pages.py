@@ -13,7 +13,6 @@ import pytest
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.label import label_of, read_label
 from patchproof.photo.read import Photo
-from patchproof.settings import Refused, read_toml, shipped
 from patchproof.sheet.board import board_sheet, is_board
 from patchproof.sheet.chart_page import chart_sheet
 from patchproof.sheet.manifest import load_manifest
@@ -25,6 +24,7 @@ from patchproof.sheet.several import OneDesign, write_several
 from patchproof.sheet.template import load_template, template_names
 from patchproof.sheet.tiles import plan_tiles
 from patchproof.sheet.write import check_sheet, write_sheet
+from patchproof.strict import Refused, read_toml, shipped
 from patchproof.verify.camera import view_of
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges

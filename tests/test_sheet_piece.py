@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.settings import Refused
 from patchproof.sheet.piece import (
     KINDS,
     black_runs,
@@ -22,6 +21,7 @@ from patchproof.sheet.piece import (
     marker_size_mm,
     sheet_id,
 )
+from patchproof.strict import Refused
 
 ID = "A1B2C3D4E5"
 

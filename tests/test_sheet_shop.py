@@ -8,8 +8,8 @@ import pytest
 from pikepdf import Array, Name
 from PIL import Image
 
-from patchproof.settings import Refused
 from patchproof.sheet.shop import shop_lines
+from patchproof.strict import Refused
 from test_photo_label import sheet
 
 

@@ -5,9 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from patchproof.settings import Refused, shipped
 from patchproof.sheet.chart import CORNERS, GRAYS, chart_colors, chart_swatches
 from patchproof.sheet.template import load_template, template_names
+from patchproof.strict import Refused, shipped
 
 A4 = shipped("print_templates", "a4.toml")
 

@@ -13,7 +13,6 @@ import pytest
 from PIL import Image, ImageCms
 
 from patchproof.color import linear_from_srgb
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import dump_manifest, load_manifest
 from patchproof.sheet.pdf import srgb_profile
 from patchproof.sheet.piece import control_design, frame_image, lay_out_piece
@@ -21,6 +20,7 @@ from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheet.shop import shop_lines
 from patchproof.sheet.template import load_template
 from patchproof.sheet.write import check_sheet, write_sheet
+from patchproof.strict import Refused
 
 ID = "A1B2C3D4E5"
 DPI = 150

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from patchproof.claims import prediction_interval
+from patchproof.printing.shots import fewest, paired_power, plan_shots, unpaired_power
 from patchproof.sheet.manifest import Promise
-from patchproof.study.shots import fewest, paired_power, plan_shots, unpaired_power
 from patchproof.verify.verdict import compare
 
 

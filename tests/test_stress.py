@@ -10,6 +10,18 @@ import pytest
 import torch
 from scipy.stats import spearmanr
 
+from patchproof.experiments import mining, stress
+from patchproof.experiments.stress import OcclusionSettings, SearchSettings, occluded, worst_case
+from patchproof.experiments.stress_map import (
+    Axis,
+    MapSettings,
+    ScenesSettings,
+    axes,
+    in_cell,
+    map_of,
+    scene_cells,
+    worst_cells,
+)
 from patchproof.optimize import loop, run
 from patchproof.optimize.loop import State, steps
 from patchproof.optimize.mining import (
@@ -24,19 +36,8 @@ from patchproof.optimize.mining import (
 from patchproof.optimize.problem import set_problem
 from patchproof.optimize.run import optimize_scene
 from patchproof.scene.scene import build_scene
-from patchproof.settings import OptimizeSettings, Refused, SceneSettings, validated
-from patchproof.study import mining, stress
-from patchproof.study.stress import OcclusionSettings, SearchSettings, occluded, worst_case
-from patchproof.study.stress_map import (
-    Axis,
-    MapSettings,
-    ScenesSettings,
-    axes,
-    in_cell,
-    map_of,
-    scene_cells,
-    worst_cells,
-)
+from patchproof.settings import OptimizeSettings, SceneSettings
+from patchproof.strict import Refused, validated
 from patchproof.study.study import run_study
 
 SCENE = {

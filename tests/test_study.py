@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import toy_studies as toy
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 from patchproof.study import study
 from patchproof.study.study import carry_out, load_study, run_study
 

@@ -7,10 +7,11 @@ import torch
 
 from patchproof.channel.printer import load_printer
 from patchproof.optimize.problem import set_problem
-from patchproof.settings import Refused
-from patchproof.study import ablation, plan_cost
-from patchproof.study.ablation import ALL, PRINTER, AblationSettings, without
+from patchproof.plan import cost as plan_cost
+from patchproof.strict import Refused
 from patchproof.study.study import Cell, Result
+from patchproof.validation import ablation
+from patchproof.validation.ablation import ALL, PRINTER, AblationSettings, without
 from test_optimize import scene_with
 
 

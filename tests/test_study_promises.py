@@ -7,8 +7,8 @@ import pytest
 
 from patchproof.claims import prediction_interval
 from patchproof.optimize import loop, run
-from patchproof.study import promises
 from patchproof.study.study import Cell, Result, run_study
+from patchproof.validation import promises
 from test_optimize import SCENE
 
 

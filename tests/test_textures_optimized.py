@@ -10,6 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 
+from patchproof.mesh.mesh import Material, Part, from_parts
 from patchproof.optimize import loop, run
 from patchproof.optimize.evaluate import evaluate_run
 from patchproof.optimize.pixels import from_pixels
@@ -18,7 +19,6 @@ from patchproof.optimize.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.export import write_glb
-from patchproof.scene.mesh import Material, Part, from_parts
 from patchproof.scene.scene import load_scene
 from test_journey import command
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from patchproof.experiments import deceive, transfer
+from patchproof.experiments.turntable import attributions, from_sides, goal_log, mean_color, three_views
 from patchproof.optimize import loop, run
 from patchproof.optimize.evaluate import evaluate_run
 from patchproof.optimize.problem import set_problem
 from patchproof.optimize.run import optimize_scene
 from patchproof.report.tables import Estimate, mean
 from patchproof.scene.scene import load_scene
-from patchproof.settings import Refused, validated
-from patchproof.study import deceive, transfer
+from patchproof.strict import Refused, validated
 from patchproof.study.study import Cell, Result, run_study, short_name
 from patchproof.study.trained import Told, TrainedSettings, cell_of, networks_of, scenes_of, verdict
-from patchproof.study.turntable import attributions, from_sides, goal_log, mean_color, three_views
 from test_textures_optimized import scene_file
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"

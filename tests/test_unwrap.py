@@ -12,13 +12,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from patchproof.color import linear_from_srgb
-from patchproof.scene import unwrap as unwrapping
-from patchproof.scene.load_mesh import load_mesh
-from patchproof.scene.mesh import Material, Part, from_parts
-from patchproof.scene.texels import coverage
+from patchproof.mesh import unwrap as unwrapping
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.mesh.texels import coverage
+from patchproof.mesh.unwrap import has_place, unwrap
 from patchproof.scene.texture import texture_canvas
-from patchproof.scene.unwrap import has_place, unwrap
-from patchproof.settings import PatchSettings, Refused
+from patchproof.settings import PatchSettings
+from patchproof.strict import Refused
 
 SOUP = np.random.default_rng(0).normal(size=(90, 3))
 
@@ -99,8 +100,8 @@ def test_faces_that_xatlas_folds_over_others_are_cut_out(monkeypatch):
 
 def test_the_same_mesh_gives_the_same_bytes_in_another_process():
     code = (
-        "import hashlib, numpy as np; from patchproof.scene.load_mesh import load_mesh;"
-        "from patchproof.scene.unwrap import unwrap; m = load_mesh('primitive:mug', 300);"
+        "import hashlib, numpy as np; from patchproof.mesh.load_mesh import load_mesh;"
+        "from patchproof.mesh.unwrap import unwrap; m = load_mesh('primitive:mug', 300);"
         "m = unwrap(m, np.ones(len(m.faces), bool), 128);"
         "print(hashlib.sha256(m.corner_uv.tobytes() + m.materials[0].texture_srgb.tobytes()).hexdigest())"
     )

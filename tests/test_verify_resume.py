@@ -16,10 +16,10 @@ import torch
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
+from patchproof.journey.verify import verify_photos
 from patchproof.photo.read import read_photo
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import dump_manifest
-from patchproof.study.verify import verify_photos
+from patchproof.strict import Refused
 from patchproof.verify import look
 from patchproof.verify.journal import Journal
 from patchproof.verify.run import gather_evidence
@@ -30,7 +30,7 @@ from test_verify_run import NET, promise, shot
 WRITTEN = ("report.json", "report.csv", "report.html", "photos.jsonl")
 KILLED = """
 import os, signal, sys
-from patchproof.study.verify import verify_photos
+from patchproof.journey.verify import verify_photos
 die = lambda done, total: done == 3 and os.kill(os.getpid(), signal.SIGKILL)
 verify_photos(sys.argv[1], sys.argv[2], sys.argv[3], on_photo=die)
 """

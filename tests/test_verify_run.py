@@ -14,7 +14,7 @@ from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.read import Photo
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 from patchproof.verify.camera import view_of
 from patchproof.verify.measure import measure
 from patchproof.verify.ranges import promised_ranges

@@ -25,8 +25,8 @@ from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see
 from patchproof.scene.conditions import with_poses_of
 from patchproof.scene.scene import load_scene
-from patchproof.settings import Refused
 from patchproof.sheet.piece import frame_image
+from patchproof.strict import Refused
 from tolerances import FLOAT32
 
 WHITE = PiecePicture(torch.ones(64, 64, 3), (0, 0, 64, 64), (0, 0, 64, 64))

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 import pytest
 
 import toy_studies as toy
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 from patchproof.workers import open_workers, result_of
 
 

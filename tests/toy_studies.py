@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from patchproof.report.tables import Drawing, Table, rate
-from patchproof.settings import Refused, Strict
+from patchproof.strict import Refused, Strict
 from patchproof.study.study import Cell, Study
 
 

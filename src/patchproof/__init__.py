@@ -18,11 +18,11 @@ _HOME = {
     "optimize_scene": "patchproof.optimize.run",
     "evaluate_run": "patchproof.optimize.evaluate",
     "load_run": "patchproof.optimize.run",
-    "sheet_of": "patchproof.study.sheet",
-    "reprint": "patchproof.study.reprint",
+    "sheet_of": "patchproof.printing.sheet",
+    "reprint": "patchproof.reprint.reprint",
     "load_manifest": "patchproof.sheet.manifest",
-    "verify_photos": "patchproof.study.verify",
-    "Refused": "patchproof.settings",
+    "verify_photos": "patchproof.journey.verify",
+    "Refused": "patchproof.strict",
 }
 
 __all__ = list(_HOME)

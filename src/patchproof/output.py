@@ -15,7 +15,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 
 @contextmanager

@@ -1,72 +1,32 @@
-"""Scene files read strictly, the one way to refuse, and where shipped data lies.
+"""The settings of a scene file: what is photographed, with what on it, under which ranges, and how it is optimized.
 
-In: a TOML file (paths relative to it, `${VAR}` expanded). Out: frozen settings, every value checked: an unknown key
-names the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three things in one sentence:
-what was expected, what was there, and what to do. The command line prints that sentence and exits with 1.
+In: a TOML file whose keys are the fields below. Out: `SceneSettings`, frozen and checked. Every default has its reason
+beside it where one was measured.
 """
 
 from __future__ import annotations
 
-import difflib
-import math
-import os
-import re
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-
-class Refused(ValueError):
-    """What the tool will not do, in one sentence that says expected, got, do."""
-
-    def __init__(self, expected: str, got: str, do: str):
-        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
-        self._parts = expected, got, do
-
-    def __reduce__(self):
-        # exceptions are rebuilt from their message when they come back from another process; this one has three parts
-        return Refused, self._parts
-
-
-def shipped(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:
-    """A file of the data that travels with the program: inside the installed package, else in the checkout."""
-    package = Path(__file__).resolve().parent
-    # an editable install keeps these folders at the top of the checkout, two levels up
-    roots = [root for root in (package / folder, package.parents[1] / folder) if root.is_dir()]
-    if not roots:
-        raise Refused(f"the folder {folder} beside the program", "none", "install patchproof again")
-    return roots[0].joinpath(*parts)
-
-
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] > pair[1]:
-        raise ValueError(f"must be [low, high] with low <= high, not [{pair[0]:g}, {pair[1]:g}]")
-    return pair
-
-
-Finite = Annotated[float, AfterValidator(_finite)]
-Positive = Annotated[Finite, Field(gt=0)]
-NotNegative = Annotated[Finite, Field(ge=0)]
-Share = Annotated[Finite, Field(ge=0, le=1)]
-Range = Annotated[tuple[Finite, Finite], AfterValidator(_ordered)]
-ShareRange = Annotated[tuple[Share, Share], AfterValidator(_ordered)]
-NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
-Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
-
-
-class Strict(BaseModel):
-    """Frozen settings that know all their keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+from patchproof.strict import (
+    Finite,
+    NotNegative,
+    NotNegativeRange,
+    Positive,
+    PositiveRange,
+    Range,
+    Share,
+    ShareRange,
+    Side,
+    Strict,
+    ordered,
+    read_toml,
+    validated,
+    within,
+)
 
 
 class ObjectSettings(Strict):
@@ -150,7 +110,7 @@ class ViewSettings(Strict):
     look_at: Literal["object", "patch"] = "object"
     look_at_jitter: Share = 0.05  # share of the object's length
     azimuth_deg: Range = (-60.0, 60.0)
-    elevation_deg: Annotated[Range, AfterValidator(lambda r: _within(r, -89, 89))] = (2.0, 27.0)
+    elevation_deg: Annotated[Range, AfterValidator(lambda r: within(r, -89, 89))] = (2.0, 27.0)
     distance_mm: PositiveRange = (440.0, 800.0)
     roll_deg: Range = (-5.0, 5.0)
     fov_deg: Annotated[Positive, Field(lt=170)] = 50.0
@@ -189,19 +149,19 @@ class PrinterSettings(Strict):
 
     profile: str = "coated"
     # One print to the next, ΔE00 1 to 3 together. Assumed, from the size of the tolerances of ISO 12647-2. Free.
-    dot_gain: Annotated[Range, AfterValidator(lambda r: _within(r, -0.25, 0.25))] = (-0.04, 0.04)  # tone value at 50 %
-    density: Annotated[Range, AfterValidator(lambda r: _within(r, -0.9, 3))] = (-0.05, 0.05)  # share of the ink's own
-    black: Annotated[Range, AfterValidator(lambda r: _within(r, -0.1, 0.5))] = (-0.004, 0.004)  # light; paper is 1
+    dot_gain: Annotated[Range, AfterValidator(lambda r: within(r, -0.25, 0.25))] = (-0.04, 0.04)  # tone value at 50 %
+    density: Annotated[Range, AfterValidator(lambda r: within(r, -0.9, 3))] = (-0.05, 0.05)  # share of the ink's own
+    black: Annotated[Range, AfterValidator(lambda r: within(r, -0.1, 0.5))] = (-0.004, 0.004)  # light; paper is 1
     # Paper beside the sheet that the light is measured by; papers differ by 0.92 to 1.03 (L* 92 to 96 beside 95) and by
     # b* -8 to 7. Free, but off: either moved the demo's confidence by 0.004, without bias.
     paper_white: PositiveRange = (1.0, 1.0)
-    paper_b: Annotated[Range, AfterValidator(lambda r: _within(r, -40, 40))] = (0.0, 0.0)
+    paper_b: Annotated[Range, AfterValidator(lambda r: within(r, -40, 40))] = (0.0, 0.0)
     # Shift of the color planes. Off: 0.1 mm moved the demo's confidence by 0.001 (0.3 mm: 0.006), and steps take 1.25
     # times as long, as each view shows a print of its own.
-    misregistration_mm: Annotated[NotNegativeRange, AfterValidator(lambda r: _within(r, 0, 5))] = (0.0, 0.0)
+    misregistration_mm: Annotated[NotNegativeRange, AfterValidator(lambda r: within(r, 0, 5))] = (0.0, 0.0)
     # Size over the sheet's own; "fit to page" makes 0.94 to 0.97. Off: sheets ask for 100 % and are measured. (0.97 to
     # 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05 with a bias of -0.006.)
-    scale: Annotated[PositiveRange, AfterValidator(lambda r: _within(r, 0.5, 2))] = (1.0, 1.0)
+    scale: Annotated[PositiveRange, AfterValidator(lambda r: within(r, 0.5, 2))] = (1.0, 1.0)
 
 
 class CameraSettings(Strict):
@@ -213,10 +173,10 @@ class CameraSettings(Strict):
     blur_px: NotNegativeRange = (0.0, 1.0)
     noise: ShareRange = (0.0, 0.01)
     motion_px: NotNegativeRange = (0.0, 0.0)  # length of a straight motion blur at photo_px
-    vignetting: Annotated[ShareRange, AfterValidator(lambda r: _within(r, 0, 0.95))] = (0.0, 0.0)  # lost in corners
+    vignetting: Annotated[ShareRange, AfterValidator(lambda r: within(r, 0, 0.95))] = (0.0, 0.0)  # lost in corners
     file: str | None = None  # a calibrated camera: intrinsics and lens distortion in place of fov_deg
     jpeg: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(_ordered)
+        tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(ordered)
     ] = (60, 95)
 
 
@@ -266,96 +226,6 @@ class SceneSettings(Strict):
         return self
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
-    try:
-        import tomllib
-    except ModuleNotFoundError:
-        import tomli as tomllib
-    path = Path(path)
-    if not path.is_file():
-        raise Refused("a TOML file", f"no file at {path}", "check the path")
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
-
-
 def load_scene_settings(path: str | Path) -> SceneSettings:
     """The settings of a scene file as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
     return validated(SceneSettings, read_toml(path), str(path))
-
-
-def validated(model: type[BaseModel], data: Any, where: str):
-    """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        # a misspelt key is also a missing one: the spelling says more
-        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-        raise _explain(model, first, where) from error
-
-
-def expand(text: str, base: Path) -> str:
-    """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
-
-    def variable(match: re.Match) -> str:
-        if match[1] not in os.environ:
-            raise Refused(f"the environment variable {match[1]}", "none", f"set {match[1]} or write the path out")
-        return os.environ[match[1]]
-
-    text = re.sub(r"\$\{(\w+)\}", variable, text)
-    prefix, colon, rest = text.partition(":")
-    if colon and prefix == "file":
-        return f"file:{_absolute(rest, base)}"
-    if (colon and (prefix in {"primitive", "torchvision", "timm", "module"})) or text == "builtin":
-        return text
-    return str(_absolute(text, base))
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """`(did you mean "x"?)` where a known word is near, else the known words."""
-    known = list(known)
-    near = difflib.get_close_matches(word, known, 1, 0.5)
-    return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
-
-
-def _absolute(path: str, base: Path) -> Path:
-    return path_ if (path_ := Path(path)).is_absolute() else base / path_
-
-
-def _within(pair: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    if pair[0] < low or pair[1] > high:
-        raise ValueError(f"must lie within [{low:g}, {high:g}]")
-    return pair
-
-
-def _explain(model: type[BaseModel], error: dict, where: str) -> Refused:
-    key = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "extra_forbidden":
-        hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
-        return Refused(f"only known keys in {where}", f'"{key}"', hint)
-    if error["type"] == "missing":
-        return Refused(f'the key "{key}" in {where}', "none", f"add {key}")
-    value = str(error.get("input"))
-    value = value if len(value) < 80 else value[:77] + "..."
-    reason = error["msg"].removeprefix("Value error, ").rstrip(".")
-    reason = reason[0].lower() + reason[1:]
-    if not key:  # tables that do not go together
-        return Refused(f"settings in {where} that go together", "others", reason)
-    return Refused(
-        f'a usable "{key}" in {where}', value, f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
-    )
-
-
-def _keys_at(model: Any, location: tuple) -> Iterable[str]:
-    """The known keys of the table at a location, through lists, dictionaries and optional tables."""
-    for part in location:
-        if part in model.model_fields:  # else an index or a dictionary's own key
-            inner, todo = None, [model.model_fields[part].annotation]
-            while todo and inner is None:
-                one = todo.pop()
-                inner = one if isinstance(one, type) and issubclass(one, BaseModel) else None
-                todo.extend(get_args(one))
-            model = inner or model
-    return model.model_fields

@@ -25,7 +25,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 Numbered = tuple[int, Any]
 TRIES = 3  # of an item whose worker dies each time

@@ -30,10 +30,10 @@ from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import expose, shade
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import relit, see
+from patchproof.reprint.reprint import take_photo
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
-from patchproof.study.reprint import take_photo
 
 SUPERSAMPLES, EDGES_PX = (1, 2, 3), 192
 SIDES_PX = (96, 128, 192, 224, 384)

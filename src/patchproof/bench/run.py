@@ -15,7 +15,7 @@ from typing import Any
 from patchproof.bench.chart import Chart, OnStage, text, with_default_checks, with_front
 from patchproof.bench.measure import describe, machine
 from patchproof.output import new_folder
-from patchproof.settings import Refused, nearest
+from patchproof.strict import Refused, nearest
 
 
 def run_bench(

@@ -19,12 +19,12 @@ import torch
 
 from patchproof.bench.chart import Chart, Check, Growth, OnStage, Point, Series, Shares
 from patchproof.bench.measure import median_interval, slope, timed
+from patchproof.mesh.load_mesh import load_mesh
 from patchproof.optimize.goals import target_loss
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.render.fragments import Cameras
 from patchproof.render.photograph import expose
 from patchproof.render.raster import rasterize
-from patchproof.scene.load_mesh import load_mesh
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 

@@ -14,15 +14,16 @@ import numpy as np
 from torch import Tensor
 
 from patchproof.bench.chart import OnStage
+from patchproof.journey import demo
 from patchproof.optimize.loop import steps
 from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem, set_problem
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.backgrounds import Backgrounds
+from patchproof.scene.patterns import background
 from patchproof.scene.scene import build_scene
-from patchproof.settings import SceneSettings, read_toml
-from patchproof.study import demo
-from patchproof.study.patterns import background
+from patchproof.settings import SceneSettings
+from patchproof.strict import read_toml
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ import numpy as np
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import luminance
 from patchproof.photo.read import FORMATS, list_photos, read_photo
-from patchproof.settings import Refused
 from patchproof.sheet.board import Board
+from patchproof.strict import Refused
 
 FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
 _ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110

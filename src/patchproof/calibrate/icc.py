@@ -24,7 +24,7 @@ import torch
 
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table, save_printer
 from patchproof.color import ciede2000, lab_from_srgb
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
 _D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from patchproof.calibrate.boards import View
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 FOLDS = 5
 NUMBERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

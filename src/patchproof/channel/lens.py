@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from patchproof.settings import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
+from patchproof.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
 
 if TYPE_CHECKING:
     from torch import Tensor

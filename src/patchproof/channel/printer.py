@@ -24,7 +24,7 @@ from pydantic import Field
 from torch import Tensor
 
 from patchproof.color import lab_from_srgb
-from patchproof.settings import Finite, Refused, Strict, nearest, shipped, validated
+from patchproof.strict import Finite, Refused, Strict, nearest, shipped, validated
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)

@@ -20,7 +20,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 MAX_JSON_BYTES = 256 << 20
 MAX_NUMBERS = 1 << 31  # in one tensor

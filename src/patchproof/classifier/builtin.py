@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from patchproof.classifier.network import Classifier
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 INPUT_PX = 96
 WIDTHS = (16, 32, 64, 96, 160)  # channels after each halving of the picture: 48, 24, 12, 6, 3 pixels

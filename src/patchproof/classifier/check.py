@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.network import Classifier
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from patchproof.classifier.network import Classifier, weights_sha256
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 
 def load_custom(dotted: str, base: Path, device: torch.device | str = "cpu") -> Classifier:

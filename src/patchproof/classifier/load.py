@@ -21,7 +21,7 @@ import torch
 from patchproof.classifier.batches import fastest
 from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.network import Classifier
-from patchproof.settings import Refused, expand
+from patchproof.strict import Refused, expand
 
 
 def load_classifier(name: str, base: Path, device: torch.device | str = "cpu") -> Classifier:

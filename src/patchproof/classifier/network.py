@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.view import center_square
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 
 def confidence(logits: Tensor, indices: Sequence[int]) -> Tensor:

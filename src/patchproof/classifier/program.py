@@ -30,7 +30,7 @@ from torch import Tensor
 from patchproof.classifier.archive import harmless_copy
 from patchproof.classifier.batches import MAX_BATCH, InBatches
 from patchproof.classifier.network import Classifier
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
 

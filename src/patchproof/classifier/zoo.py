@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from patchproof.classifier.network import Classifier, weights_sha256
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 
 class Normalized(nn.Module):

@@ -14,7 +14,7 @@ import typer
 from patchproof.cli.calibrate import camera, printer
 from patchproof.cli.experiments import bench, harden, study
 from patchproof.cli.journey import demo, evaluate, optimize, plan, reprint, sheet, verify
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 app = typer.Typer(
     no_args_is_help=True,

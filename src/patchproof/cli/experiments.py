@@ -37,8 +37,8 @@ def harden(
     cluster: Cluster = None,
 ) -> None:
     """Change labeled images so that classifiers recognize them better, and attack them."""
-    from patchproof.settings import validated
-    from patchproof.study.harden import HardenSettings, harden_images
+    from patchproof.harden.folder import HardenSettings, harden_images
+    from patchproof.strict import validated
 
     given = {
         "images": str(images),

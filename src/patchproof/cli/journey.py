@@ -51,7 +51,7 @@ def demo(
     overwrite: Overwrite = False,
 ) -> None:
     """The whole journey, offline, on a built-in object and classifier."""
-    from patchproof.study.demo import run_demo
+    from patchproof.journey.demo import run_demo
 
     with progress() as bar:
         summary = run_demo(out, overwrite=overwrite, on_stage=bar)
@@ -66,7 +66,7 @@ def plan(
 ) -> None:
     """What is modeled, what is not, and why."""
     from patchproof.output import check_file, write_whole
-    from patchproof.study.plan import plan_lines, plan_scene
+    from patchproof.plan.plan import plan_lines, plan_scene
 
     if out is not None:
         check_file(out, overwrite)
@@ -147,9 +147,9 @@ def sheet(
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.optimize.run import load_run
     from patchproof.output import check_file
+    from patchproof.printing.sheet import blank_page, sheet_of, sheet_of_several
     from patchproof.sheet.shop import shop_lines
     from patchproof.sheet.write import check_sheet, manifest_paths
-    from patchproof.study.sheet import blank_page, sheet_of, sheet_of_several
 
     runs = runs or []
     if copies > 1 and len(runs) != 1:
@@ -193,8 +193,8 @@ def reprint(
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimize.run import load_run
-    from patchproof.study.reprint import reprint as reprint_sheet
-    from patchproof.study.reprint import scan
+    from patchproof.reprint.reprint import reprint as reprint_sheet
+    from patchproof.reprint.reprint import scan
 
     scale = pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
@@ -212,7 +212,7 @@ def reprint(
         with progress() as bar:
             taken = {"seed": seed, "on_photo": lambda done, total: bar("photograph", done, total), **printed}
             if card:
-                from patchproof.study.card_photo import photograph_cards
+                from patchproof.reprint.card_photo import photograph_cards
 
                 truth = photograph_cards(pdf, made, n, out, **taken)
             else:
@@ -242,8 +242,8 @@ def verify(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure photographs of the print and judge them against the promise."""
+    from patchproof.journey.verify import verify_photos
     from patchproof.report.summary import verdict_lines
-    from patchproof.study.verify import verify_photos
 
     if require not in (None, "kept"):
         raise typer.BadParameter('takes "kept" only', param_hint="--require")

@@ -25,7 +25,8 @@ from patchproof.optimize.pixels import as_pixels, from_pixels
 from patchproof.optimize.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.views import Seen, relit
-from patchproof.settings import OptimizeSettings, Refused
+from patchproof.settings import OptimizeSettings
+from patchproof.strict import Refused
 
 SELECT_AFTER = 120  # training views
 SELECT_VIEWS = 64

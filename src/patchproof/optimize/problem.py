@@ -24,7 +24,7 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Seen, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 # Sides at which views are rendered. Against 40 full photographs of the demo's patch the mean confidence was off by 0.09
 # at 96 px, 0.05 at 192 and 0.005 at 384; against 40 of a patch before a network of 224 px by 0.02 at 224 and at 448.

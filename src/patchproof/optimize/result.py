@@ -17,7 +17,7 @@ from patchproof.optimize.texture import Texture
 from patchproof.output import write_whole
 from patchproof.scene.export import write_glb
 from patchproof.scene.scene import Scene
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 _DESIGN, _OBJECT, _MASK = "design.png", "object.glb", "mask.png"
 RESULT_FILES = (_DESIGN, _OBJECT, "texture_*.png", _MASK)

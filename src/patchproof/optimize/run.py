@@ -28,8 +28,9 @@ from patchproof.optimize.promise import CONTROLS, PROMISE_VIEWS, promise_from, t
 from patchproof.optimize.result import RESULT_FILES, read_result, save_result
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.scene import Scene, build_scene, load_scene
-from patchproof.settings import Refused, SceneSettings, validated
+from patchproof.settings import SceneSettings
 from patchproof.sheet.manifest import Promise
+from patchproof.strict import Refused, validated
 
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
 OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, *RESULT_FILES, "evaluate.json", ".*.part")

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from patchproof.render.clip import GUARD_PX, clipped
 from patchproof.render.fragments import Cameras, Fragments, columns
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
 # Faces, rows, pixels or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.settings import BackgroundSettings, Refused, expand
+from patchproof.settings import BackgroundSettings
+from patchproof.strict import Refused, expand
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}

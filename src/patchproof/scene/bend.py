@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from patchproof.mesh.mesh import Mesh
 from patchproof.scene.exponential import Smooth, exponential_map, largest_stretch
-from patchproof.scene.mesh import Mesh
 from patchproof.scene.placement import (
     GRID,
     LIFT_MM,
@@ -27,7 +27,7 @@ from patchproof.scene.placement import (
     spun,
 )
 from patchproof.scene.surface import Chart, crop, edge_points, heights, net, surface_at
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 # Mean gap, as a share of the shorter edge, up to which a simpler family lies on the surface: 0.6 mm on 60 mm.
 CLOSE_SHARE = 0.01

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.scene.mesh import Mesh
+from patchproof.mesh.mesh import Mesh
 
 _M_FROM_MM = 1e-3
 

@@ -26,7 +26,7 @@ from patchproof.photo.read import read_photo
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
-from patchproof.settings import Refused, SceneSettings, expand
+from patchproof.settings import SceneSettings
 from patchproof.sheet.page import largest_piece_mm
 from patchproof.sheet.piece import (
     MODULES,
@@ -38,6 +38,7 @@ from patchproof.sheet.piece import (
     sheet_id,
 )
 from patchproof.sheet.template import load_template
+from patchproof.strict import Refused, expand
 
 SPLIT_FROM = 20
 _OPTIMIZED_ON = {"train", "select"}

@@ -15,19 +15,20 @@ import numpy as np
 
 from patchproof import geometry
 from patchproof.channel import lens
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
 from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.load_mesh import load_mesh
-from patchproof.scene.mesh import Mesh
 from patchproof.scene.placement import Frame, Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
 from patchproof.scene.texture import Canvas, texture_canvas
-from patchproof.settings import Refused, SceneSettings, expand
+from patchproof.settings import SceneSettings
 from patchproof.sheet.page import largest_piece_mm
 from patchproof.sheet.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheet.template import load_template
 from patchproof.sheet.tiles import plan_tiles
+from patchproof.strict import Refused, expand
 
 _VIEWS_TRIED = 1024
 CLEARANCE = 5e-3  # of the object's length between it and a camera: what is nearer than the near plane would vanish

@@ -32,12 +32,13 @@ from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.scene.resolution import design_grid
-from patchproof.settings import Refused, SceneSettings, expand
+from patchproof.settings import SceneSettings
 from patchproof.sheet.blank import blank_piece_mm
 from patchproof.sheet.manifest import Manifest, load_manifest
 from patchproof.sheet.page import largest_piece_mm
 from patchproof.sheet.piece import Piece, lay_out_piece, sheet_id
 from patchproof.sheet.template import load_template
+from patchproof.strict import Refused, expand
 
 LEAST_PHOTOS = 6
 _MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.scene.mesh import Mesh
+from patchproof.mesh.mesh import Mesh
 from patchproof.scene.surface import Chart, heights
-from patchproof.settings import PatchSettings, Refused
+from patchproof.settings import PatchSettings
+from patchproof.strict import Refused
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.settings import Refused
+from patchproof.strict import Refused
 
 _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
 from patchproof.sheet.piece import frame_mm, lay_out_piece, sheet_id
 from patchproof.sheet.template import load_template
 from patchproof.sheet.write import write_sheet
+from patchproof.strict import Refused
 
 
 def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:

@@ -15,7 +15,6 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from patchproof.settings import NotNegative, Positive, Refused, Strict, nearest, read_toml, shipped, validated
 from patchproof.sheet import page as parts
 from patchproof.sheet.manifest import Manifest, Marker, Point, dump_manifest, load_manifest
 from patchproof.sheet.pdf import page_pdf
@@ -23,6 +22,7 @@ from patchproof.sheet.piece import DICTIONARY, MODULES, marker_at, sheet_id
 from patchproof.sheet.swatches import RectMm
 from patchproof.sheet.template import QrCode, Rulers, TextLine, template_names
 from patchproof.sheet.write import qr_text, replace_both
+from patchproof.strict import NotNegative, Positive, Refused, Strict, nearest, read_toml, shipped, validated
 
 KIND = "board"
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.settings import Finite, Positive, Refused, Share, Strict, validated
+from patchproof.strict import Finite, Positive, Refused, Share, Strict, validated
 
 Point = tuple[Finite, Finite]
 Rect = tuple[Finite, Finite, Positive, Positive]

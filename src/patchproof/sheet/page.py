@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-from patchproof.settings import Refused
 from patchproof.sheet.chart import chart_swatches
 from patchproof.sheet.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheet.piece import (
@@ -30,6 +29,7 @@ from patchproof.sheet.piece import (
 )
 from patchproof.sheet.swatches import RectMm, SwatchRect
 from patchproof.sheet.template import Rulers, Template, TextLine
+from patchproof.strict import Refused
 
 CUT_LINE_MM = 0.2  # drawn wholly outside the cut, so that no ink of it stays on the piece
 TICK_MM = 0.15

@@ -23,8 +23,8 @@ import numpy as np
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import rect_corners
-from patchproof.settings import Refused, nearest
 from patchproof.sheet.swatches import RectMm, SwatchRect, frame_swatches
+from patchproof.strict import Refused, nearest
 
 DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "grey", "noise", "shuffled", "blank")

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.settings import Refused
 from patchproof.sheet.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheet.page import Box, Line, PageLayout, prove_apart, text_box
 from patchproof.sheet.pdf import Printed
 from patchproof.sheet.swatches import RectMm
 from patchproof.sheet.template import Template, TextLine
+from patchproof.strict import Refused
 
 PICTURE_SHARE = 0.42  # of the page's height at most
 ABOVE_MM, BESIDE_MM = 13.0, 22.0  # for the dimension chains

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.settings import Refused, validated
 from patchproof.sheet.manifest import Manifest, Tile
 from patchproof.sheet.pdf import ATTACHMENT, POINTS_PER_MM, numbered
+from patchproof.strict import Refused, validated
 
 LARGEST_PX = 20_000  # along a side; more would be gigabytes
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest, Promise, Swatch, design_sha256
 from patchproof.sheet.page import PageLayout, lay_out_parts, moved, moved_marker, place_pieces, size_text
 from patchproof.sheet.pdf import Printed
@@ -33,6 +32,7 @@ from patchproof.sheet.write import (
     printed_marker,
     save_sheets,
 )
+from patchproof.strict import Refused
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from patchproof.settings import NotNegative, Positive, Refused, Share, Strict, nearest, read_toml, shipped, validated
 from patchproof.sheet.manifest import Point, Rect
+from patchproof.strict import NotNegative, Positive, Refused, Share, Strict, nearest, read_toml, shipped, validated
 
 Count = Annotated[int, Field(ge=1)]
 

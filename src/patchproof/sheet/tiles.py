@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from patchproof.settings import Refused
 from patchproof.sheet.fonts import text_width_mm
 from patchproof.sheet.page import (
     CUT_LINE_MM,
@@ -37,6 +36,7 @@ from patchproof.sheet.page import (
 from patchproof.sheet.piece import MODULES, Piece, marker_at
 from patchproof.sheet.swatches import RectMm
 from patchproof.sheet.template import Template, TextLine
+from patchproof.strict import Refused
 
 BLEED_MM = 1.0  # of the piece's picture on a flap
 MARKERS = 5  # of a tile's own: whichever corner is hidden, four are left that surround most of it

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import (
     Design,
     Manifest,
@@ -34,6 +33,7 @@ from patchproof.sheet.plan_page import PlanPage, lay_out_plan
 from patchproof.sheet.swatches import FRAME_COLORS, RectMm
 from patchproof.sheet.template import Template
 from patchproof.sheet.tile_pages import FIRST_TILE_PAGE, tile_pages
+from patchproof.strict import Refused
 
 
 def write_sheet(

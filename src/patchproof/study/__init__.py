@@ -1,1 +1,1 @@
-"""Whole experiments: simulated reprints, the demo, and how the built-in network was trained."""
+"""The harness of studies: cells that resume and spread, and what trained designs share."""

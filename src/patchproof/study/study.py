@@ -25,25 +25,25 @@ from typing import Any
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.report.study_page import study_page
 from patchproof.report.tables import Drawing, Table, csv_text, png
-from patchproof.settings import Refused, Strict, nearest, read_toml, validated
+from patchproof.strict import Refused, Strict, nearest, read_toml, validated
 from patchproof.workers import Workers, one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is, imported when asked for
 STUDIES: dict[str, str] = {
-    "ablation": "patchproof.study.ablation",
-    "deceive": "patchproof.study.deceive",
-    "detection": "patchproof.study.detection",
-    "envelope": "patchproof.study.envelope.sweeps",
-    "gamut": "patchproof.study.gamut",
-    "harden": "patchproof.study.harden",
-    "ledger": "patchproof.study.ledger_trials",
-    "mining": "patchproof.study.mining",
-    "patch2d": "patchproof.study.patch2d",
-    "patch3d": "patchproof.study.patch3d",
-    "promises": "patchproof.study.promises",
-    "robust": "patchproof.study.robust",
-    "stress": "patchproof.study.stress",
-    "transfer": "patchproof.study.transfer",
+    "ablation": "patchproof.validation.ablation",
+    "deceive": "patchproof.experiments.deceive",
+    "detection": "patchproof.validation.detection",
+    "envelope": "patchproof.validation.envelope.sweeps",
+    "gamut": "patchproof.validation.gamut",
+    "harden": "patchproof.harden.folder",
+    "ledger": "patchproof.validation.ledger_trials",
+    "mining": "patchproof.experiments.mining",
+    "patch2d": "patchproof.experiments.patch2d",
+    "patch3d": "patchproof.experiments.patch3d",
+    "promises": "patchproof.validation.promises",
+    "robust": "patchproof.experiments.robust",
+    "stress": "patchproof.experiments.stress",
+    "transfer": "patchproof.experiments.transfer",
 }
 _LIBRARIES = ("patchproof", "torch", "numpy")
 _NAME = re.compile(r"[\w=+.,-]{1,120}")

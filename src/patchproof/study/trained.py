@@ -28,7 +28,8 @@ from patchproof.optimize.texture import Texture
 from patchproof.report.tables import Estimate, difference, mean, rate
 from patchproof.scene.export import write_glb
 from patchproof.scene.scene import Scene, build_scene
-from patchproof.settings import Refused, SceneSettings, Strict, expand, read_toml, validated
+from patchproof.settings import SceneSettings
+from patchproof.strict import Refused, Strict, expand, read_toml, validated
 from patchproof.study.study import Cell, Result, short_name
 
 Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change

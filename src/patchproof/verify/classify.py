@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest, Promise
+from patchproof.strict import Refused
 from patchproof.verify.results import Prediction
 
 if TYPE_CHECKING:

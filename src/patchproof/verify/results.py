@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from patchproof.settings import Finite, Strict
+from patchproof.strict import Finite, Strict
 
 Status = Literal["judged", "measured", "rejected"]
 Row = tuple[Finite, Finite, Finite]

@@ -18,8 +18,8 @@ import numpy as np
 
 from patchproof.claims import wilson
 from patchproof.photo.read import list_photos, pictures_in
-from patchproof.settings import Refused
 from patchproof.sheet.manifest import Manifest
+from patchproof.strict import Refused
 from patchproof.verify.classify import check_primary, predict, target_indices
 from patchproof.verify.journal import Journal, settings_key
 from patchproof.verify.ledger import Ledger, ledger_of

@@ -1,0 +1,1 @@
+"""Assistive images: photographs changed so that networks recognize them better, also when attacked."""

@@ -1,0 +1,1 @@
+"""Verification of photographs, and the demo that goes the whole way."""

@@ -1,0 +1,137 @@
+"""Verify: photographs and a manifest in, a report out.
+
+In: a folder of photographs and SHEET.json. Out: REPORT/ with report.json, report.csv, report.html, pictures and
+photos.jsonl, one line per finished photograph, from which `resume` goes on. This joins what must not know each other:
+the judge, its networks and the page. The promise's primary network always judges, whatever others are named.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from patchproof.channel.lens import load_camera
+from patchproof.channel.printer import load_printer
+from patchproof.classifier.load import load_classifier
+from patchproof.output import check_folder
+from patchproof.report.images import save_pictures
+from patchproof.report.write import write_report
+from patchproof.sheet.manifest import Manifest, load_manifest
+from patchproof.strict import Refused
+from patchproof.verify.look import WITH_PICTURES
+from patchproof.verify.results import Evidence, Origin, Report
+from patchproof.verify.run import LEDGER_PHOTOS, gather_evidence
+
+_JOURNAL = "photos.jsonl"
+OWN = ("report.json", "report.csv", "report.html", "pictures", _JOURNAL, ".*.part")
+_LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
+
+
+def verify_photos(
+    photos: str | Path,
+    sheet: str | Path,
+    out: str | Path,
+    *,
+    models: tuple[str, ...] | None = None,
+    controls: str | Path | None = None,
+    scan_dpi: float | None = None,
+    ruler_mm: tuple[float, float] | None = None,
+    ledger_photos: int = LEDGER_PHOTOS,
+    card: bool = False,
+    camera: str | None = None,
+    jobs: int = 1,
+    cluster: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    on_photo: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
+
+    `card` looks for a bank card in its outline on the uncut page; `camera` is a camera file's name or path. Model and
+    printer names are looked up from the manifest's folder, then as the scene's were. `resume` goes on from what an
+    earlier run finished, whole or killed: only photographs that are new, or differ, are measured.
+    """
+    out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
+    _check_out(out, resume, overwrite)
+    networks = [load_classifier(name, base) for name in _names(manifest, models)]
+    printer = manifest.settings.get("printer")
+    evidence = gather_evidence(
+        photos,
+        manifest,
+        models=networks,
+        printer=None if printer is None else load_printer(printer["profile"], base),
+        scan_dpi=scan_dpi,
+        controls=controls,
+        ledger_photos=ledger_photos,
+        camera=None if camera is None else load_camera(camera),
+        card=card,
+        jobs=jobs,
+        cluster=cluster,
+        journal=out / _JOURNAL,
+        resume=resume,
+        on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
+        progress=on_photo,
+    )
+    if ruler_mm is not None:
+        evidence = _with_ruler(evidence, manifest, ruler_mm)
+    options = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "card": card or None, "camera": camera and Path(camera).name}
+    hashes = {"manifest": hashlib.sha256(Path(sheet).read_bytes()).hexdigest()}
+    hashes |= {f"network {network.name}": network.sha256 for network in networks}
+    origin = Origin(options=options | {"ledger_photos": ledger_photos}, sha256=hashes, versions=_versions())
+    report = evidence.report.model_copy(update={"origin": origin})
+    _drop_pictures(out / "pictures", {photo.file for photo in report.photos[:WITH_PICTURES]})
+    write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, evidence.notes())
+    return report
+
+
+def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
+    """Refuse a folder with files in it, unless they are ours and to be gone on from, or replaced."""
+    begun = (out / _JOURNAL).is_file()
+    if resume:
+        check_folder(out, OWN if begun else (), overwrite=begun)
+        return
+    if begun and not overwrite and not (out / "report.json").is_file():
+        raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
+    check_folder(out, OWN, overwrite)
+
+
+def _drop_pictures(folder: Path, files: set[str]) -> None:
+    """Remove pictures of photographs that this report does not show."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name.rsplit(".", 2)[0] not in files:
+            path.unlink()
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # run from a checkout, or another of OpenCV's four wheels
+            continue
+    return found
+
+
+def _names(manifest: Manifest, models: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The primary network first, then the others asked for, or else the promise's."""
+    if manifest.promise is None:
+        if not models:
+            raise Refused(
+                "a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models"
+            )
+        return models
+    promised = tuple(model.name for model in manifest.promise.models)
+    return tuple(dict.fromkeys((promised[0], *(models or promised))))
+
+
+def _with_ruler(evidence: Evidence, manifest: Manifest, ruler_mm: tuple[float, float]) -> Evidence:
+    """The scale that a ruler on the print shows, for every photograph of it that shows none itself."""
+    scale = [measured / nominal for measured, nominal in zip(ruler_mm, manifest.ruler_mm, strict=True)]
+    photos = tuple(
+        photo if photo.scale_x is not None else photo.model_copy(update={"scale_x": scale[0], "scale_y": scale[1]})
+        for photo in evidence.report.photos
+    )
+    return replace(evidence, report=evidence.report.model_copy(update={"photos": photos}))

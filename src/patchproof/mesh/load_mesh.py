@@ -1,0 +1,58 @@
+"""A mesh by its name: a file's (`mesh_file`) or a procedural object's (`primitives`).
+
+In: a path or `primitive:NAME`, and the object's longest extent. Out: a `Mesh` in the scene's frame. Textures larger
+than any photograph shows are reduced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
+
+# Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, and no photograph of an object shows as much.
+LARGEST_TEXTURE_PX = 4096
+_Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z") -> Mesh:
+    """The mesh of a file, or of `primitive:NAME`, with its longest extent `length_mm`.
+
+    `up = "z"` turns (x, y, z) into (x, z, -y); primitives are y up already. Refused where nothing usable is left or a
+    texture that the file names is missing.
+    """
+    if str(path).startswith("primitive:"):
+        from patchproof.mesh import primitives
+
+        mesh = primitives.build(str(path).removeprefix("primitive:"), 0)
+        return replace(mesh, vertices=mesh.vertices * (length_mm / np.ptp(mesh.vertices, axis=0).max()))
+    from patchproof.mesh.mesh_file import read_parts
+
+    parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
+    parts, reduced = _within_limit(parts)
+    return from_parts(parts, length_mm, (*warnings, *reduced))
+
+
+def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
+    """The parts with textures of at most LARGEST_TEXTURE_PX a side, and warnings about those that were larger."""
+    import cv2
+
+    known: dict[int, Material] = {}
+    warnings = []
+    for material in (part.material for part in parts):
+        texture = material.texture_srgb
+        if id(material) in known or texture is None or max(texture.shape[:2]) <= LARGEST_TEXTURE_PX:
+            known.setdefault(id(material), material)
+            continue
+        height, width = texture.shape[:2]
+        scale = LARGEST_TEXTURE_PX / max(width, height)
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        reduced = cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
+        known[id(material)] = replace(material, texture_srgb=reduced)
+        warnings.append(f"the texture of {width} × {height} of {material.name} is reduced to {size[0]} × {size[1]}")
+    return [replace(part, material=known[id(part.material)]) for part in parts], warnings

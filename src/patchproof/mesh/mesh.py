@@ -1,0 +1,142 @@
+"""Meshes: what the object looks like, in millimetres.
+
+In: parts, read by `load_mesh` or made by code. Out: one triangle list in the scene's frame
+with per-corner texture coordinates, normals and colours, and warnings that say what was assumed.
+Faces that cannot be drawn (NaN corners, no area) are left out; size and centre are those of the faces that are drawn.
+Left out on purpose: closed surfaces. A renderer needs no inside, so open, non-manifold and loose triangles will do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.strict import Refused
+
+
+@dataclass(frozen=True)
+class Material:
+    """A base colour in linear light and, where there is one, a texture as uint8 H×W×3 sRGB; they multiply as light."""
+
+    name: str
+    base_color_linear: tuple[float, float, float]
+    texture_srgb: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """Triangles of one material: what `from_parts` joins. Arrays are per vertex; None where there is none."""
+
+    vertices: np.ndarray  # V×3, any unit, world axes (y up)
+    faces: np.ndarray  # F×3 integers, counter-clockwise seen from outside
+    material: Material
+    uv: np.ndarray | None = None  # V×2, u right, v down from the texture's top-left
+    normals: np.ndarray | None = None  # V×3, any length
+    colors_linear: np.ndarray | None = None  # V×3
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle list; the colour of a point is texture (as light) · base colour · corner colour."""
+
+    vertices: np.ndarray  # float64 V×3: mm, right-handed, y up, origin at the bounding box's centre
+    faces: np.ndarray  # int64 F×3, counter-clockwise seen from outside
+    corner_uv: (
+        np.ndarray
+    )  # float32 F×3×2: u right, v down from the texture's top-left, in textures (wraps); 0 where none
+    corner_normal: np.ndarray  # float32 F×3×3 unit: the file's where it has them, else the face's own
+    corner_color_linear: np.ndarray  # float32 F×3×3; 1 where none
+    face_material: np.ndarray  # int64 F, into materials
+    materials: tuple[Material, ...]
+    warnings: tuple[str, ...] = ()  # what was assumed or left out
+
+
+def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
+    """One mesh of several parts, centred, its longest extent `length_mm`; parts may share a Material object.
+
+    Faces with NaN or infinite corners and faces without area are left out with a warning; refused where none is left.
+    """
+    vertices, faces, owner = _joined(parts)
+    finite = np.isfinite(vertices).all(1)
+    whole = finite[faces].all(1)
+    # everything is first divided by the largest coordinate, so that neither 1e-200 nor 1e300 over- or underflows
+    size = np.abs(vertices[faces[whole]]).max(initial=0.0)
+    unit = np.where(finite[:, None], vertices, 0.0) / (size or 1.0)
+    normals, has_area = _face_normals(unit, faces)
+    keep = whole & has_area
+    if not keep.any():
+        got = "only NaN or infinite vertices" if len(faces) and not whole.any() else f"{len(faces)} faces without any"
+        raise Refused("a mesh whose faces have an area", got, "export the object again")
+    warnings = list(warnings)
+    if not whole.all():
+        warnings.append(f"{np.count_nonzero(~whole)} faces with NaN or infinite corners are left out")
+    if np.any(whole & ~has_area):
+        warnings.append(f"{np.count_nonzero(whole & ~has_area)} faces without area are left out")
+    corners = [_corners(part, normals[owner == i]) for i, part in enumerate(parts)]
+    uv, corner_normals, colors = (np.concatenate(array)[keep] for array in zip(*corners, strict=True))
+    used, kept_faces = _compact(faces[keep], len(unit))
+    placed = unit[used]
+    low, high = placed.min(0), placed.max(0)
+    known: dict[int, int] = {}
+    index = np.array([known.setdefault(id(part.material), len(known)) for part in parts])
+    by_id = {id(part.material): part.material for part in parts}
+    return Mesh(
+        vertices=(placed - (low + high) / 2) * (length_mm / (high - low).max()),
+        faces=kept_faces,
+        corner_uv=uv,
+        corner_normal=corner_normals,
+        corner_color_linear=colors,
+        face_material=index[owner[keep]],
+        materials=tuple(by_id[key] for key in known),
+        warnings=tuple(warnings),
+    )
+
+
+def _joined(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All vertices, all faces into them, and the part that each face belongs to."""
+    for part in parts:
+        if len(part.faces) and (part.faces.min() < 0 or part.faces.max() >= len(part.vertices)):
+            last = len(part.vertices) - 1
+            raise Refused(f"faces that name vertices 0 to {last}", f"{part.faces.max()}", "export the mesh again")
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    vertices = np.concatenate([np.asarray(part.vertices, float) for part in parts])
+    faces = np.concatenate([np.asarray(part.faces, np.int64) + s for part, s in zip(parts, starts, strict=False)])
+    return vertices, faces, np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+
+
+def _face_normals(unit: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals F×3, and whether the face has an area, for coordinates within [-1, 1]."""
+    a, b, c = (unit[faces[:, i]] for i in range(3))
+    cross = np.cross(b - a, c - a)
+    doubled_area = np.linalg.norm(cross, axis=1)
+    edge = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
+    # collinear points give a cross product of rounding only: a few 1e-16 of the coordinates, times an edge
+    has_area = doubled_area > 1e-14 * edge
+    return cross / np.where(has_area, doubled_area, 1.0)[:, None], has_area
+
+
+def _corners(part: Part, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(uv F×3×2, normals F×3×3, colours F×3×3) of a part's corners, float32."""
+    count = len(part.faces)
+    uv = np.zeros((count, 3, 2), np.float32)
+    if part.uv is not None:
+        uv[:] = part.uv[part.faces]
+    normals = np.repeat(face_normals[:, None].astype(np.float32), 3, axis=1)
+    if part.normals is not None:
+        length = np.linalg.norm(part.normals, axis=1)
+        good = np.isfinite(length) & (length > 0)
+        directions = part.normals / np.where(good, length, 1.0)[:, None]
+        normals = np.where(good[part.faces][..., None], directions[part.faces].astype(np.float32), normals)
+    colors = np.ones((count, 3, 3), np.float32)
+    if part.colors_linear is not None:
+        colors[:] = part.colors_linear[part.faces]
+    return uv, normals, colors
+
+
+def _compact(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(indices of the vertices that faces use, faces into those)."""
+    used = np.zeros(count, bool)
+    used[faces] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[faces]

@@ -1,0 +1,340 @@
+"""Mesh files: OBJ (with MTL), GLB, glTF, PLY and STL turned into parts, and what had to be assumed on the way.
+
+In: a file and the rotation into the world's axes. Out: parts with the scene graph's transforms applied, and warnings.
+Colours: a glTF base colour and COLOR_0 are linear light, as its specification says; an OBJ's Kd and the vertex colours
+of OBJ and PLY are taken as sRGB, as their exporters write them. Vertex colours multiply the material in glTF; elsewhere
+they stand for a missing texture. A texture's alpha is dropped: what it would let shine through is drawn opaque.
+Refused: a file that cannot be parsed, and a texture that the file names but that is missing or broken.
+Left out on purpose: metal, roughness, emission, normal maps, transparency, skins and animation.
+
+trimesh parses. Its loaders are called below its `Trimesh` class, which would round colours to 8 bits and make up
+normals that the file does not have; they keep silent about missing files and invent a 2×2 image; both are looked for.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import urllib.parse
+import warnings as python_warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from patchproof.color import linear_from_srgb
+from patchproof.mesh.mesh import Material, Part
+from patchproof.strict import Refused
+
+FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
+GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5: what an object without colour is taken to be
+WHITE = (1.0, 1.0, 1.0)
+
+
+def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[Part], list[str]]:
+    """Every placed piece of geometry with faces, vertices and normals turned by `world_from_file` 3×3, and warnings."""
+    if not path.is_file():
+        raise Refused("a mesh file", f"no file at {path}", "check the path")
+    if path.suffix.lower() not in FORMATS:
+        raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
+    reader = _Reader(path)
+    parts = [
+        reader.part(raw, recipe, world_from_file @ world[:3])
+        for world, raw, recipe in reader.placed()
+        if np.size(raw.get("faces", ())) and np.size(raw["vertices"])
+    ]
+    if not parts:
+        raise Refused("a mesh with faces", f"none in {path.name}", "export the object as triangles")
+    return parts, [*dict.fromkeys(reader.warnings), *_topology_warnings(parts)]
+
+
+class _Assets:
+    """Files that a mesh names, looked up beside it; remembers the missing and broken ones. trimesh's `resolver`."""
+
+    def __init__(self, mesh: Path):
+        self.folder, self.file_name = mesh.parent, mesh.name
+        self.missing, self.broken = [], []
+
+    def get(self, name: str) -> bytes:
+        name = str(name).strip()
+        if name.startswith("-"):  # map_Kd takes options before the name
+            name = name.split()[-1]
+        for spelled in (name, name.replace("\\", "/"), urllib.parse.unquote(name)):
+            if (self.folder / spelled).is_file():
+                data = (self.folder / spelled).read_bytes()
+                if not spelled.lower().endswith((".mtl", ".bin")) and not _is_image(data):
+                    self.broken.append(name)
+                return data
+        self.missing.append(name)
+        raise FileNotFoundError(name)
+
+    __getitem__ = get
+
+
+class _Reader:
+    """One file while it is read: what trimesh found in it, materials already made, and the warnings so far."""
+
+    def __init__(self, path: Path):
+        self.path, self.assets, self.warnings = path, _Assets(path), []
+        self.kind = path.suffix.lower()[1:]
+        self.is_gltf = self.kind in {"glb", "gltf"}
+        self.textures: dict[int, np.ndarray] = {}
+        self.materials: dict[tuple, Material] = {}
+        try:
+            self.header = _gltf_header(path) if self.is_gltf else {}
+            if self.kind == "obj":
+                _check_obj(path)
+            self.loaded = self._load()
+        except Refused:
+            raise
+        except Exception as error:  # the parsers raise whatever they stumble over
+            self._refuse_missing()
+            reason = f"{type(error).__name__}: {error}"[:120]
+            got = f"{path.name} that cannot be read ({reason})"
+            raise Refused(f"a mesh as {self.kind.upper()}", got, "export it again") from error
+        self._refuse_missing()
+        self._warn_about_gltf()
+
+    def placed(self) -> list[tuple[np.ndarray, dict, dict]]:
+        """(world_from_part 4×4, trimesh's arrays, the glTF primitive) of each placed geometry."""
+        from trimesh.scene.transforms import SceneGraph
+
+        geometry = self.loaded.get("geometry", {"": self.loaded})
+        # trimesh keeps the primitives' order and leaves out fans and loops (modes 2, 3, 6)
+        primitives = [
+            p for m in self.header.get("meshes", ()) for p in m["primitives"] if p.get("mode", 4) in (0, 1, 4, 5)
+        ]
+        recipes = dict(zip(geometry, primitives, strict=False))
+        places = [(np.eye(4), name) for name in geometry]
+        if self.is_gltf:
+            graph = SceneGraph(base_frame=self.loaded.get("base_frame", "world"))
+            for edge in self.loaded.get("graph", ()):
+                graph.update(**edge)
+            # in the loader's order: the graph's own is that of a set, another one in every process
+            nodes = dict.fromkeys(edge["frame_to"] for edge in self.loaded.get("graph", ()) if edge.get("geometry"))
+            places = [graph[node] for node in nodes]
+        return [(np.asarray(world, float), geometry[name], recipes.get(name, {})) for world, name in places]
+
+    def part(self, raw: dict[str, Any], primitive: dict, transform: np.ndarray) -> Part:
+        """The part of a geometry, carried by `transform` 3×4."""
+        from trimesh.geometry import triangulate_quads
+
+        faces = triangulate_quads(raw["faces"])
+        vertices = np.asarray(raw["vertices"], float)
+        rotation = transform[:, :3]
+        if np.linalg.det(rotation) < 0:  # a mirror turns triangles inside out
+            faces = faces[:, ::-1]
+        with np.errstate(invalid="ignore", over="ignore"):
+            placed = vertices @ rotation.T + transform[:, 3]
+            normals = raw.get("vertex_normals")
+            usable = normals is not None and np.shape(normals) == vertices.shape
+            normals = np.asarray(normals, float) @ _normal_transform(rotation).T if usable else None
+        uv = self._uv(raw.get("visual"), len(vertices))
+        colors = self._corner_colors(raw, len(vertices), len(faces))
+        material = self._material(raw.get("visual"), primitive, uv is not None, colors is not None)
+        if colors is not None and not self.is_gltf and material.texture_srgb is not None:
+            self.warnings.append("vertex colors are left out where there is a texture")
+            colors = None
+        if colors is None or len(colors) == len(vertices):
+            return Part(placed, faces, material, uv, normals, colors)
+        corners = faces.reshape(-1)  # one colour per face: give every face corners of its own
+        uv, normals = (None if array is None else array[corners] for array in (uv, normals))
+        own = np.arange(len(corners)).reshape(-1, 3)
+        return Part(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
+
+    def _load(self) -> dict[str, Any]:
+        from trimesh.exchange.load import mesh_loaders
+
+        with open(self.path, "rb") as file, python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")  # about numpy's parsers, not about the mesh
+            return mesh_loaders[self.kind](file, file_type=self.kind, resolver=self.assets)
+
+    def _refuse_missing(self):
+        for name in dict.fromkeys(self.assets.missing):
+            if not name.lower().endswith(".mtl"):
+                raise Refused(
+                    f"the file {name}, which {self.path.name} names", "none", f"put it into {self.path.parent}"
+                )
+            self.warnings.append(f"the material file {name} is missing")
+        for name in self.assets.broken:
+            raise Refused(f"the texture {name} of {self.path.name}", "no picture that can be read", "export it again")
+
+    def _warn_about_gltf(self):
+        used = set(self.header.get("extensionsUsed", ())) | set(self.header.get("extensionsRequired", ()))
+        for name in sorted(used & {"KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"}):
+            self.warnings.append(f"the glTF extension {name} is not read; textures or shapes may be wrong")
+        if any(m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in self.header.get("materials", ())):
+            self.warnings.append("transparent materials are drawn opaque")
+
+    def _uv(self, visual, count: int) -> np.ndarray | None:
+        """Coordinates with v down, or None; trimesh's run up, whatever the file's do."""
+        uv = getattr(visual, "uv", None)
+        if uv is None or len(uv) != count:
+            return None
+        finite = np.isfinite(uv).all(1)
+        if not finite.all():
+            self.warnings.append(f"{np.count_nonzero(~finite)} texture coordinates are not numbers and are taken as 0")
+        u, v = np.asarray(uv, float)[:, :2].T
+        return np.where(finite[:, None], np.column_stack([u, 1 - v]), 0.0)
+
+    def _corner_colors(self, raw: dict, vertex_count: int, face_count: int) -> np.ndarray | None:
+        """Linear colours per vertex, or per face, or None."""
+        colors = raw.get("vertex_colors")
+        if colors is None:
+            colors = getattr(raw.get("visual"), "vertex_attributes", {}).get("color")
+        if colors is None or len(colors) != vertex_count:
+            colors = raw.get("face_colors")
+        if colors is None or len(colors) not in (vertex_count, face_count):
+            return None
+        colors = np.asarray(colors)[:, :3]
+        top = np.iinfo(colors.dtype).max if colors.dtype.kind in "iu" else 1.0
+        colors = np.asarray(colors, float) / top
+        broken = ~np.isfinite(colors).all(1)
+        if broken.any():
+            self.warnings.append(f"{np.count_nonzero(broken)} vertex colors are not numbers and are taken as gray 0.5")
+        if top == 1.0 and not self.is_gltf and np.max(colors[~broken], initial=0.0) > 1:
+            self.warnings.append("vertex colors above 1 are taken as 0 to 255")
+            colors = colors / 255
+        colors = np.clip(np.where(broken[:, None], 0.0, colors), 0.0, 1.0)
+        linear = colors if self.is_gltf else linear_from_srgb(colors)
+        return np.where(broken[:, None], GRAY_LINEAR, linear)
+
+    def _material(self, visual, primitive: dict, has_uv: bool, has_colors: bool) -> Material:
+        """The material of a geometry, made once for all that share it."""
+        source = getattr(visual, "material", None)
+        image = getattr(source, "baseColorTexture", None) if self.is_gltf else getattr(source, "image", None)
+        if image is not None and image.format is None:  # trimesh's own invention: a read image knows its format
+            image = None
+        key = (id(source), id(image), has_uv, has_colors)
+        if key not in self.materials:
+            self.materials[key] = self._make_material(source, image, primitive, has_uv, has_colors)
+        return self.materials[key]
+
+    def _make_material(self, source, image, primitive: dict, has_uv: bool, has_colors: bool) -> Material:
+        if image is not None and not has_uv:
+            self.warnings.append("a texture without texture coordinates is left out")
+            image = None
+        texture = None if image is None else self._texture(image)
+        name = str(getattr(source, "name", None) or "unnamed")
+        if self.is_gltf and source is not None:
+            return Material(name, self._gltf_base_color(source, primitive, texture is not None), texture)
+        if has_colors and texture is None:
+            return Material("vertex colors", WHITE)
+        kd = (getattr(source, "kwargs", None) or {}).get("kd")
+        if kd is None or np.shape(kd) != (3,) or not np.isfinite(kd).all():
+            if texture is None:
+                self.warnings.append("faces without a material color are taken as gray 0.5")
+            return Material(name, GRAY_LINEAR if texture is None else WHITE, texture)
+        if texture is not None and not np.any(kd):  # exporters write Kd 0 0 0 beside a map and mean "the map alone"
+            kd = WHITE
+        return Material(name, tuple(linear_from_srgb(np.clip(np.asarray(kd, float), 0, 1)).tolist()), texture)
+
+    def _gltf_base_color(self, source, primitive: dict, has_texture: bool) -> tuple[float, float, float]:
+        """The factor as the file has it; trimesh's is rounded to 8 bits, and serves for old extensions only."""
+        material = self.header["materials"][primitive["material"]] if "material" in primitive else {}
+        metal_rough = material.get("pbrMetallicRoughness", {})
+        named = metal_rough.get("baseColorTexture")
+        if named is not None and not has_texture and getattr(source, "baseColorTexture", None) is None:
+            got = "none or a broken one"
+            raise Refused(
+                f"the texture of {source.name!s} in {self.path.name} as PNG, JPEG or WebP", got, "export it again"
+            )
+        if named is not None and named.get("texCoord", 0) != 0:
+            self.warnings.append("a texture asks for its second set of coordinates; the first is used")
+        factor = metal_rough.get("baseColorFactor")
+        if factor is None:
+            factor = WHITE if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255
+        return tuple(float(value) for value in factor[:3])
+
+    def _texture(self, image) -> np.ndarray:
+        """An image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
+        if id(image) not in self.textures:
+            try:
+                if image.mode.startswith("I"):  # Pillow would clip 16 bits at 255 instead of scaling them
+                    pixels = np.repeat((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+                else:
+                    pixels = np.asarray(image.convert("RGB"))
+            except Exception as error:
+                got = f"a broken one ({str(error)[:80]})"
+                raise Refused(f"a texture of {self.path.name} that can be read", got, "export it again") from error
+            self.textures[id(image)] = pixels
+        return self.textures[id(image)]
+
+
+def _is_image(data: bytes) -> bool:
+    """Whether Pillow knows the format and finds it in order, as far as that can be told without decoding."""
+    from PIL import Image
+
+    try:
+        Image.open(io.BytesIO(data)).verify()
+    except Exception:  # Pillow's readers raise whatever they stumble over
+        return False
+    return True
+
+
+def _gltf_header(path: Path) -> dict:
+    """The JSON of a GLB or glTF file. trimesh reads another file, model.gltf, where a .gltf is no JSON."""
+    with open(path, "rb") as file:
+        if path.suffix.lower() == ".glb":
+            head = file.read(20)
+            if head[:4] != b"glTF":
+                raise ValueError("it does not start with glTF")
+            text = file.read(int.from_bytes(head[12:16], "little"))
+        else:
+            text = file.read()
+    header = json.loads(text)
+    if not isinstance(header, dict):
+        raise ValueError("its JSON is no object")
+    return header
+
+
+def _check_obj(path: Path):
+    """Two things that trimesh reads wrongly without a word: short faces, and indices relative to where they stand."""
+    text = path.read_bytes().replace(b"\\\n", b" ")
+    short = re.search(rb"^f(?:[ \t]+\S+){0,2}[ \t]*\r?$", text, re.MULTILINE)
+    if short:
+        line = text.count(b"\n", 0, short.start()) + 1
+        got = f"{len(short[0].split()) - 1} in line {line} of {path.name}"
+        raise Refused("faces with at least three corners", got, "the file may be cut short, export it again")
+    relative = re.search(rb"^f[^\n]*[ \t/]-\d", text, re.MULTILINE)
+    if relative and re.search(rb"^v[tn]?[ \t]", text[relative.end() :], re.MULTILINE):
+        got = f"some in {path.name} that stand before further vertices"
+        raise Refused("relative indices after the last vertex", got, "export with absolute indices")
+
+
+def _normal_transform(rotation: np.ndarray) -> np.ndarray:
+    """What carries normals: the inverse transpose up to a positive factor, as cofactors, so that flattening works."""
+    a, b, c = rotation
+    cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+    return -cofactors if np.linalg.det(rotation) < 0 else cofactors
+
+
+def _topology_warnings(parts: list[Part]) -> list[str]:
+    """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
+    loose = crowded = edges = 0
+    for part in parts:
+        corners = _places(part.vertices)[part.faces]
+        pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+        count = np.unique(pairs[:, 0] * (len(part.vertices) + 1) + pairs[:, 1], return_counts=True)[1]
+        loose, crowded, edges = (
+            loose + np.count_nonzero(count == 1),
+            crowded + np.count_nonzero(count > 2),
+            edges + len(count),
+        )
+    found = []
+    if edges > 5 and loose > 0.9 * edges:  # more than two triangles, hardly an edge shared
+        found.append("the mesh is a soup of loose triangles; each is drawn as it is")
+    if crowded:
+        found.append(f"{crowded} edges belong to more than two faces (not a manifold); faces are drawn as they are")
+    return found
+
+
+def _places(vertices: np.ndarray) -> np.ndarray:
+    """A number per vertex, equal for equal positions; hashed, since sorting rows would take longer than loading."""
+    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)
+    with np.errstate(over="ignore"):
+        key = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+        key = (key ^ (key >> np.uint64(29)) ^ bits[:, 1]) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ (key >> np.uint64(32)) ^ bits[:, 2]) * np.uint64(0x94D049BB133111EB)
+    return np.unique(key, return_inverse=True)[1]

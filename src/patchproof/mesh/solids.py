@@ -1,0 +1,139 @@
+"""Closed solids from rings of points: lathe, tube, prism and box, as mesh parts with normals and texture coordinates.
+
+In: millimetres, y up, and an sRGB color. Out: parts wound counter-clockwise seen from outside, three vertices of their
+own for every face, so that normals and texture coordinates may jump between faces. Sides that bend by less than the
+crease angle shade smoothly. Texture coordinates are cylindrical on lathe and tube (caps: the disc inscribed in the
+texture) and planar on prism and box (each face direction sees the texture upright, once over the part).
+Left out on purpose: booleans; parts may run into one another and the z-buffer sorts them out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from patchproof.color import linear_from_srgb
+from patchproof.mesh.mesh import Material, Part
+
+AROUND = 24  # corners of a round cross-section: 15° each, below the crease, so that sides shade smoothly
+CREASE_DEG = 40.0
+
+
+def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: bool = False) -> Part:
+    """The closed surface over rings K×3, counter-clockwise about the way they go; 1×3 at both ends closes it."""
+    grid = np.stack([np.broadcast_to(ring, (max(map(len, rings)), 3)) for ring in rings])
+    rows, columns = grid.shape[:2]
+    v = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(grid, axis=0), axis=2).mean(1))])
+    v = 1 - v / v[-1]
+    triangles, uv = [], []
+    for i, j in np.ndindex(rows - 1, columns):
+        a, b, c, d = (i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)
+        below, above = len(rings[i]) == 1, len(rings[i + 1]) == 1  # a fan about a pole has one triangle, not two
+        for triangle in [(a, b, c)] * (not below) + [(a, c, d)] * (not above):
+            triangles.append([grid[m, n % columns] for m, n in triangle])
+            cap = below or above
+            uv.append([_pole_uv(rings, m, n) if cap else (n / columns, v[m]) for m, n in triangle])
+    corners = np.array(triangles)
+    normals = _corner_normals(corners)
+    uv = _planar_uv(corners) if planar else np.array(uv)
+    material = Material(name, tuple(float(c) for c in linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1))))
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    return Part(corners.reshape(-1, 3), faces, material, uv.reshape(-1, 2), normals.reshape(-1, 3))
+
+
+def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int = AROUND) -> Part:
+    """A profile of (radius, height) turned about y; starts and ends at radius 0, the outside on its right hand."""
+    angle = np.arange(around) * 2 * np.pi / around
+    circle = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
+    up = np.array([0.0, 1.0, 0.0])
+    return skin([(circle if r > 0 else circle[:1]) * r + up * y for r, y in profile], name, srgb)
+
+
+def tube(path: Sequence[Sequence[float]], radius, name: str, srgb, around: int = 12) -> Part:
+    """A round tube along N×3 points, flat ends; `radius` is one figure or one per point."""
+    path = np.asarray(path, float)
+    radius = np.broadcast_to(np.asarray(radius, float), len(path))
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    angle = np.arange(around)[:, None] * 2 * np.pi / around
+    rings, e1 = [path[:1]], np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
+    for point, direction, r in zip(path, along, radius, strict=True):
+        e1 = e1 - direction * (e1 @ direction)  # carried along without twist
+        e1 = e1 / np.linalg.norm(e1)
+        rings.append(point + r * (np.cos(angle) * e1 + np.sin(angle) * np.cross(direction, e1)))
+    return skin([*rings, path[-1:]], name, srgb)
+
+
+def prism(outline: Sequence[tuple[float, float]], x0: float, x1: float, name: str, srgb) -> Part:
+    """An outline of (z, y) in either direction, star-shaped about its middle, from x0 to x1."""
+    z, y = np.asarray(outline, float).T
+    if np.sum(z * np.roll(y, -1) - y * np.roll(z, -1)) > 0:  # seen from +x, z runs to the left
+        z, y = z[::-1], y[::-1]
+
+    def at(x: float, z, y) -> np.ndarray:
+        return np.stack([np.full_like(z, x), y, z], 1)
+
+    middle = z.mean(keepdims=True), y.mean(keepdims=True)
+    return skin([at(x0, *middle), at(x0, z, y), at(x1, z, y), at(x1, *middle)], name, srgb, planar=True)
+
+
+def box(size: tuple[float, float, float], at: tuple[float, float, float], name: str, srgb) -> Part:
+    """A box of (x, y, z) extents; `at` is the middle of its *bottom*."""
+    dx, dy, dz = size
+    outline = [(-dz / 2, 0), (-dz / 2, dy), (dz / 2, dy), (dz / 2, 0)]
+    return moved(prism(outline, -dx / 2, dx / 2, name, srgb), at)
+
+
+def moved(part: Part, by: Sequence[float]) -> Part:
+    """The part, shifted."""
+    return replace(part, vertices=part.vertices + np.asarray(by, float))
+
+
+def turned(part: Part, axis: int, degrees: float) -> Part:
+    """The part, turned about a world axis (0 x, 1 y, 2 z) through the origin, counter-clockwise seen from its tip."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    matrix = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix[i, i], matrix[i, j], matrix[j, i], matrix[j, j] = c, -s, s, c
+    return replace(part, vertices=part.vertices @ matrix.T, normals=part.normals @ matrix.T)
+
+
+def _pole_uv(rings, row: int, column: int) -> tuple[float, float]:
+    """Texture coordinates on a cap: the cap's disc inscribed in the texture."""
+    if len(rings[row]) == 1:
+        return 0.5, 0.5
+    angle = 2 * np.pi * column / len(rings[row])
+    return 0.5 + 0.5 * np.cos(angle), 0.5 + 0.5 * np.sin(angle)
+
+
+def _corner_normals(corners: np.ndarray) -> np.ndarray:
+    """F×3×3 unit normals: weighted by angle over the faces at a point that bend less than the crease from here."""
+    from scipy.sparse import csr_matrix
+
+    unit = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    scale = np.ptp(corners.reshape(-1, 3), axis=0).max()
+    point = np.unique(np.round(corners.reshape(-1, 3) / scale, 7), axis=0, return_inverse=True)[1].reshape(-1)
+    at = csr_matrix((np.ones(len(point)), (np.arange(len(point)), point)))
+    first, second = (at @ at.T).nonzero()
+    near = (unit[first // 3] * unit[second // 3]).sum(1) > np.cos(np.radians(CREASE_DEG))
+    edge = np.roll(corners, -1, 1) - corners
+    edge /= np.linalg.norm(edge, axis=2, keepdims=True)
+    angle = np.arccos(np.clip(-(edge * np.roll(edge, 1, 1)).sum(2), -1, 1)).reshape(-1, 1)
+    total = np.zeros((len(point), 3))
+    np.add.at(total, first[near], (angle * unit.repeat(3, 0))[second[near]])
+    return (total / np.linalg.norm(total, axis=1, keepdims=True)).reshape(-1, 3, 3)
+
+
+def _planar_uv(corners: np.ndarray) -> np.ndarray:
+    """F×3×2: each face sees the texture along the axis nearest to its normal, upright from outside, once per part."""
+    low, extent = corners.min((0, 1)), np.ptp(corners, axis=(0, 1))
+    x, y, z = np.moveaxis((corners - low) / extent, 2, 0)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.abs(normal).argmax(1)
+    sign = np.take_along_axis(normal, axis[:, None], 1) > 0
+    u = np.select([(axis == 0)[:, None], (axis == 1)[:, None]], [np.where(sign, 1 - z, z), x], np.where(sign, x, 1 - x))
+    v = np.where((axis == 1)[:, None], np.where(sign, z, 1 - z), 1 - y)
+    return np.stack([u, v], 2)

@@ -1,0 +1,1 @@
+"""What of a scene is modeled, what is not, and why."""

@@ -1,0 +1,155 @@
+"""What one step of optimization costs on this machine, and where the time goes.
+
+In: a problem and a design. Out: `Cost`: median milliseconds of each part over a few steps' views, after a warm-up. The
+parts are those of the loop; what cannot be timed inside of `see` is the difference of two calls of it. Nothing is
+predicted but what keeping views for several steps would save, which is their share of `see`.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from patchproof.optimize.goals import target_loss
+from patchproof.optimize.problem import Problem
+from patchproof.render.fragments import Cameras
+from patchproof.render.photograph import expose
+from patchproof.render.raster import rasterize
+from patchproof.render.views import NEAR_SHARE, see
+from patchproof.scene.conditions import Conditions
+from patchproof.strict import Strict
+
+REPEATS = 5
+REFRESH = (2, 4)
+
+
+class Part(Strict):
+    """Milliseconds of a part of a step and their share of it."""
+
+    name: str
+    ms: float
+    share: float
+
+
+class Cost(Strict):
+    """One step of `views` views of `side_px`; `refresh_ms` is the step at `optimize.refresh` = k by k, `see` shared by
+    k steps.
+    """
+
+    views: int
+    side_px: int
+    threads: int
+    refresh: int
+    ms: float
+    parts: tuple[Part, ...]
+    refresh_ms: dict[int, float]
+
+
+def measure_cost(
+    problem: Problem, design: Tensor, on_step: Callable[[int, int], None] = lambda done, total: None
+) -> Cost:
+    """The cost of a step that shows `design`, with all classifiers of the problem."""
+    settings = problem.scene.settings.optimize
+    rows = []
+    for number in range(REPEATS + 1):
+        conditions = problem.scene.draw("train", settings.views, start=number * settings.views)
+        rows.append(_step_ms(problem, design, conditions))
+        on_step(number + 1, REPEATS + 1)
+    median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
+    total = sum(median.values())
+    parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
+    see_ms = sum(ms for name, ms in median.items() if name.startswith("see"))
+    return Cost(
+        views=settings.views,
+        side_px=problem.training_px,
+        threads=torch.get_num_threads(),
+        refresh=settings.refresh,
+        ms=total,
+        parts=parts,
+        refresh_ms={k: total - see_ms * (1 - 1 / k) for k in REFRESH},
+    )
+
+
+def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tensor) -> dict[str, float]:
+    """What a step of each other problem takes, as a multiple of the problem's own just before: medians of ratios."""
+    views, ratios = problem.scene.settings.optimize.views, {name: [] for name in others}
+    for number in range(REPEATS + 1):
+        conditions = problem.scene.draw("train", views, start=number * views)
+        for name, other in others.items():
+            own_ms, other_ms = (sum(_step_ms(one, design, conditions).values()) for one in (problem, other))
+            ratios[name].append(other_ms / own_ms)
+    return {name: statistics.median(values[1:]) for name, values in ratios.items()}
+
+
+def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
+    """Milliseconds of each part of one step, in the order of the loop."""
+    clock = _Clock(problem.device)
+    design = design.clone().requires_grad_()
+    parts, seen = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
+    clock.start()
+    shown = problem.subject.shown(design)
+    parts["printer" if problem.scene.piece is not None else "textures"] = clock.lap()
+    pictures = expose(seen, shown)
+    parts["light, piece and camera"] = clock.lap()
+    leaf = pictures.detach().requires_grad_()
+    losses = [
+        target_loss(classifier.logits(leaf), indices, problem.scene.settings.target.goal).mean()
+        for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
+    ]
+    loss = torch.stack(losses).mean()
+    parts["classifier forward"] = clock.lap()
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    parts["classifier backward"] = clock.lap()
+    cost = (pictures * gradient).sum() + problem.subject.penalty(design)
+    torch.autograd.grad(cost, design)
+    parts["design backward"] = clock.lap()
+    return parts
+
+
+def _see_ms(problem: Problem, shown, conditions: Conditions):
+    """(milliseconds of the parts of `see`, the views)."""
+    clock, size = _Clock(problem.device), (problem.training_px,) * 2
+    clock.start()
+    seen = problem.see(shown, conditions, problem.training_px)
+    whole = clock.lap()
+    see(problem.stage, None, conditions, size)
+    parts = {"see: background": clock.lap()}
+    if problem.stage.object is not None:
+        _rasterize_object(problem, conditions, size)
+        rasterizing = min(clock.lap(), parts["see: background"])
+        rest = parts.pop("see: background") - rasterizing
+        parts |= {"see: rasterize object": rasterizing, "see: object's texels, background": rest}
+    if seen.piece is not None:
+        parts["see: piece's footprints"] = max(0.0, whole - sum(parts.values()))
+    return parts, seen
+
+
+def _rasterize_object(problem: Problem, conditions: Conditions, size_px: tuple[int, int]) -> None:
+    scene, surface, device = problem.scene, problem.stage.object, problem.device
+    poses = torch.as_tensor(scene.camera_from_world(conditions), device=device)
+    matrices = torch.as_tensor(scene.matrix_px(size_px), device=device).expand(len(poses), 3, 3)
+    near_mm = NEAR_SHARE * scene.settings.object.length_mm
+    rasterize(surface.vertices, surface.faces, Cameras(poses, matrices, size_px), near_mm)
+
+
+class _Clock:
+    """A stopwatch in milliseconds that waits for the device."""
+
+    def __init__(self, device: torch.device):
+        self._device, self._last = device, 0.0
+
+    def start(self) -> None:
+        """Begin now."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        self._last = time.perf_counter()
+
+    def lap(self) -> float:
+        """Milliseconds since the last time, and begin again."""
+        before = self._last
+        self.start()
+        return 1000 * (self._last - before)

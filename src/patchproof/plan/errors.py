@@ -1,0 +1,266 @@
+"""The error that each part of the model would leave, in pictures and before the primary classifier.
+
+In: a problem, a design that the classifier responds to, and a few views of the select stream. Out: `Terms`. The
+difference is taken where it counts: in the picture as the classifier gets it. What sensors and files do is measured on
+whole photographs' centered squares, stored as real JPEGs, and then asked whether training, which renders smaller views,
+shows it at all. Filtering and edges are measured against one sample per pixel.
+Left out on purpose: interactions of terms, but for one check of all that can go, left out at once.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from patchproof.classifier.view import center_square
+from patchproof.optimize.pixels import as_pixels, from_pixels
+from patchproof.optimize.problem import Problem
+from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
+from patchproof.render.photograph import expose, photograph
+from patchproof.render.views import PiecePicture, Seen, relit, see
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.placement import Placement
+from patchproof.strict import Strict
+
+# A view of this many times the size, of which every fifth pixel is kept, shows points in place of a pixel's mean.
+_FINE = 5
+_WHOLE = 1 - 1 / 256  # share of a pixel from which on it lies inside of the piece
+_PIXELS_AT_ONCE = 1 << 21  # about 300 MB of pictures and what is between them
+_RENDERED = tuple(Term(name, "", lambda setup: setup) for name in ("footprint filtering", "piece's edges"))
+
+
+class TermError(Strict):
+    """The error that a term leaves where it is left out; of one that is not modeled, the error that it leaves now.
+
+    `codes_mean` and `codes_p95` are absolute differences of 8-bit code values over the picture that the classifier
+    gets, `confidence` is the mean absolute change of the target's. Figures are null where the term is off.
+    """
+
+    name: str
+    key: str  # empty where there is no setting to change
+    verdict: Literal["off", "keep", "can go", "missing", "left out"]  # the last two are of what is not modeled
+    codes_mean: float | None = None
+    codes_p95: float | None = None
+    confidence: float | None = None
+    bias: float | None = None  # the mean change with its sign: of leaving out, or of putting in what is not modeled
+    in_training: bool | None = None  # whether training's smaller views show it
+
+
+class Terms(Strict):
+    """All terms, over `views` views in which the design has a mean `confidence`. Those can go whose changes, added up
+    from the smallest on, stay under `threshold`; `together` is the change when they are left out at once.
+    """
+
+    views: int
+    confidence: float
+    threshold: float
+    errors: tuple[TermError, ...]
+    together: float | None = None
+
+
+def measure_terms(
+    problem: Problem,
+    design: Tensor,
+    conditions: Conditions,
+    selection_views: int,
+    other_surface: Placement | None = None,
+    on_view: Callable[[int, int], None] = lambda done, total: None,
+) -> Terms:
+    """The errors of all terms over `conditions`. The threshold is the standard error that the mean confidence has over
+    `selection_views` views: a smaller change decides about no design.
+    """
+    base = Setup(problem.stage, problem.subject.shown(design), conditions)
+    terms = scene_terms(problem, design, other_surface)
+    changed = {term.name: term.change(base) for term in terms}
+    on = [term for term in terms if changed[term.name] is not None]
+    photo = Album(problem, base, min(problem.scene.settings.camera.photo_px))
+    advance = _counter(on_view, 3 * len(conditions))
+    with torch.no_grad():
+        wholes = [term for term in on if term.whole]
+        whole = photo.look([changed[term.name] for term in wholes], advance)
+        small = Album(problem, base, problem.training_px).look([changed[t.name] for t in on], advance)
+        points = _point_sampled(problem, base)
+        confidence = _confidence(problem, whole[0])
+        threshold = float(confidence.std()) / selection_views**0.5
+        rows = {}
+        for term, pictures in zip(on, small[1:], strict=True):
+            rows[term.name] = _row(problem, term, small[0], pictures)
+        for term, pictures in zip(wholes, whole[1:], strict=True):
+            shows = rows[term.name].codes_mean > 0
+            rows[term.name] = _row(problem, term, whole[0], pictures).model_copy(update={"in_training": shows})
+        for term in _RENDERED:
+            if term.name in points:
+                rows[term.name] = _row(problem, term, points[""], points[term.name])
+        judged = {row.name: row for row in _judged(terms, rows, threshold)}
+        gone = [term for term in on if term.key and judged[term.name].verdict == "can go"]
+        together = _together(problem, photo, gone, confidence, advance)
+    return Terms(
+        views=len(conditions),
+        confidence=float(confidence.mean()),
+        threshold=threshold,
+        errors=tuple(judged.values()),
+        together=together,
+    )
+
+
+def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: float) -> list[TermError]:
+    """The rows of all terms, with verdicts; terms without a row are off."""
+    terms, verdicts, sum_of_gone = (*terms, *(t for t in _RENDERED if t.name in rows)), {}, 0.0
+    for term in sorted((t for t in terms if t.name in rows), key=lambda t: rows[t.name].confidence):
+        change = rows[term.name].confidence
+        small = change < threshold or change == 0
+        if not term.modeled:
+            verdicts[term.name] = "left out" if small else "missing"
+            continue
+        if small and term.key:  # errors that are small one by one may add up
+            small = sum_of_gone + change < threshold or change == 0
+            sum_of_gone += change
+        verdicts[term.name] = "can go" if small else "keep"
+    return [
+        rows[t.name].model_copy(update={"verdict": verdicts[t.name]})
+        if t.name in rows
+        else TermError(name=t.name, key=t.key, verdict="off")
+        for t in terms
+    ]
+
+
+def _counter(on_view: Callable[[int, int], None], total: int) -> Callable[[int], None]:
+    done = 0
+
+    def advance(n: int) -> None:
+        nonlocal done
+        done += n
+        on_view(done, total)
+
+    return advance
+
+
+def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermError:
+    codes = (255 * (changed - base)).abs().cpu().numpy()
+    change = _confidence(problem, changed) - _confidence(problem, base)
+    return TermError(
+        name=term.name,
+        key=term.key,
+        verdict="keep",
+        codes_mean=float(codes.mean()),
+        codes_p95=float(np.quantile(codes, 0.95)),
+        confidence=float(change.abs().mean()),
+        bias=float(change.mean()),
+    )
+
+
+def _together(
+    problem: Problem, photo: Album, gone: list[Term], confidence: Tensor, on_view: Callable[[int], None]
+) -> float | None:
+    """The mean absolute change of confidence when all of these are left out at once; None of none."""
+    if not gone:
+        return None
+    setup = photo.base
+    for term in gone:
+        setup = term.change(setup) or setup
+    pictures = replace(photo, base=setup).look([], on_view)[0]
+    return float((_confidence(problem, pictures) - confidence).abs().mean())
+
+
+def _confidence(problem: Problem, pictures: Tensor) -> Tensor:
+    """N confidences of the primary classifier in the target."""
+    classifier = problem.classifiers[0]
+    return classifier.confidence(classifier.logits(pictures), problem.indices[0])
+
+
+@dataclass(frozen=True)
+class Album:
+    """Square views of one size, as the primary classifier gets them."""
+
+    problem: Problem
+    base: Setup
+    side_px: int
+
+    def look(self, setups: list[Setup], on_view: Callable[[int], None]) -> Tensor:
+        """(1 + len(setups))×N×3×S×S: the base setup's pictures, then those of each other one."""
+        stack = []
+        for rows in _chunks(len(self.base.conditions), self.side_px):
+            base = self._seen(self.base, self.base.conditions[rows])
+            parts = []
+            for setup in (self.base, *setups):
+                conditions = setup.conditions[rows]
+                same = setup.stage is self.base.stage and setup.supersample == self.base.supersample
+                same = same and (conditions.printed_scale == base.conditions.printed_scale).all()
+                seen = relit(base, conditions) if same else self._seen(setup, conditions)
+                parts.append(self._pictures(seen, setup))
+            stack.append(torch.stack(parts))
+            on_view(len(base.conditions))
+        return torch.cat(stack, 1)
+
+    def _seen(self, setup: Setup, conditions: Conditions) -> Seen:
+        piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
+        return see(setup.stage, piece, conditions, (self.side_px, self.side_px), setup.supersample)
+
+    def _pictures(self, seen: Seen, setup: Setup) -> Tensor:
+        """A whole photograph goes through a real JPEG, a training view as training exposes it."""
+        if seen.reduced:
+            pictures = expose(seen, setup.shown, setup.jpeg)
+        else:
+            pictures = expose(seen, setup.shown, jpeg=False)
+            pictures = _stored(pictures, seen.conditions.jpeg) if setup.jpeg else pictures
+        return center_square(pictures, self.problem.classifiers[0].input_px)
+
+
+def _chunks(views: int, side_px: int) -> list[slice]:
+    """The views to render at a time."""
+    count = max(1, _PIXELS_AT_ONCE // side_px**2)
+    return [slice(first, first + count) for first in range(0, views, count)]
+
+
+def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
+    """Pictures N×3×H×W that were JPEG files in between."""
+    stored = []
+    for picture, one in zip(pictures, quality, strict=True):
+        file = io.BytesIO()
+        Image.fromarray(as_pixels(picture)).save(file, "JPEG", quality=int(one))
+        stored.append(from_pixels(np.asarray(Image.open(file)), pictures.device))
+    return torch.stack(stored)
+
+
+def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
+    """N×3×S×S pictures by name: as rendered (""), and with one point per pixel within the piece (or, without one, on
+    the object) or along the piece's edges.
+    """
+    setup, side = without_camera(base), problem.training_px
+    scene, parts = setup.stage.scene, []
+    for rows in _chunks(len(base.conditions), _FINE * side):
+        conditions = setup.conditions[rows]
+        piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
+        seen = see(setup.stage, piece, conditions, (side, side))
+        fine = photograph(setup.stage, setup.shown, conditions, (_FINE * side, _FINE * side), jpeg=False)
+        points = fine[..., _FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
+        rendered = expose(seen, setup.shown, jpeg=False)
+        inside, edge = (_mask(which, len(rendered), side) for which in _pixels(seen))
+        parts.append(
+            torch.stack([rendered, torch.where(inside, points, rendered), torch.where(edge, points, rendered)])
+        )
+    both = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
+    rendered, inside, edge = both.unflatten(0, (3, -1))
+    named = {"": rendered, "footprint filtering": inside}
+    return named if scene.piece is None else named | {"piece's edges": edge}
+
+
+def _pixels(seen: Seen) -> tuple[Tensor, Tensor]:
+    """Pixels that lie within the piece (or on the object), and those that the piece covers in part."""
+    if seen.piece is None:
+        return seen.object.pixel, seen.object.pixel[:0]
+    whole = seen.piece.share[:, 0] >= _WHOLE
+    return seen.piece.pixel[whole], seen.piece.pixel[~whole]
+
+
+def _mask(pixel: Tensor, views: int, side_px: int) -> Tensor:
+    mask = torch.zeros(views * side_px**2, dtype=torch.bool, device=pixel.device)
+    mask[pixel] = True
+    return mask.view(views, 1, side_px, side_px)

@@ -1,0 +1,55 @@
+"""How much the figures that are counted can say: the selection's, the promise's, and that of photographs.
+
+In: the draft's rate and what selection can tell apart. Out: for each, how far off it may be with as many samples as it
+takes, and with four times as many, which is the next rung: chance shrinks with their root, cost grows with them. The
+promise's interval is Wilson's; photographs are judged by what they may show after such a promise (see `claims`).
+"""
+
+from __future__ import annotations
+
+from patchproof.claims import prediction_interval, wilson
+from patchproof.journey.demo import PHOTOS
+from patchproof.optimize.loop import SELECT_VIEWS
+from patchproof.optimize.promise import PROMISE_VIEWS
+from patchproof.strict import Strict
+
+NEXT = 4
+
+
+class Sample(Strict):
+    """Half the width of a 95 % interval, of a mean confidence or a rate in [0, 1], from `n` and from `next_n`."""
+
+    name: str
+    n: int
+    half_width: float
+    next_n: int
+    next_half_width: float
+
+
+def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
+    """The samples' ladder at a rate; `standard_error` is that of the selection set's mean confidence."""
+    selection = [1.96 * standard_error / k**0.5 for k in (1, NEXT)]
+    promise = [_half(wilson(round(rate * n), n)) for n in (PROMISE_VIEWS, NEXT * PROMISE_VIEWS)]
+    photos = [
+        _half(prediction_interval(round(rate * PROMISE_VIEWS), PROMISE_VIEWS, n)) / n for n in (PHOTOS, NEXT * PHOTOS)
+    ]
+    rows = (
+        ("selection: mean confidence", SELECT_VIEWS, selection),
+        ("promise: rate", PROMISE_VIEWS, promise),
+        ("photographs: rate", PHOTOS, photos),
+    )
+    return tuple(
+        Sample(name=name, n=n, half_width=now, next_n=NEXT * n, next_half_width=after) for name, n, (now, after) in rows
+    )
+
+
+def _half(interval: tuple[float, float]) -> float:
+    return (interval[1] - interval[0]) / 2
+
+
+def sample_lines(samples: tuple[Sample, ...]) -> list[str]:
+    """The ladder for the terminal."""
+    return [
+        f"  {one.name:27} {one.n:4d} samples leave ±{one.half_width:.3f}, {one.next_n} would ±{one.next_half_width:.3f}"
+        for one in samples
+    ]

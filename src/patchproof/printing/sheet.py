@@ -1,0 +1,127 @@
+"""A run's sheets: the design's own page and those of its controls, each with the marker ids that tell it from the
+others.
+
+In: a finished run. Out: SHEET.pdf and SHEET.json. The promise belongs to the design in the piece it was optimized with:
+another template, and with it another frame, would be another promise, which is then made anew. A piece whose blank was
+photographed keeps its size on every template, or the template is refused. The last page of a template with `plan_page`
+says where the piece goes and how to photograph it. Before there is a run, `blank_page` writes the pages of blanks,
+charts and boards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from patchproof.optimize.problem import set_problem
+from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimize.run import Run
+from patchproof.printing.hung import hang
+from patchproof.printing.shots import shot_sections
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import Scene, build_scene
+from patchproof.sheet.blank import blank_sheet
+from patchproof.sheet.board import board_sheet, is_board
+from patchproof.sheet.chart_page import chart_sheet
+from patchproof.sheet.manifest import Manifest, Promise
+from patchproof.sheet.page import size_text
+from patchproof.sheet.piece import MODULES, control_design, lay_out_piece
+from patchproof.sheet.plan_page import PlanPage, edges_mm
+from patchproof.sheet.several import OneDesign, write_several
+from patchproof.sheet.template import Template, load_template
+from patchproof.sheet.write import write_sheet
+from patchproof.strict import Refused
+
+
+def sheet_of(
+    run: Run, pdf_path: str | Path, *, template: str | None = None, control: str | None = None, copies: int = 1
+) -> Manifest:
+    """Write the run's sheet; `control` is mean, grey, noise, shuffled or blank, `template` a name or file in place of
+    the scene's.
+    """
+    one, scene, page = _design(run, template, control)
+    return write_sheet(
+        pdf_path,
+        template=page,
+        piece=one.piece,
+        sheet_id=one.sheet_id,
+        kind=one.kind,
+        design_srgb8=None if one.kind == "blank" else one.design_srgb8,
+        promise=one.promise,
+        settings=one.settings,
+        plan=_plan(scene, page, one.promise) if page.plan_page else None,
+        copies=copies,
+    )
+
+
+def sheet_of_several(
+    runs: Sequence[Run], pdf_path: str | Path, *, template: str | None = None, control: str | None = None
+) -> list[Manifest]:
+    """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
+    another is named.
+    """
+    name = template or runs[0].scene.settings.sheet.template
+    return write_several(pdf_path, load_template(name), [_design(run, name, control)[0] for run in runs])
+
+
+def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDesign, Scene, Template]:
+    """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
+    scene, promise = run.scene, run.promise
+    settings = scene.settings
+    if scene.piece is None:
+        raise Refused(
+            "a run of a patch", "one of the object's own texture", "take object.glb and textures from the run"
+        )
+    if template is not None and template != settings.sheet.template:
+        settings = settings.model_copy(update={"sheet": settings.sheet.model_copy(update={"template": template})})
+        scene = build_scene(settings, scene.base, scene.seed)
+        if scene.piece.size_mm != run.scene.piece.size_mm and control is None:
+            problem = set_problem(scene)
+            promise = promise_from(problem, try_out(problem, run.design, scene.draw("promise", PROMISE_VIEWS)))
+    kind = control or "design"
+    piece = scene.piece
+    if control is not None:
+        piece = lay_out_piece(piece.design_rect_mm[2:], scene.piece.module_mm * MODULES, scene.sheet_id, kind)
+    one = OneDesign(
+        piece=piece,
+        sheet_id=scene.sheet_id,
+        kind=kind,
+        design_srgb8=run.design if control is None else control_design(kind, run.design, scene.sheet_id),
+        promise=promise if control is None else None,
+        settings=settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]},
+    )
+    return one, scene, load_template(settings.sheet.template)
+
+
+def _plan(scene: Scene, template: Template, promise: Promise | None) -> PlanPage | None:
+    """Where the piece goes and, for a promise, how to photograph it; None where neither can be said."""
+    hung, sections = None, []
+    if isinstance(scene, MeshScene):
+        hung = hang(scene, template)
+        edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edges_mm(hung).items())
+        placed = [
+            f"Seen as you face the object's {scene.settings.patch.side} side. From the piece's cut edge to the "
+            f"outermost edges of that side: {edges}.",
+            f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement.reason}.",
+        ]
+        if template.tiles is not None:
+            placed.append(
+                "Glue from the top left to the bottom right on a flat table: each tile covers the white flaps of its "
+                "neighbors and 1 mm of their picture. Letters name rows, numbers columns."
+            )
+        sections.append(("Where the piece goes", tuple(placed)))
+    if promise is not None:
+        sections += shot_sections(promise, scene.settings)
+    return PlanPage(hung, tuple(sections)) if sections else None
+
+
+def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:
+    """Write a page that needs no run: of a template with a [blank] or a [board] table, or of a chart alone."""
+    if control is not None:
+        raise Refused(f"the run whose {control} control belongs on the page", "none", "name the run")
+    if template is None:
+        raise Refused("a run, or the template of a blank page", "neither", "name a run, or --template blank_a4")
+    if is_board(template):
+        return board_sheet(template, pdf_path)
+    page = load_template(template)
+    return chart_sheet(page, pdf_path) if page.piece is None else blank_sheet(template, pdf_path)

@@ -1,0 +1,1 @@
+"""Prints and their photographs in simulation: our own renderer, one that is not ours, and charts."""

@@ -1,0 +1,345 @@
+"""Photographs by a renderer that is not ours: Mitsuba 3 traces paths through the same scene under the same conditions.
+
+In: a stage, the printed piece (or none) and one view's conditions. Out: a picture, as `render.photograph` gives. What
+our renderer leaves out is here: shadows that are cast, with soft edges, light that goes back and forth between paper,
+object and what stands beside it, and depth of field. How large the light and the lens are follows from `draw_optics`,
+since conditions do not say. What stays ours: the printer, the camera behind its lens (`channel.camera`), and the
+picture in the background, which lights nothing. Levels follow `channel.light`: a surface with nothing around it comes
+out alike.
+
+Left out on purpose: colored light, transparency, scenes made of pictures.
+
+Source: Jakob et al., Mitsuba 3 renderer, 2022. Veach and Guibas, Optimally Combining Sampling Techniques for Monte
+Carlo Rendering, SIGGRAPH 1995, for why the surrounding light is sampled by the surface alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof import geometry
+from patchproof.channel.camera import develop
+from patchproof.channel.lens import Frame, distorted, pinhole_frame
+from patchproof.channel.light import irradiance_basis
+from patchproof.channel.printer import misregistered, vary
+from patchproof.color import linear_from_srgb
+from patchproof.render.photograph import PAPER_BACK_LINEAR
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import Stage
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.strict import Refused
+
+# Bare paper: our levels are relative to it, but light that goes back and forth is not.
+PAPER_REFLECTANCE = 0.85
+LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
+APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
+LAMP_RADIUS_MM = 20.0
+PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels
+MOST_BOUNCES = 4  # of a path, the light included: paper lit by what paper lights
+_FAR = 20.0  # the directional light's distance in lengths of the object
+_SKY_PX = (64, 128)
+_SKY_WEIGHT = 1e-3  # of paths sent to a light on purpose; 0 is refused where there is no other light
+_SQUARE = 1e-4  # how far a pixel's sides may differ
+# Older ones end the whole process: they cannot compile the minimum that Dr.Jit asks for.
+_FIRST_LLVM = 17
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What conditions do not say: the directional light's radius as an angle, and the lens's diameter."""
+
+    light_radius_deg: float
+    aperture_mm: float
+
+
+def draw_optics(conditions: Conditions) -> Optics:
+    """One view's light and lens, evenly drawn; they follow from the view's noise seed."""
+    u = np.random.default_rng([int(conditions.noise_seed[0]), 1]).random(2)
+    ends = zip((LIGHT_RADIUS_DEG, APERTURE_MM), u, strict=True)
+    return Optics(*(float(low + (high - low) * share) for (low, high), share in ends))
+
+
+def photograph_traced(
+    stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics | None = None
+) -> Tensor:
+    """1×3×H×W sRGB: the photograph of one view, without JPEG; `piece=None` is the bare object."""
+    light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
+    if stage.camera is not None:
+        light = distorted(light, stage.camera, stage.scene.settings.camera.photo_px)
+    return develop(light, conditions, 1.0, jpeg=False)
+
+
+def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
+    """1×3×H×W linear light before lens distortion and sensor, of the size of the lens's frame."""
+    scene = stage.scene
+    _refuse_unfit(scene)
+    mi = mitsuba()
+    frame = _frame(stage)
+    box = _box(scene, conditions, frame, optics.aperture_mm)
+    parts = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": MOST_BOUNCES, "hide_emitters": True},
+        "sensor": _sensor(mi, scene, conditions, frame, box, optics.aperture_mm),
+        **_lights(mi, scene, conditions, optics.light_radius_deg),
+        **{f"object{i}": part for i, part in enumerate(_object(mi, stage))},
+    }
+    if piece is not None:
+        parts["piece"] = _piece(mi, scene, piece, conditions)
+    traced, total = mi.load_dict(parts), 0.0
+    for i in range(PASSES):  # seeds of one view are its own
+        seed = (int(conditions.noise_seed[0]) * PASSES + i) % 2**32
+        total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
+    whole = linear_from_srgb(_background(scene, conditions, frame) / 255.0)
+    left, top, width, height = box
+    inside = whole[top : top + height, left : left + width]
+    inside *= 1 - total[..., 3:].clip(0, 1)
+    inside += total[..., :3] / PAPER_REFLECTANCE
+    return torch.tensor(whole, dtype=torch.float32).permute(2, 0, 1)[None]
+
+
+def mitsuba() -> ModuleType:
+    """Mitsuba with a variant set: compiled by LLVM where there is one that can, else the slow one that needs nothing.
+
+    Refused where it is not installed.
+    """
+    try:
+        import drjit
+        import mitsuba as mi
+    except ImportError as error:
+        raise Refused("Mitsuba 3 for path tracing", "none installed", "pip install 'patchproof[pathtrace]'") from error
+    if mi.variant() is None:
+        try:
+            mi.set_variant("llvm_ad_rgb")
+            if drjit.detail.llvm_version()[0] < _FIRST_LLVM:
+                mi.set_variant("scalar_rgb")
+        except ImportError:  # what Dr.Jit raises where it finds no library
+            mi.set_variant("scalar_rgb")
+    if mi.variant().startswith("llvm"):
+        drjit.set_thread_count(torch.get_num_threads())
+    return mi
+
+
+def _refuse_unfit(scene) -> None:
+    if not isinstance(scene, MeshScene):
+        raise Refused("a scene with a mesh to trace paths in", "one of pictures", "leave --path-traced out")
+    matrix = scene.matrix_px(scene.settings.camera.photo_px)
+    if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
+        raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
+
+
+def _frame(stage: Stage) -> Frame:
+    size_px = stage.scene.settings.camera.photo_px
+    if stage.camera is not None:
+        return pinhole_frame(stage.camera, size_px)
+    return Frame(size_px, stage.scene.matrix_px(size_px), 0, 0, 0, 0)
+
+
+def _background(scene: MeshScene, conditions: Conditions, frame: Frame) -> np.ndarray:
+    photo_px = scene.settings.camera.photo_px
+    picture = scene.backgrounds.picture(conditions.background[0], photo_px, photo_px)
+    return np.pad(picture, ((frame.top, frame.bottom), (frame.left, frame.right), (0, 0)), mode="edge")
+
+
+def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
+    """The part of the frame that shows anything but background: left, top, width and height, 1 at least."""
+    points = [scene.mesh.vertices] if scene.placement is None else [scene.mesh.vertices, scene.placement.vertices_mm]
+    seen = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
+    if not np.isfinite(seen).all():  # some of it lies behind the camera
+        return 0, 0, *frame.size_px
+    # out of focus and printed larger it reaches farther
+    margin = 8 + 0.05 * np.ptp(seen, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.distance_mm[0]
+    size = np.array(frame.size_px)
+    low = np.clip(np.floor(seen.min(0) - margin), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(seen.max(0) + margin), low + 1, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Frame, box, aperture_mm: float) -> dict:
+    """A thin lens that is focused on the piece's middle; a pinhole where the picture's middle is not the lens's.
+
+    Mitsuba's cameras have x left and y up.
+    """
+    pose = scene.camera_from_world(conditions)[0]
+    (width, height), matrix = frame.size_px, frame.matrix_px
+    middle = pose[:3, :3] @ scene.middle_mm + pose[:3, 3]
+    off = matrix[:2, 2] / frame.size_px - 0.5
+    lens = {"type": "thinlens", "aperture_radius": aperture_mm / 2, "focus_distance": float(middle[2])}
+    if aperture_mm == 0 or off.any():
+        lens = {"type": "perspective"} | {
+            f"principal_point_offset_{axis}": float(off[i]) for i, axis in enumerate("xy")
+        }
+    return lens | {
+        "to_world": mi.ScalarTransform4f(np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        "fov": float(np.degrees(2 * np.arctan(width / 2 / matrix[0, 0]))),
+        "fov_axis": "x",
+        "near_clip": 1.0,
+        "far_clip": 1e6,
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            **dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), box, strict=True)),
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},  # what a pixel collects
+        },
+        "sampler": {"type": "multijitter", "sample_count": PASS_SAMPLES},
+    }
+
+
+def _lights(mi: ModuleType, scene: MeshScene, conditions: Conditions, radius_deg: float) -> dict:
+    """The surroundings, a disk far away for the directional light, and a small sphere for the lamp.
+
+    An outgoing radiance of 1 is white: paper of reflectance ρ gives ρ·E/π, so that E is π where our light is 1.
+    """
+    found = {"sky": _sky(mi, conditions)}
+    frame, middle = scene.frame, scene.middle_mm
+    if conditions.directional[0] > 0:
+        toward = geometry.orbit(conditions.light_azimuth_deg, conditions.light_elevation_deg, frame.normal, frame.up)[0]
+        far, angle = _FAR * scene.settings.object.length_mm, np.radians(radius_deg)
+        place = mi.ScalarTransform4f().look_at(
+            (middle + far * toward).tolist(), middle.tolist(), _across(toward).tolist()
+        )
+        found["sun"] = {
+            "type": "disk",
+            "to_world": place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle))),
+            "emitter": _emitter(conditions.directional[0] / np.sin(angle) ** 2),
+        }
+    if conditions.point[0] > 0:
+        away = geometry.orbit(conditions.point_azimuth_deg, conditions.point_elevation_deg, frame.normal, frame.up)[0]
+        distance = float(conditions.point_distance_mm[0])
+        radius = min(LAMP_RADIUS_MM, distance / 4)
+        found["lamp"] = {
+            "type": "sphere",
+            "center": (middle + distance * away).tolist(),
+            "radius": radius,
+            "emitter": _emitter(conditions.point[0] * (distance / radius) ** 2),
+        }
+    return found
+
+
+def _emitter(radiance: float) -> dict:
+    return {"type": "area", "radiance": {"type": "rgb", "value": [float(radiance)] * 3}}
+
+
+def _across(direction: np.ndarray) -> np.ndarray:
+    """Any unit vector that is not along a direction."""
+    return np.eye(3)[np.abs(direction).argmin()]
+
+
+def _sky(mi: ModuleType, conditions: Conditions) -> dict:
+    """Light from all around; almost no paths are sent to it: those that surfaces scatter find it anyway."""
+    picture = np.repeat(sky_radiance(sky_directions(), conditions)[..., None], 3, -1).astype(np.float32)
+    return {"type": "envmap", "bitmap": mi.Bitmap(picture), "sampling_weight": _SKY_WEIGHT}
+
+
+def sky_directions() -> np.ndarray:
+    """H×W×3 unit directions of the pixels of Mitsuba's pictures of the surroundings: latitude by longitude, y up."""
+    height, width = _SKY_PX
+    theta, phi = (np.arange(height) + 0.5) / height * np.pi, (np.arange(width) + 0.5) / width * 2 * np.pi
+    level, up = np.sin(theta)[:, None], np.cos(theta)[:, None] * np.ones(width)
+    return np.stack([level * np.sin(phi), up, -level * np.cos(phi)], -1)
+
+
+def sky_radiance(toward: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """Radiance of the surroundings in directions ...×3, whose irradiance is `channel.light`'s ambient light.
+
+    A surface sees first orders with 2/3 and second with 1/4 of the weight of an even light (A1/π and A2/π in
+    Ramamoorthi and Hanrahan, 2001). Light that would be negative is 0 here by direction, there by surface.
+    """
+    ambient, even = conditions.ambient[0], np.ones(toward.shape[:-1])
+    if not conditions.sh2.any():
+        return ambient * even
+    basis = irradiance_basis(torch.tensor(toward)).numpy() / np.repeat([2 / 3, 1 / 4], [3, 5])
+    return (ambient * (even + conditions.sh2[0] * basis @ conditions.sh2_coefficients[0])).clip(0)
+
+
+def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
+    """The printed piece as large as it came out of the printer, plain paper on its back."""
+    placement = scene.placement
+    scale = geometry.scaled_about(scene.middle_mm, conditions.printed_scale[0])
+    vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
+    front = _glossy(_diffuse(_texture(mi, _printed(picture, placement.size_mm, conditions), "clamp")), conditions)
+    back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
+    uv = placement.piece_mm / np.array(placement.size_mm)
+    bsdf = {"type": "twosided", "front": front, "back": back}
+    return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
+
+
+def _printed(picture: PiecePicture, size_mm, conditions: Conditions) -> np.ndarray:
+    """H×W×3 light of this print under white light, beside the sheet that light is measured by."""
+    srgb = picture.srgb
+    if conditions.misregistration_mm.any():
+        height, width = srgb.shape[:2]
+        shift = conditions.misregistration_mm[0] * [width / size_mm[0], height / size_mm[1]]
+        srgb = misregistered(srgb, torch.tensor(shift).to(srgb))
+    change = torch.tensor([conditions.dot_gain[0], conditions.density[0], conditions.black[0]]).to(srgb)
+    return vary(linear_from_srgb(srgb), change).numpy() * conditions.paper[0]
+
+
+def _glossy(diffuse: dict, conditions: Conditions) -> dict:
+    """A surface that mirrors the drawn share of the light, roughly; Beckmann's slopes match Blinn's exponent."""
+    if not conditions.gloss[0]:
+        return diffuse
+    rough = float(np.sqrt(2 / (conditions.shininess[0] + 2)))
+    mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": rough}
+    return {"type": "blendbsdf", "weight": float(conditions.gloss[0] * PAPER_REFLECTANCE), "a": diffuse, "b": mirror}
+
+
+def _object(mi: ModuleType, stage: Stage) -> list:
+    """One Mitsuba mesh per material, its corners apart: they have normals and texture coordinates of their own."""
+    mesh, found = stage.scene.mesh, []
+    for number, material in enumerate(mesh.materials):
+        faces = mesh.face_material == number
+        count = int(faces.sum())
+        if not count:
+            continue
+        colors = (mesh.corner_color_linear[faces] * np.array(material.base_color_linear)).reshape(-1, 3)
+        color = {"type": "mesh_attribute", "name": "vertex_color"}
+        if material.texture_srgb is not None:
+            if np.ptp(colors, axis=0).max() > 1 / 255:
+                raise Refused(
+                    "objects whose textures are not colored by corners, too", material.name, "bake the colors in"
+                )
+            color = _texture(mi, linear_from_srgb(material.texture_srgb / 255.0) * colors[0], "repeat")
+        corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
+        normals, uv = mesh.corner_normal[faces].reshape(-1, 3), mesh.corner_uv[faces].reshape(-1, 2)
+        bsdf = {"type": "twosided", "both": _diffuse(color)}
+        paint = (colors * PAPER_REFLECTANCE).clip(0, 1)
+        found.append(
+            _mesh(mi, f"object{number}", corners, np.arange(3 * count).reshape(-1, 3), normals, uv, bsdf, paint)
+        )
+    return found
+
+
+def _diffuse(reflectance: dict) -> dict:
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _texture(mi: ModuleType, linear: np.ndarray, wrap: str) -> dict:
+    """A picture of light beside white as reflectances."""
+    bitmap = mi.Bitmap((linear * PAPER_REFLECTANCE).clip(0, 1).astype(np.float32))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": wrap}
+
+
+def _mesh(mi: ModuleType, name: str, vertices, faces, normals, uv, bsdf: dict, colors: np.ndarray | None = None):
+    """Triangles as a Mitsuba shape; `uv` runs down from the top-left, as everywhere here."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh(
+        name, len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties
+    )
+    if colors is not None:
+        mesh.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
+    parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    parameters["faces"] = np.ravel(faces).astype(np.uint32)
+    parameters.update()
+    return mesh

@@ -1,0 +1,162 @@
+"""The one way to refuse, strict settings, and where shipped data lies.
+
+In: a TOML file or a dictionary and a model of it; `${VAR}` in paths is expanded. Out: frozen settings, every value
+checked: an unknown key names the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three
+things in one sentence: what was expected, what was there, and what to do. The command line prints that sentence and
+exits with 1.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+
+class Refused(ValueError):
+    """What the tool will not do, in one sentence that says expected, got, do."""
+
+    def __init__(self, expected: str, got: str, do: str):
+        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
+        self._parts = expected, got, do
+
+    def __reduce__(self):
+        # exceptions are rebuilt from their message when they come back from another process; this one has three parts
+        return Refused, self._parts
+
+
+def shipped(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:
+    """A file of the data that travels with the program: inside the installed package, else in the checkout."""
+    package = Path(__file__).resolve().parent
+    # an editable install keeps these folders at the top of the checkout, two levels up
+    roots = [root for root in (package / folder, package.parents[1] / folder) if root.is_dir()]
+    if not roots:
+        raise Refused(f"the folder {folder} beside the program", "none", "install patchproof again")
+    return roots[0].joinpath(*parts)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """A range as it is, when its low end is not above its high one."""
+    if pair[0] > pair[1]:
+        raise ValueError(f"must be [low, high] with low <= high, not [{pair[0]:g}, {pair[1]:g}]")
+    return pair
+
+
+Finite = Annotated[float, AfterValidator(_finite)]
+Positive = Annotated[Finite, Field(gt=0)]
+NotNegative = Annotated[Finite, Field(ge=0)]
+Share = Annotated[Finite, Field(ge=0, le=1)]
+Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
+ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
+NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class Strict(BaseModel):
+    """Frozen settings that know all their keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:
+        import tomli as tomllib
+    path = Path(path)
+    if not path.is_file():
+        raise Refused("a TOML file", f"no file at {path}", "check the path")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
+
+
+def validated(model: type[BaseModel], data: Any, where: str):
+    """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        # a misspelt key is also a missing one: the spelling says more
+        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        raise _explain(model, first, where) from error
+
+
+def expand(text: str, base: Path) -> str:
+    """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
+
+    def variable(match: re.Match) -> str:
+        if match[1] not in os.environ:
+            raise Refused(f"the environment variable {match[1]}", "none", f"set {match[1]} or write the path out")
+        return os.environ[match[1]]
+
+    text = re.sub(r"\$\{(\w+)\}", variable, text)
+    prefix, colon, rest = text.partition(":")
+    if colon and prefix == "file":
+        return f"file:{_absolute(rest, base)}"
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "module"})) or text == "builtin":
+        return text
+    return str(_absolute(text, base))
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`(did you mean "x"?)` where a known word is near, else the known words."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, 1, 0.5)
+    return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
+
+
+def _absolute(path: str, base: Path) -> Path:
+    return path_ if (path_ := Path(path)).is_absolute() else base / path_
+
+
+def within(pair: tuple[float, float], low: float, high: float) -> tuple[float, float]:
+    """A range as it is, when it lies in [low, high]."""
+    if pair[0] < low or pair[1] > high:
+        raise ValueError(f"must lie within [{low:g}, {high:g}]")
+    return pair
+
+
+def _explain(model: type[BaseModel], error: dict, where: str) -> Refused:
+    key = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
+        return Refused(f"only known keys in {where}", f'"{key}"', hint)
+    if error["type"] == "missing":
+        return Refused(f'the key "{key}" in {where}', "none", f"add {key}")
+    value = str(error.get("input"))
+    value = value if len(value) < 80 else value[:77] + "..."
+    reason = error["msg"].removeprefix("Value error, ").rstrip(".")
+    reason = reason[0].lower() + reason[1:]
+    if not key:  # tables that do not go together
+        return Refused(f"settings in {where} that go together", "others", reason)
+    return Refused(
+        f'a usable "{key}" in {where}', value, f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
+    )
+
+
+def _keys_at(model: Any, location: tuple) -> Iterable[str]:
+    """The known keys of the table at a location, through lists, dictionaries and optional tables."""
+    for part in location:
+        if part in model.model_fields:  # else an index or a dictionary's own key
+            inner, todo = None, [model.model_fields[part].annotation]
+            while todo and inner is None:
+                one = todo.pop()
+                inner = one if isinstance(one, type) and issubclass(one, BaseModel) else None
+                todo.extend(get_args(one))
+            model = inner or model
+    return model.model_fields

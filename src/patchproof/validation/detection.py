@@ -1,0 +1,315 @@
+"""Where sheets are found, how far off they are measured, and whether the stated uncertainty holds.
+
+In: a scene with wide ranges of view, light and camera. Out: by photograph its status and code, and against the
+renderer's truth the error of the design's corners; over all of them shares with Wilson intervals by tilt, distance,
+blur, noise, light, hiding and JPEG, and maps. The sheet carries noise in place of a design, since only markers are
+read here. In a share of the photographs a card of drawn size, place and color hides a part of the piece.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from patchproof.geometry import apply_homography, local_scale, rect_corners
+from patchproof.report.tables import Drawing, Estimate, Table, rate
+from patchproof.strict import Refused, Share, Strict
+from patchproof.study.study import Cell, Result, Study
+
+MEASURABLE_TILT_DEG, MEASURABLE_BLUR_PX = 70.0, 1.5  # beyond these the bounds on errors are not claimed
+SHARP_MODULE_PX = 4.0  # pixels per marker module from which corners should be right to a tenth of a pixel
+_BINS = {
+    "tilt_deg": (0, 20, 40, 50, 60, 70, 90),
+    "module_px": (0, 1.5, 2, 3, 4, 6, 30),
+    "blur_px": (0, 0.5, 1, 1.5, 2, 9),
+    "noise": (0, 0.01, 0.02, 0.03, 1),
+    "light": (0, 0.06, 0.12, 0.25, 0.5, 9),
+    "hidden": (0, 1e-9, 0.1, 0.25, 0.5, 1.01),
+    "jpeg": (40, 55, 70, 85, 101),
+}
+_LABELS = {
+    "tilt_deg": "tilt in degrees",
+    "module_px": "pixels per marker module",
+    "blur_px": "blur, Gaussian sigma in pixels",
+    "noise": "noise at white",
+    "light": "light of white paper",
+    "hidden": "share of the piece hidden",
+    "jpeg": "JPEG quality",
+}
+_COLORS = {"measured": "#2a9d6f", "judged": "#e0a030", "rejected": "#d1495b"}
+
+
+class DetectionSettings(Strict):
+    """A scene of one object with a patch, how many photographs of it, and how many of them are partly hidden."""
+
+    scene: str
+    photos: Annotated[int, Field(ge=1, le=100_000)] = 200
+    hidden: Share = 0.4
+    seed: int = 0
+
+
+def cells(settings: DetectionSettings, base: Path) -> list[Cell]:
+    """One for each photograph."""
+    return [Cell(f"photo_{i:05d}", {"number": i}) for i in range(settings.photos)]
+
+
+def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """What was photographed and what was found: see `_Hall` for the sheet, and `_compared` for the errors."""
+    hall, number = _hall(str(base / settings.scene), settings.seed), cell.values["number"]
+    conditions = hall.scene.draw("reprint", 1, settings.seed, number)
+    rng = np.random.default_rng([settings.seed, number])
+    truth = hall.truth(conditions)
+    quad = rng.random() < settings.hidden and _card(rng, apply_homography(truth, rect_corners(hall.cut_mm)))
+    srgb, focal_px, share = hall.photograph(conditions, truth, None if quad is False else quad, rng)
+    px_per_mm, tilt_deg = local_scale(truth, hall.surface.center_mm)
+    taken = {
+        "tilt_deg": tilt_deg,
+        "module_px": px_per_mm * hall.module_mm,
+        "blur_px": float(conditions.blur_px[0]),
+        "noise": float(conditions.noise[0]),
+        "jpeg": int(conditions.jpeg[0]),
+        "hidden": share,
+    }
+    return taken | hall.found(srgb, focal_px, truth)
+
+
+@dataclass(frozen=True)
+class _Hall:
+    """A scene with its printed sheet, ready to be photographed."""
+
+    scene: Any
+    stage: Any
+    piece: Any
+    manifest: Any
+    surface: Any
+    module_mm: float
+
+    @property
+    def cut_mm(self) -> tuple[float, float, float, float]:
+        return self.manifest.cut_mm
+
+    def truth(self, conditions) -> np.ndarray:
+        """3×3 from page millimetres to pixels."""
+        x, y, *_ = self.cut_mm
+        to_piece = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+        return self.scene.piece_homographies(conditions, self.scene.settings.camera.photo_px)[0] @ to_piece
+
+    def photograph(self, conditions, truth, quad, rng):
+        """(uint8 pixels as read back from the JPEG, focal length, share of the piece behind the card)."""
+        import torch
+        from PIL import Image
+
+        from patchproof.render.photograph import photograph
+
+        photo_px = self.scene.settings.camera.photo_px
+        with torch.no_grad():
+            picture = photograph(self.stage, self.piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0).numpy()
+        share = 0.0
+        if quad is not None:
+            cover = _filled(quad, picture.shape[:2])
+            piece = _filled(apply_homography(truth, rect_corners(self.cut_mm)), picture.shape[:2])
+            share = float((cover * piece).sum() / max(piece.sum(), 1))
+            picture = picture + cover[..., None] * (rng.uniform(0.05, 0.8, 3).astype(np.float32) - picture)
+        buffer = io.BytesIO()
+        pixels = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+        Image.fromarray(pixels).save(buffer, "JPEG", quality=int(conditions.jpeg[0]))
+        return np.asarray(Image.open(buffer).convert("RGB")), self.scene.matrix_px(photo_px)[0, 0], share
+
+    def found(self, srgb, focal_px, truth) -> dict[str, Any]:
+        """The entry's figures and, where there is a homography, the design's corner errors."""
+        from patchproof.photo.read import Photo
+        from patchproof.verify.camera import view_of
+        from patchproof.verify.measure import measure
+        from patchproof.verify.ranges import promised_ranges
+
+        view = view_of(Photo(srgb, focal_px, Path("photo.jpg")), None)
+        entry = measure(view, "photo.jpg", self.surface, None, promised_ranges(())).entry
+        said = {"status": entry.status, "code": entry.code, "markers": entry.markers_found, "light": entry.contrast}
+        if entry.homography_px_from_mm is None:
+            return said | {"error_mm": None, "error_px": None, "uncertainty_mm": entry.corner_uncertainty_mm}
+        homography, corners = np.array(entry.homography_px_from_mm), rect_corners(self.surface.rect_mm)
+        off_px = apply_homography(homography, corners) - apply_homography(truth, corners)
+        off_mm = apply_homography(np.linalg.inv(homography), apply_homography(truth, corners)) - corners
+        return said | {
+            "error_mm": float(np.linalg.norm(off_mm, axis=1).max()),
+            "error_px": np.linalg.norm(off_px, axis=1).tolist(),
+            "uncertainty_mm": entry.corner_uncertainty_mm,
+        }
+
+
+@lru_cache(maxsize=1)
+def _hall(scene_path: str, seed: int) -> _Hall:
+    from patchproof.render.stage import set_stage
+    from patchproof.reprint.reprint import load_printer, printed_piece
+    from patchproof.scene.mesh_scene import MeshScene
+    from patchproof.scene.scene import load_scene
+    from patchproof.sheet.piece import control_design
+    from patchproof.sheet.template import load_template
+    from patchproof.sheet.write import write_sheet
+    from patchproof.verify.surface import surface_of
+
+    scene = load_scene(scene_path, seed)
+    if not isinstance(scene, MeshScene) or scene.piece is None or not scene.placement.is_flat:
+        raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
+    blank = np.zeros((240, round(240 * scene.piece.design_rect_mm[2] / scene.piece.design_rect_mm[3]), 3), np.uint8)
+    with TemporaryDirectory() as folder:
+        pdf = Path(folder) / "sheet.pdf"
+        manifest = write_sheet(
+            pdf,
+            template=load_template(scene.settings.sheet.template),
+            piece=scene.piece,
+            sheet_id=scene.sheet_id,
+            kind="design",
+            design_srgb8=control_design("noise", blank, scene.sheet_id),
+            promise=None,
+            settings={},
+        )
+        printer = load_printer(scene.settings.printer.profile, scene.base)
+        piece = printed_piece(pdf, manifest, scene, printer)
+    return _Hall(scene, set_stage(scene), piece, manifest, surface_of(manifest), scene.piece.module_mm)
+
+
+def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
+    """Corners of a card, a fifth to two thirds of the piece long, with its middle somewhere on the piece."""
+    u, v = rng.random(2)
+    top, bottom = piece_px[0] + u * (piece_px[1] - piece_px[0]), piece_px[3] + u * (piece_px[2] - piece_px[3])
+    length = rng.uniform(0.2, 0.67) * np.linalg.norm(piece_px[2] - piece_px[0]) / np.sqrt(2)
+    half, angle = length / 2 * np.array([1, rng.uniform(0.3, 1)]), rng.uniform(0, np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return top + v * (bottom - top) + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ turn.T
+
+
+def _filled(quad: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
+    import cv2
+
+    mask = np.zeros(shape, np.uint8)
+    points = np.clip((quad - 0.5) * 16, -1e6, 1e6).round().astype(np.int32)
+    cv2.fillConvexPoly(mask, points, 255, cv2.LINE_AA, 4)
+    return mask.astype(np.float32) / 255
+
+
+def tables(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Table]:
+    """Bounds over all photographs, shares by each quantity, and codes."""
+    found = [one.found for one in results]
+    return (_bounds(found), _by_quantity(found), _codes(found))
+
+
+def within_bounds(found: dict) -> bool:
+    """Whether the bounds on errors are claimed for a photograph: measured, and taken at usual tilt and blur."""
+    usual = found["tilt_deg"] <= MEASURABLE_TILT_DEG and found["blur_px"] <= MEASURABLE_BLUR_PX
+    return usual and found["status"] == "measured" and found["error_mm"] is not None
+
+
+def _bounds(found: Sequence[dict]) -> Table:
+    usual = [f for f in found if f["tilt_deg"] <= MEASURABLE_TILT_DEG and f["blur_px"] <= MEASURABLE_BLUR_PX]
+    claimed = [f for f in found if within_bounds(f)]
+    sharp = [f for f in claimed if f["module_px"] >= SHARP_MODULE_PX]
+    measured = [f for f in found if f["status"] == "measured" and f["error_mm"] is not None]
+    rows = (
+        ("sheet identified", rate([f["status"] != "rejected" for f in usual])),
+        ("measured", rate([f["status"] == "measured" for f in usual])),
+        (f"corner error at {SHARP_MODULE_PX:g} px per module or more, median, px", _median(sharp, "error_px")),
+        ("corner error, median, px", _median(claimed, "error_px")),
+        ("largest corner error, median, mm", _median(claimed, "error_mm")),
+        ("largest corner error of all, mm", max((f["error_mm"] for f in claimed), default=None)),
+        ("the same at any tilt and blur, mm", max((f["error_mm"] for f in measured), default=None)),
+        ("stated 95 % uncertainty covers the largest corner error", rate([_covered(f) for f in claimed])),
+        ("the same at any tilt and blur", rate([_covered(f) for f in measured])),
+    )
+    about = f"{len(usual)} of {len(found)} photographs have tilt ≤ 70° and blur ≤ 1.5 px; corners are the design's four"
+    return Table("bounds", "Errors against the truth", ("figure", "value"), rows, about)
+
+
+def _covered(found: dict) -> bool:
+    return found["error_mm"] <= found["uncertainty_mm"]
+
+
+def _median(found: Sequence[dict], name: str) -> Estimate | None:
+    """The median with its 95 % interval over resampled photographs."""
+    values = [np.atleast_1d(f[name]) for f in found]
+    if not values:
+        return None
+    rng, table = np.random.default_rng(0), np.array(values)
+    picks = rng.integers(0, len(table), (1000, len(table)))
+    medians = [float(np.median(table[pick])) for pick in picks]
+    low, high = np.quantile(medians, (0.025, 0.975))
+    return Estimate(float(np.median(table)), float(low), float(high), len(values))
+
+
+def _by_quantity(found: Sequence[dict]) -> Table:
+    rows = []
+    for name, edges in _BINS.items():
+        for low, high in pairwise(edges):
+            here = [f for f in found if f[name] is not None and low <= f[name] < high]
+            if here:
+                known = [f for f in here if f["status"] == "measured" and f["error_mm"] is not None]
+                identified, measured = (
+                    [f["status"] in kinds for f in here] for kinds in (("judged", "measured"), ("measured",))
+                )
+                span = f"{low:g} to {high:g}"
+                rows.append((_LABELS[name], span, rate(identified), rate(measured), rate([_covered(f) for f in known])))
+    head = ("quantity", "range", "identified", "measured", "covered")
+    about = "each with all other quantities over their whole ranges; light is known where markers were found"
+    return Table("by_quantity", "By what a photograph was taken under", head, tuple(rows), about)
+
+
+def _codes(found: Sequence[dict]) -> Table:
+    counts: dict[tuple[str, str], int] = {}
+    for f in found:
+        key = (f["status"], f["code"] or "–")
+        counts[key] = counts.get(key, 0) + 1
+    rows = tuple((status, code, count) for (status, code), count in sorted(counts.items()))
+    return Table("codes", "Status and code", ("status", "code", "photographs"), rows)
+
+
+def figures(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Drawing]:
+    """Maps of what was measured, judged and rejected, and errors against the stated uncertainty."""
+    found = [one.found for one in results]
+    pairs = (("module_px", "tilt_deg"), ("module_px", "blur_px"), ("hidden", "tilt_deg"), ("noise", "jpeg"))
+    maps = [
+        Drawing(f"{x}_{y}", f"By {_LABELS[x]} and {_LABELS[y]}", lambda figure, x=x, y=y: _map(figure, found, x, y))
+        for x, y in pairs
+    ]
+    return (*maps, Drawing("uncertainty", "Stated and true", lambda figure: _stated(figure, found)))
+
+
+def _map(figure, found: Sequence[dict], x: str, y: str) -> None:
+    axes = figure.add_subplot()
+    for status, color in _COLORS.items():
+        here = [f for f in found if f["status"] == status]
+        axes.scatter([f[x] for f in here], [f[y] for f in here], s=18, color=color, label=f"{status} ({len(here)})")
+    axes.set_xlabel(_LABELS[x])
+    axes.set_ylabel(_LABELS[y])
+    axes.legend(frameon=False)
+
+
+def _stated(figure, found: Sequence[dict]) -> None:
+    axes, known = figure.add_subplot(), [f for f in found if f["status"] == "measured" and f["error_mm"] is not None]
+    stated = [f["uncertainty_mm"] for f in known]
+    axes.loglog(stated, [f["error_mm"] for f in known], ".", color="#2457c5")
+    if known:
+        ends = min(stated), max(stated)
+        axes.loglog(ends, ends, color="gray", linewidth=1)
+    axes.set_xlabel("stated 95 % uncertainty of the largest corner error, mm")
+    axes.set_ylabel("largest corner error, mm")
+
+
+STUDY = Study(
+    "detection",
+    "Finding and measuring the sheet in rendered photographs, against the renderer's truth.",
+    DetectionSettings,
+    cells,
+    run,
+    tables,
+    figures,
+)

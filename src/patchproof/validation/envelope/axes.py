@@ -1,0 +1,134 @@
+"""What an operating envelope varies: tilt, distance, light, camera, paper and print, one number each.
+
+In: a scene. Out: `AXES`: for every axis its unit, the sweep from an easy to a hard end that suits the scene, and what a
+value does to drawn conditions (`conditions_at`) or to where the piece lies (`placed_at`). What an axis does not name
+stays as it was drawn, so that the points of a sweep differ in nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from patchproof.reprint.reprint import scaled_print
+from patchproof.scene.bend import curled
+from patchproof.scene.conditions import Conditions, with_value
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import Scene
+
+Point = Mapping[str, float]
+"""Values by axis; what is not named is as drawn, or as the run has it."""
+
+Ends = Callable[[Scene], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that is made harder: `ends` are (easy, hard); `ratio` steps multiply instead of adding."""
+
+    title: str
+    unit: str
+    ends: Ends
+    ratio: bool = False
+    needs_mesh: bool = True
+
+    def values(self, easy: float, hard: float, points: int) -> np.ndarray:
+        """Evenly spaced values from easy to hard."""
+        return np.geomspace(easy, hard, points) if self.ratio else np.linspace(easy, hard, points)
+
+    def value(self, easy: float, hard: float, position: float) -> float:
+        """The value at a position from 0 (easy) to 1 (hard)."""
+        return float(easy * (hard / easy) ** position if self.ratio else easy + (hard - easy) * position)
+
+
+def _distances(scene: MeshScene) -> tuple[float, float]:
+    """From the scene's closest to where a marker's module is two thirds of a pixel."""
+    photo_px = scene.settings.camera.photo_px
+    nearest = scene.settings.view.distance_mm[0]
+    far = 1.5 * float(scene.matrix_px(photo_px)[0, 0]) * scene.piece.module_mm
+    return nearest, max(far, 2 * nearest)
+
+
+def _pixels(share: float) -> Callable[[Scene], float]:
+    return lambda scene: share * min(scene.settings.camera.photo_px)
+
+
+AXES: dict[str, Axis] = {
+    "tilt": Axis("tilt", "° off the patch's axis", lambda scene: (0.0, 88.0)),
+    "distance": Axis("distance", "mm", _distances, ratio=True),
+    "blur": Axis(
+        "blur",
+        "px (sigma)",
+        lambda scene: (_pixels(1 / 3000)(scene), _pixels(1 / 30)(scene)),
+        ratio=True,
+        needs_mesh=False,
+    ),
+    "darkness": Axis("darkness", "stops under", lambda scene: (0.0, 9.0), needs_mesh=False),
+    "noise": Axis("noise", "of white", lambda scene: (0.004, 1.0), ratio=True, needs_mesh=False),
+    "jpeg": Axis("JPEG", "quality", lambda scene: (95.0, 1.0), ratio=True, needs_mesh=False),
+    "hidden": Axis("hidden corners", "quarters", lambda scene: (0.0, 4.0), needs_mesh=False),
+    "curl": Axis("curl", "mm radius", lambda scene: tuple(k * scene.placement.size_mm[0] for k in (8, 0.35)), True),
+    "gap": Axis("gap behind", "mm", lambda scene: (0.0, round(scene.settings.object.length_mm / 3))),
+    "mismatch": Axis("print mismatch", "× other printer", lambda scene: (0.0, 6.0), needs_mesh=False),
+    "size": Axis("patch size", "× its own", lambda scene: (1.0, 0.1), ratio=True),
+}
+# Axes that move the camera or the paper: views of other values have to be rasterized anew.
+GEOMETRY = ("tilt", "distance", "curl", "gap", "size")
+MAPS = (
+    ("tilt", "distance"),
+    ("blur", "darkness"),
+    ("hidden", "size"),
+    ("jpeg", "noise"),
+    ("gap", "curl"),
+    ("mismatch", "size"),
+)
+
+
+def possible(scene: Scene, name: str) -> bool:
+    """Whether this scene can be photographed at other values of the axis."""
+    if not isinstance(scene, MeshScene):
+        return not AXES[name].needs_mesh
+    return name != "curl" or scene.placement.is_flat
+
+
+def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditions:
+    """`conditions` with what the point says about camera and light."""
+    for axis, value in point.items():
+        if axis == "tilt":
+            conditions = _tilted(conditions, value)
+        elif axis == "darkness":
+            conditions = with_value(conditions, "exposure_ev", -value)
+        elif axis in _FIELDS:
+            conditions = with_value(conditions, _FIELDS[axis], value)
+    return conditions
+
+
+_FIELDS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg": "jpeg"}
+
+
+def placed_at(scene: Scene, point: Point) -> Scene:
+    """The scene with its piece printed smaller, standing off, or curled."""
+    if "size" in point:
+        scene = scaled_print(scene, (point["size"],) * 2)
+    if not {"curl", "gap"} & point.keys():
+        return scene
+    placement = scene.placement if "curl" not in point else curled(scene.placement, point["curl"])
+    if "gap" in point:
+        off, frame = point["gap"] * placement.normal, placement.world_from_piece.copy()
+        frame[:3, 3] += off
+        placement = replace(placement, vertices_mm=placement.vertices_mm + off, world_from_piece=frame)
+    return replace(scene, placement=placement)
+
+
+def _tilted(conditions: Conditions, tilt_deg: float) -> Conditions:
+    """The cameras moved to this angle from straight before the side, each towards where it stood."""
+    azimuth, elevation = np.radians(conditions.azimuth_deg), np.radians(conditions.elevation_deg)
+    right, up = np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    toward = np.arctan2(up, right)
+    tilt = np.radians(tilt_deg)
+    right, up = np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward)
+    elevation = np.degrees(np.arcsin(up.clip(-1, 1)))
+    azimuth = np.degrees(np.arctan2(right, np.cos(tilt)))
+    return with_value(with_value(conditions, "azimuth_deg", azimuth), "elevation_deg", elevation)

@@ -1,0 +1,163 @@
+"""The operating envelope: where recognition, detection and measurement of one run's patch stop working, and what the
+tool says beyond.
+
+In: a run, sweeps of one axis and maps of two (`envelope_axes`; left out, all that the scene allows). Out: tables, a
+page to print beside the patch, and the curves and maps behind it. All points of a study share their draws of everything
+that is not varied, so that differences between them are not luck. Draws cover the ranges evenly (scrambled Sobol points
+of a seed of their own); intervals take them for independent ones, which is cautious.
+
+Left out on purpose: shadows of a card that stands off, which the renderer does not have, and a camera that answers
+darkness with a longer exposure: darkness is light that is missing from the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from patchproof.optimize.run import load_run
+from patchproof.strict import Finite, Refused, Strict, nearest
+from patchproof.study.study import Cell, Study
+from patchproof.validation.envelope.axes import AXES, MAPS, possible
+from patchproof.validation.envelope.fit import find_break
+from patchproof.validation.envelope.pages import figures, tables
+from patchproof.validation.envelope.world import measured, open_world, recognized
+
+_SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
+Count = Annotated[int, Field(ge=1, le=4096)]
+Points = Annotated[int, Field(ge=3, le=33)]
+
+
+class Sweep(Strict):
+    """One axis from an easy to a hard value; ends left out are those that suit the scene."""
+
+    axis: str
+    easy: Finite | None = None
+    hard: Finite | None = None
+    points: Points | None = None
+
+
+class Map(Strict):
+    """Two axes against each other, each from its easy to its hard end."""
+
+    x: str
+    y: str
+    points: Points = 4
+
+
+class EnvelopeSettings(Strict):
+    """Whose envelope, and how finely. `n` conditions per point are shown to the network (a quarter of them where JPEG
+    is varied, which takes pictures of full size), `photos` of them photographed in full and measured; `map_n` and
+    `map_photos` the same for points of maps. With these counts another seed moved 32 of the demo's 33 breaks by less
+    than a tenth of their sweeps, as 128 and 8 did at four thirds of the time; 80 and 6 moved two by more.
+    """
+
+    run: str
+    seed: Annotated[int, Field(ge=0)] = 0
+    n: Count = 96
+    photos: Count = 6
+    points: Points = 6
+    map_n: Count = 8
+    map_photos: Count = 3
+    sweeps: tuple[Sweep, ...] | None = None
+    maps: tuple[Map, ...] | None = None
+    other_printer: str | None = None  # what `mismatch` counts from the run's own printer towards
+
+
+def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
+    """A cell per sweep and per map; refused where the scene has no such axis."""
+    scene = load_run(base / settings.run).scene
+    if scene.piece is None:
+        raise Refused("a run of a patch", "one of the object's own texture", "name the run of a printed patch")
+    able = [name for name in AXES if possible(scene, name)]
+    sweeps = settings.sweeps
+    if sweeps is None:
+        sweeps = tuple(Sweep(axis=name) for name in able)
+    maps = settings.maps
+    if maps is None:
+        maps = tuple(Map(x=x, y=y) for x, y in MAPS if x in able and y in able)
+    for name in [sweep.axis for sweep in sweeps] + [name for one in maps for name in (one.x, one.y)]:
+        if name not in able:
+            raise Refused("an axis along which this scene can be varied", f'"{name}"', nearest(name, able))
+    if any(one.x == one.y for one in maps):
+        raise Refused("two different axes for a map", "one twice", "name another")
+    return [
+        *(Cell(f"sweep-{sweep.axis}", _sweep_values(sweep, scene, settings)) for sweep in sweeps),
+        *(Cell(f"map-{one.x}-{one.y}", _map_values(one, scene)) for one in maps),
+    ]
+
+
+def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, Any]:
+    axis = AXES[sweep.axis]
+    easy, hard = axis.ends(scene)
+    easy, hard = easy if sweep.easy is None else sweep.easy, hard if sweep.hard is None else sweep.hard
+    if easy == hard or (axis.ratio and (easy <= 0 or hard <= 0)):
+        raise Refused(f"two different ends of {axis.title}, above 0 where it multiplies", f"{easy:g}, {hard:g}", "mend")
+    points = 5 if sweep.axis == "hidden" and sweep.points is None else sweep.points or settings.points
+    return {"x": {"axis": sweep.axis, "easy": easy, "hard": hard, "points": points}}
+
+
+def _map_values(one: Map, scene) -> dict[str, Any]:
+    ends = {name: AXES[name].ends(scene) for name in (one.x, one.y)}
+    return {
+        key: {"axis": name, "easy": ends[name][0], "hard": ends[name][1], "points": one.points}
+        for key, name in (("x", one.x), ("y", one.y))
+    }
+
+
+def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Per point which conditions were recognized and what was said of each photograph; of sweeps the breaks, too."""
+    world = open_world(base / settings.run, settings.other_printer)
+    is_map = "y" in cell.values
+    n, photos = (settings.map_n, settings.map_photos) if is_map else (settings.n, settings.photos)
+    drawn = world.scene.draw("select", max(n, photos), _SEED + settings.seed)
+    x, along = _values(cell.values["x"])
+    points = [{x: value} for value in along]
+    if is_map:
+        y, across = _values(cell.values["y"])
+        points = [point | {y: value} for value in across for point in points]
+    shown = max(n // 4, photos) if "jpeg" in points[0] else n
+    seen = recognized(world, points, drawn[:shown])
+    said = measured(world, points, drawn[:photos])
+    works = ~seen if world.scene.settings.target.goal == "deceive" else seen
+    found = {
+        "goal": world.scene.settings.target.goal,
+        "label": str(world.scene.settings.target.label),
+        "model": world.problem.classifiers[0].name,
+        "sheet": world.scene.sheet_id,
+        "points": points,
+        "recognized": works.astype(int).tolist(),
+        "status": [[one.status for one in row] for row in said],
+        "code": [[one.code for one in row] for row in said],
+        "error_mm": [[one.error_mm for one in row] for row in said],
+    }
+    return found if is_map else found | {"breaks": _breaks(found, len(points), settings.seed)}
+
+
+def _values(axis: dict) -> tuple[str, list[float]]:
+    return axis["axis"], AXES[axis["axis"]].values(axis["easy"], axis["hard"], axis["points"]).tolist()
+
+
+def _breaks(found: dict, points: int, seed: int) -> dict[str, Any]:
+    status, at = np.array(found["status"]), np.linspace(0, 1, points)
+    stages = {
+        "recognized": np.array(found["recognized"], bool),
+        "found": status != "rejected",
+        "measured": status == "measured",
+    }
+    return {name: vars(find_break(worked.T, at, seed)) for name, worked in stages.items()}
+
+
+STUDY = Study(
+    "envelope",
+    "Where recognition, detection and measurement of this patch on this scene stop working, in simulation.",
+    EnvelopeSettings,
+    cells,
+    run,
+    tables,
+    figures,
+)
