@@ -14,7 +14,6 @@ from patchproof.bench import chart as charts
 from patchproof.bench import measure, render, run, speed, texture
 from patchproof.bench.chart import Chart, Check, Growth, Point, Series, Shares
 from patchproof.bench.world import set_world
-from patchproof.optimize import loop
 
 LOOKED_AT = (45, 60)  # px wide, degrees
 
@@ -138,15 +137,6 @@ def test_samples_at_edges_bring_the_bare_object_nearer_to_the_truth(world, monke
     points = {p.setting: p for p in made.series[0].points}
     assert points["1 × 1"].default and points["1 × 1"].cost == 1
     assert points["3 × 3"].error > points["1 × 1"].error
-
-
-def test_the_pool_is_refreshed_as_asked_and_its_default_is_the_reference(world, monkeypatch):
-    monkeypatch.setattr(render, "REFRESHES", (1, 4))
-    monkeypatch.setattr(loop, "SELECT_AFTER", 1)  # so that every step has a loss
-    made = render.refresh_chart(world.problem, 2, 2, 1, quiet)
-    first, *others = made.series[0].points
-    assert first.default and first.cost == 1 and first.error > 0
-    assert others[0].cost < 1 and not any(p.default for p in others)
 
 
 def test_a_sphere_that_is_larger_has_more_fragments_and_a_process_tells_its_peak():

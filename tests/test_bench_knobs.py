@@ -12,10 +12,10 @@ from patchproof.bench import evidence, measure, numbers, sheets, train
 from patchproof.bench.chart import Chart, Point, Series, with_default_checks, with_front
 from patchproof.bench.detect import PIECE_MM, corners_mm
 from patchproof.bench.world import demo_problem, with_settings
-from patchproof.optimize import loop
-from patchproof.optimize.patch import Patch
+from patchproof.evidence.verdict import judge
+from patchproof.optimizer import loop
+from patchproof.optimizer.patch import Patch
 from patchproof.settings import OptimizeSettings
-from patchproof.verify.verdict import judge
 
 
 def quiet(stage, done, total):

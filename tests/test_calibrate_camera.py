@@ -16,8 +16,8 @@ from patchproof.calibrate.boards import View, corner_places_mm, see_boards
 from patchproof.calibrate.camera import calibrate_camera, solve
 from patchproof.calibrate.lens_ladder import Rung, chosen
 from patchproof.channel.lens import distort_points, load_camera
-from patchproof.sheet.board import board_sheet, load_board
-from patchproof.sheet.raster import page_pixels
+from patchproof.sheets.board import board_sheet, load_board
+from patchproof.sheets.raster import page_pixels
 from patchproof.strict import Refused
 
 SIZE = (1600, 1200)

@@ -34,10 +34,10 @@ from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import Photo
-from patchproof.reprint.chart_photos import chart_manifest, photograph_page, printed_page
-from patchproof.reprint.inkjets import DRIVERS, draw_inkjet
-from patchproof.sheet.chart import chart_colors
-from patchproof.sheet.manifest import dump_manifest
+from patchproof.reprints.chart_photos import chart_manifest, photograph_page, printed_page
+from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
+from patchproof.sheets.chart import chart_colors
+from patchproof.sheets.manifest import dump_manifest
 from patchproof.strict import Refused
 
 UNSEEN = np.random.default_rng(8).random((500, 3))

@@ -11,6 +11,8 @@ import pytest
 import card_photo
 from patchproof.channel import lens
 from patchproof.color import linear_from_srgb
+from patchproof.evidence.camera import _turned, view_of
+from patchproof.evidence.surface import surface_of
 from patchproof.geometry import apply_homography, intrinsics, look_at, normalized, plane_homography
 from patchproof.photo.card import _sizes, card_scale
 from patchproof.photo.card_lines import CARD_MM, LEAST_PX_PER_MM, NoCard
@@ -20,11 +22,9 @@ from patchproof.photo.quality import blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
-from patchproof.sheet.blank import blank_sheet
-from patchproof.sheet.manifest import load_manifest
-from patchproof.sheet.raster import page_pixels
-from patchproof.verify.camera import _turned, view_of
-from patchproof.verify.surface import surface_of
+from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.raster import page_pixels
 
 SIZE_PX = (900, 700)
 

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from patchproof.evidence import measure
+from patchproof.evidence.camera import View
+from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.surface import surface_of
 from patchproof.geometry import intrinsics
 from patchproof.photo.detect import Found
 from patchproof.photo.edges import Borders
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, fit_page
-from patchproof.verify import measure
-from patchproof.verify.camera import View
-from patchproof.verify.results import PhotoEntry
-from patchproof.verify.surface import surface_of
 from test_photo_rectify import marker_corners, noisy_corners
 from test_photo_synthetic import PIECE_IDS, make_manifest, view
 from test_verify_run import measured, shot

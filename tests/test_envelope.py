@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from patchproof import geometry
-from patchproof.optimize.run import optimize_scene
+from patchproof.optimizer.run import optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import with_value
 from patchproof.strict import Refused
@@ -35,7 +35,7 @@ def world(tmp_path_factory):
     scene = conftest.SCENE.replace("steps = 3", "steps = 1").replace("views = 4", "views = 1")
     (folder / "scene.toml").write_text(scene)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.optimize.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
         optimize_scene(folder / "scene.toml", folder / "run")
     return open_world(folder / "run", None)
 

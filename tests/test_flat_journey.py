@@ -20,17 +20,17 @@ from PIL import Image
 from patchproof.channel.printer import load_printer
 from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, rect_corners
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import set_problem
-from patchproof.optimize.run import Run, load_run
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.run import Run, load_run
 from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprint.reprint import printed_piece, take_photo
+from patchproof.reprints.reprint import printed_piece, take_photo
 from patchproof.scene.mesh_scene import MeshScene, load_mesh_scene
 from patchproof.scene.placement import place_card
 from patchproof.settings import SceneSettings
-from patchproof.sheet.manifest import Manifest, load_manifest
+from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.strict import Refused, shipped
 from test_journey import command
 
@@ -87,8 +87,8 @@ class Journey:
 def few_views():
     """A promise of 8 views and a selection of 4, since no rate is tested here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.optimize.run.PROMISE_VIEWS", 8)
-        patch.setattr("patchproof.optimize.loop.SELECT_VIEWS", 4)
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         yield
 
 

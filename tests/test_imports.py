@@ -14,33 +14,33 @@ import patchproof
 ROOT = Path(patchproof.__file__).parent
 GROUND = {"strict", "settings", "claims", "color", "geometry", "output", "workers"}
 # From the ground up: a room may import from the rows above its own, as far as they are named here.
-WORLD = GROUND | {"sheet", "photo", "channel", "mesh", "scene", "render", "classifier"}
-EVIDENCE = GROUND | {"sheet", "photo", "channel", "classifier", "verify", "report"}
-COMMANDS = WORLD | EVIDENCE | {"optimize", "calibrate", "printing", "reprint"}
+WORLD = GROUND | {"sheets", "photo", "channel", "mesh", "scene", "render", "classifier"}
+EVIDENCE = GROUND | {"sheets", "photo", "channel", "classifier", "evidence", "report"}
+COMMANDS = WORLD | EVIDENCE | {"optimizer", "calibrate", "printing", "reprints"}
 STUDIES = COMMANDS | {"journey", "plan", "study"}
 MAY_IMPORT = {
     **{module: set() for module in GROUND},
     "settings": {"strict"},
     "output": {"strict"},
     "workers": {"strict"},
-    "sheet": GROUND,
-    "photo": GROUND | {"sheet"},
+    "sheets": GROUND,
+    "photo": GROUND | {"sheets"},
     "channel": GROUND,
     "mesh": GROUND,
-    "scene": GROUND | {"sheet", "photo", "channel", "mesh"},
-    "render": GROUND | {"sheet", "photo", "channel", "mesh", "scene"},
+    "scene": GROUND | {"sheets", "photo", "channel", "mesh"},
+    "render": GROUND | {"sheets", "photo", "channel", "mesh", "scene"},
     "classifier": GROUND,
-    "optimize": WORLD,
-    "calibrate": GROUND | {"sheet", "photo", "channel"},
-    "verify": GROUND | {"sheet", "photo", "classifier", "channel"},
+    "optimizer": WORLD,
+    "calibrate": GROUND | {"sheets", "photo", "channel"},
+    "evidence": GROUND | {"sheets", "photo", "classifier", "channel"},
     "report": GROUND,
-    "printing": WORLD | {"optimize", "verify"},
-    "reprint": WORLD | {"optimize", "verify", "printing"},
+    "printing": WORLD | {"optimizer", "evidence"},
+    "reprints": WORLD | {"optimizer", "evidence", "printing"},
     "journey": COMMANDS,
     "plan": COMMANDS | {"journey"},
-    "study": WORLD | {"optimize", "report"},
+    "study": WORLD | {"optimizer", "report"},
     "harden": GROUND | {"photo", "scene", "classifier", "report", "study"},
-    "experiments": WORLD | {"optimize", "report", "study", "harden"},
+    "experiments": WORLD | {"optimizer", "report", "study", "harden"},
     "validation": STUDIES,
     "training": WORLD,
     "bench": STUDIES | {"training", "harden"},
@@ -64,8 +64,8 @@ def imported(source: str) -> set[str]:
 
 def test_the_reader_of_imports_sees_them():
     deep = "def f():\n    import patchproof.mesh.mesh"
-    source = f"from patchproof.sheet.piece import Piece\n{deep}\nfrom patchproof import color"
-    assert imported(source) == {"sheet", "mesh", "color"}
+    source = f"from patchproof.sheets.piece import Piece\n{deep}\nfrom patchproof import color"
+    assert imported(source) == {"sheets", "mesh", "color"}
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
@@ -74,7 +74,7 @@ def test_imports_point_upwards(path):
     assert imported(path.read_text(encoding="utf-8")) <= MAY_IMPORT[top] | {top}
 
 
-@pytest.mark.parametrize("package", ["sheet.write", "sheet.raster", "photo.read", "photo.detect", "photo.rectify"])
+@pytest.mark.parametrize("package", ["sheets.write", "sheets.raster", "photo.read", "photo.detect", "photo.rectify"])
 def test_paper_and_photographs_need_no_torch(package):
     code = f"import sys, patchproof.{package}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,9 +12,9 @@ import pytest
 
 from conftest import SCENE
 from patchproof import cli, geometry
-from patchproof.optimize import run as run_module
-from patchproof.sheet.manifest import load_manifest
-from patchproof.sheet.raster import attached_manifest
+from patchproof.optimizer import run as run_module
+from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.raster import attached_manifest
 from patchproof.strict import shipped
 
 PHOTOS = 8
@@ -86,9 +86,9 @@ def test_design_corners_are_where_the_truth_says(journey, report):
 
 def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
     """The conditions of these very photographs, rendered as for a promise: at most one in eight is judged otherwise."""
-    from patchproof.optimize.problem import set_problem
-    from patchproof.optimize.promise import try_out
-    from patchproof.optimize.run import load_run
+    from patchproof.optimizer.problem import set_problem
+    from patchproof.optimizer.promise import try_out
+    from patchproof.optimizer.run import load_run
 
     run = load_run(journey / "run")
     outcomes = try_out(set_problem(run.scene), run.design, run.scene.draw("reprint", PHOTOS))
@@ -103,7 +103,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
     """EXIF holds the 35 mm equivalent as a whole number, 2 % at 28 mm; distance is from the patch, not the object's
     middle.
     """
-    from patchproof.optimize.run import load_run
+    from patchproof.optimizer.run import load_run
     from patchproof.scene.conditions import Conditions
 
     scene = load_run(journey / "run").scene

@@ -13,15 +13,15 @@ import torch
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.color import linear_from_srgb
+from patchproof.evidence.ledger import _ledger, shapley
+from patchproof.evidence.print_fit import fit_print
+from patchproof.evidence.reproject import Shot, deblurred, light_fit, shot_of
+from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.surface import Promised, piece_picture, promised_of, surface_of
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
 from patchproof.report.plots import ledger_plot
-from patchproof.sheet.manifest import Manifest
-from patchproof.verify.ledger import _ledger, shapley
-from patchproof.verify.print_fit import fit_print
-from patchproof.verify.reproject import Shot, deblurred, light_fit, shot_of
-from patchproof.verify.run import gather_evidence
-from patchproof.verify.surface import Promised, piece_picture, promised_of, surface_of
+from patchproof.sheets.manifest import Manifest
 from test_photo_synthetic import CONDITION, make_manifest, page_raster, photograph, save, view
 from test_verify_run import measured
 

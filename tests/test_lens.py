@@ -14,7 +14,6 @@ from patchproof.channel.lens import (
     Camera,
     distort_points,
     distorted,
-    largest_shift_px,
     load_camera,
     matrix_px,
     pinhole_frame,
@@ -104,7 +103,7 @@ def test_points_of_the_square_are_those_of_the_whole_picture():
 def test_no_distortion_changes_nothing():
     one, pictures = camera(), torch.rand(2, 3, 30, 40)
     frame = pinhole_frame(one, (40, 30))
-    assert frame.size_px == (40, 30) and not one.bends and largest_shift_px(one, (40, 30)) == 0
+    assert frame.size_px == (40, 30) and not one.bends
     np.testing.assert_array_equal(frame.matrix_px, matrix_px(one, (40, 30)))
     assert distorted(pictures, one, (40, 30)) is pictures
 
@@ -154,16 +153,6 @@ def test_batches_equal_single_pictures():
     together = distorted(pictures, one, (40, 30))
     for i in range(3):
         assert torch.equal(distorted(pictures[i : i + 1], one, (40, 30))[0], together[i])
-
-
-def test_the_largest_shift_is_at_the_barrels_corner():
-    """k1 alone, centered: a corner at radius r comes from R with R (1 + k1 R²) = r."""
-    one = camera(fx=500.0, fy=500.0, cx=400.0, cy=300.0, k1=-0.1)
-    corner = np.hypot(399.5, 299.5) / 500
-    roots = np.roots([-0.1, 0, 1, -corner])
-    straight = min(root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0)
-    assert largest_shift_px(one, (800, 600)) == pytest.approx(500 * (straight - corner), rel=1e-9)
-    assert largest_shift_px(one, (400, 300)) == pytest.approx(250 * (straight - corner), rel=0.02)
 
 
 @pytest.mark.parametrize("path", sorted(shipped("calibration", "cameras").glob("*.json")), ids=lambda p: p.stem)

@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from patchproof.claims import wilson
-from patchproof.optimize import loop, run
-from patchproof.optimize.goals import target_loss, total_variation
-from patchproof.optimize.loop import _step, start, steps
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import set_problem
-from patchproof.optimize.promise import CONTROLS, judged, promise_from, try_out
-from patchproof.optimize.run import load_run, optimize_scene
+from patchproof.optimizer import loop, run
+from patchproof.optimizer.goals import target_loss, total_variation
+from patchproof.optimizer.loop import _step, start, steps
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import CONTROLS, judged, promise_from, try_out
+from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings

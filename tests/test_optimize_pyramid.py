@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from patchproof.optimize.pyramid import FEWEST, joined, level_count, levels
+from patchproof.optimizer.pyramid import FEWEST, joined, level_count, levels
 
 
 @pytest.mark.parametrize(("size", "count"), [((1, 5), 1), ((8, 8), 1), ((15, 40), 1), ((16, 16), 2), ((64, 80), 4)])

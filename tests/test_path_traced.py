@@ -16,8 +16,8 @@ from patchproof.color import linear_from_srgb
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
-from patchproof.reprint import path_traced
-from patchproof.reprint.path_traced import Optics, draw_optics, photograph_traced, sky_directions, sky_radiance
+from patchproof.reprints import path_traced
+from patchproof.reprints.path_traced import Optics, draw_optics, photograph_traced, sky_directions, sky_radiance
 from patchproof.scene.conditions import with_value
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused

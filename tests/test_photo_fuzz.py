@@ -12,7 +12,7 @@ from PIL import Image
 
 from patchproof.photo.cannot import CODES, CannotJudge
 from patchproof.photo.read import read_photo
-from patchproof.sheet.manifest import dump_manifest, load_manifest
+from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.strict import Refused
 from test_photo_synthetic import make_manifest
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from patchproof.channel.printer import identity_printer
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo.label import Label, label_of, parsed, read_label
 from patchproof.photo.read import Photo
-from patchproof.sheet.blank import blank_sheet
-from patchproof.sheet.piece import lay_out_piece
-from patchproof.sheet.raster import page_pixels
-from patchproof.sheet.several import OneDesign, write_several
-from patchproof.sheet.template import load_template
-from patchproof.sheet.write import write_sheet
-from patchproof.verify.camera import view_of
-from patchproof.verify.measure import measure
-from patchproof.verify.ranges import promised_ranges
-from patchproof.verify.surface import promised_of, surface_of
+from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.piece import lay_out_piece
+from patchproof.sheets.raster import page_pixels
+from patchproof.sheets.several import OneDesign, write_several
+from patchproof.sheets.template import load_template
+from patchproof.sheets.write import write_sheet
 
 
 def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):

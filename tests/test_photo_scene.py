@@ -16,10 +16,10 @@ from patchproof.scene import flat
 from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import _digest, load_photo_scene, see
 from patchproof.settings import SceneSettings
-from patchproof.sheet.blank import blank_sheet
-from patchproof.sheet.manifest import Manifest, dump_manifest
-from patchproof.sheet.piece import lay_out_piece, sheet_id
-from patchproof.sheet.raster import piece_pixels
+from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.manifest import Manifest, dump_manifest
+from patchproof.sheets.piece import lay_out_piece, sheet_id
+from patchproof.sheets.raster import piece_pixels
 from patchproof.strict import Refused, shipped
 
 SIZE = (800, 600)

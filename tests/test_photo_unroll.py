@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import surface_of
 from patchproof.geometry import apply_homography, intrinsics, look_at, rect_corners
 from patchproof.photo.read import Photo
 from patchproof.photo.unroll import unroll
-from patchproof.verify.camera import view_of
-from patchproof.verify.measure import measure
-from patchproof.verify.ranges import promised_ranges
-from patchproof.verify.surface import surface_of
 from test_photo_synthetic import (
     CUT_MM,
     DESIGN_MM,

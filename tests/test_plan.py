@@ -13,9 +13,9 @@ from PIL import Image
 
 from conftest import SCENE
 from patchproof import cli
-from patchproof.optimize import loop
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import set_problem
+from patchproof.optimizer import loop
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import set_problem
 from patchproof.plan.cost import measure_cost
 from patchproof.plan.errors import measure_terms
 from patchproof.plan.plan import Plan, marker_plan, other_surface, plan_lines, plan_scene, resolution_plan, scales
@@ -26,7 +26,7 @@ from patchproof.scene.paper_light import PaperLight
 from patchproof.scene.photo_scene import PhotoScene, Seen
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.settings import SceneSettings
-from patchproof.sheet.piece import lay_out_piece
+from patchproof.sheets.piece import lay_out_piece
 from patchproof.strict import validated
 
 
@@ -256,9 +256,6 @@ def test_the_parts_of_a_step_add_up(tmp_path):
     cost = measure_cost(problem, problem.subject.start())
     assert sum(part.ms for part in cost.parts) == pytest.approx(cost.ms)
     assert sum(part.share for part in cost.parts) == pytest.approx(1) and min(part.ms for part in cost.parts) >= 0
-    see_ms = sum(part.ms for part in cost.parts if part.name.startswith("see"))
-    assert cost.refresh_ms[2] == pytest.approx(cost.ms - see_ms / 2)
-    assert cost.refresh_ms[4] == pytest.approx(cost.ms - see_ms * 3 / 4)
 
 
 def test_the_verb_prints_and_writes_and_does_not_overwrite(scene_file, tmp_path, monkeypatch, capsys, plan):

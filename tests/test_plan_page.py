@@ -10,8 +10,8 @@ import trimesh
 
 from conftest import SCENE
 from patchproof.printing.hung import hang
-from patchproof.sheet.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
-from patchproof.sheet.template import load_template
+from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
+from patchproof.sheets.template import load_template
 from patchproof.strict import Refused
 from test_scene import scene_of
 

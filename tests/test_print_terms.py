@@ -18,16 +18,15 @@ from patchproof.channel.printer import (
     node_colors,
     save_printer,
 )
-from patchproof.optimize import loop
-from patchproof.optimize.goals import non_printability, printable_colors
-from patchproof.optimize.loop import steps
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import set_problem
+from patchproof.optimizer import loop
+from patchproof.optimizer.loop import steps
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import set_problem
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.render.photograph import expose, photograph, shade
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
-from patchproof.reprint.reprint import scaled_print
+from patchproof.reprints.reprint import scaled_print
 from patchproof.strict import Refused
 from patchproof.study.study import run_study
 from patchproof.validation.gamut import UNPRINTED, WAYS, Outcomes, gamut_cell, gamut_rows, other_printers, way_problem
@@ -100,48 +99,6 @@ def test_a_printer_that_misses_even_gray_is_refused(tmp_path, miss, refused):
         return
     with pytest.raises(Refused, match="even show middle gray"):
         set_problem(scene)
-
-
-# ------------------------------------------------------------------------------------------------ NPS
-
-
-def test_nps_is_the_product_of_distances_over_that_of_random_colors():
-    printable = torch.tensor([[0.0, 0, 0], [1, 1, 1]], dtype=torch.float64)
-    gray, black = (torch.full((3, 2, 2), value, dtype=torch.float64) for value in (0.5, 0.0))
-    red = torch.tensor([1.0, 0, 0], dtype=torch.float64)[:, None, None]
-    assert non_printability(black, printable) == 0
-    ratio = non_printability(red, printable) / non_printability(gray, printable)
-    assert float(ratio) == pytest.approx((1 * 2**0.5) / (3**0.5 / 2) ** 2)
-    random = torch.tensor(np.random.default_rng(0).random((3, 200, 200)))
-    assert float(non_printability(random, printable)) == pytest.approx(1, rel=0.02)
-
-
-def test_nps_has_true_gradients_also_on_a_printable_color():
-    printable = torch.tensor(np.random.default_rng(1).random((5, 3)))
-    design = torch.tensor(np.random.default_rng(2).random((3, 2, 2)), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: non_printability(x, printable), (design,))
-    on = printable[:1].T[:, :, None].clone().requires_grad_()
-    assert torch.isfinite(torch.autograd.grad(non_printability(on, printable), on)[0]).all()
-
-
-def test_printable_colors_are_colors_of_the_printer_and_the_same_each_time():
-    printer = load_printer("uncoated")
-    kept, shown, exact = printable_colors(printer), printer.lut.reshape(-1, 3), "donot_use_mm_for_euclid_dist"
-    assert (
-        len(torch.unique(kept, dim=0)) == 30 and torch.cdist(kept, shown, compute_mode=exact).min(1).values.max() < 1e-6
-    )
-    torch.testing.assert_close(printable_colors(printer), kept, rtol=0, atol=0)
-    score = [float(non_printability(design[0], kept)) for design in (printer.apply(colors()), colors())]
-    assert score[0] < score[1] / 20  # what was printed scores lower than what was sent
-
-
-def test_nps_pulls_a_design_towards_printable_colors(tmp_path):
-    scores = []
-    for weight in (0.0, 100.0):
-        problem = set_problem(scene_with(tmp_path, optimize__steps=6, optimize__nps=weight, optimize__gamut=0.0))
-        *_, last = steps(problem)
-        scores.append(float(non_printability(last.state.design, printable_colors(problem.printer))))
-    assert scores[1] < scores[0] / 10
 
 
 # ------------------------------------------------------------------------------------------------ what prints do
@@ -253,8 +210,6 @@ def test_ways_differ_in_what_they_say(tmp_path):
     problem = set_problem(scene_with(tmp_path))
     posed_by = {way.name: way_problem(problem, way) for way in WAYS}
     assert posed_by[UNPRINTED.name].subject.printer.name == "identity"
-    assert posed_by["NPS alone"].subject.printable is not None
-    torch.testing.assert_close(posed_by["NPS alone"].subject.printable, printable_colors(problem.printer))
     design = from_pixels(np.full((8, 8, 3), [255, 0, 255], np.uint8))
     kept = posed_by["in gamut by construction"].subject.clipped(design)
     assert as_pixels(kept).tolist() != as_pixels(design).tolist()

@@ -144,9 +144,6 @@ def test_a_closed_sphere_has_no_hole_and_no_pixel_twice(seed, drawn):
     y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
     disk = (x - SIZE[0] / 2) ** 2 + (y - SIZE[1] / 2) ** 2 < radius[:, None, None] ** 2
     assert (times.view(fragments.shape).numpy()[disk] == 2).all() and disk.sum() > 10_000
-    drawn.clear()
-    outside = rasterize(vertices, faces, views, 0.01, cull_back=True)
-    assert len(torch.cat(drawn)) == len(outside) == len(fragments)
 
 
 def test_two_triangles_cover_each_pixel_of_their_square_once():
@@ -225,15 +222,6 @@ def test_a_plane_in_front_wins_down_to_23_bits_and_then_ties_go_to_the_lower_fac
     assert upper_share(23, [0.0, 0, 4]) == upper_share(23, [2.0, 1, 3]) == 1
     assert upper_share(24, [0.0, 0, 4]) == 0 and 0 < upper_share(24, [2.0, 1, 3]) < 1
     assert upper_share(24, [2.0, 1, 3]) == upper_share(24, [2.0, 1, 3])
-
-
-def test_culling_keeps_the_outside():
-    vertices, faces = sphere()
-    views = cameras([[0.0, 0, 4]])
-    kept, culled = rasterize(vertices, faces, views, 0.01), rasterize(vertices, faces, views, 0.01, cull_back=True)
-    assert bool(kept.front.all()) and kept.face.tolist() == culled.face.tolist()
-    turned = rasterize(vertices, faces.flip(1), views, 0.01, cull_back=True)
-    assert not turned.face.tolist() == kept.face.tolist() and bool(turned.front.all())
 
 
 def test_chunks_do_not_change_the_picture(monkeypatch):

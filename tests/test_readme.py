@@ -27,7 +27,7 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture(autouse=True)
 def a_promise_of_few_views(monkeypatch):
-    monkeypatch.setattr("patchproof.optimize.run.PROMISE_VIEWS", 40)
+    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
 
 
 @pytest.fixture(scope="module")

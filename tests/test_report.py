@@ -17,10 +17,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from patchproof.evidence.results import Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
 from patchproof.report.images import delta_map, save_pictures
 from patchproof.report.photo_table import photos_csv
 from patchproof.report.write import write_report
-from patchproof.verify.results import Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
 from test_photo_synthetic import make_manifest
 from test_verify_run import promise
 

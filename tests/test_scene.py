@@ -16,7 +16,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.scene import load_scene
-from patchproof.sheet.piece import MODULES, frame_image
+from patchproof.sheets.piece import MODULES, frame_image
 from patchproof.strict import Refused
 
 QUIET = """

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from patchproof import strict
-from patchproof.settings import SceneSettings, load_scene_settings
+from patchproof.settings import SceneSettings, identifying, load_scene_settings
 from patchproof.strict import Refused, Strict, expand, nearest, shipped, validated
 
 SCENE = """
@@ -138,7 +138,7 @@ def test_lengths_are_finite_positive_numbers(tmp_path, value):
         "[light]\nshininess = [0, 20]",
         "[camera]\nvignetting = [0, 0.99]",
         "[camera]\nmotion_px = [-1, 2]",
-        "[optimize]\nrefresh = 0",
+        "[optimize]\nviews = 0",
         "[view]\npatch_share = [0.1, 1.2]",
         "[optimize]\nsteps = 0",
         "[optimize]\nsteps = 1.5",
@@ -224,3 +224,16 @@ def test_numbers_stay_numbers(tmp_path):
     assert (
         math.isclose(read.object.length_mm, 100) and SceneSettings.model_validate_json(read.model_dump_json()) == read
     )
+
+
+def test_keys_of_former_runs_are_forgotten_where_they_changed_nothing(tmp_path):
+    former = load_scene_settings(scene(tmp_path, extra="[optimize]\nrefresh = 1\nmine = 0\nnps = 0\nsteps = 7"))
+    assert former.optimize.steps == 7
+    with pytest.raises(Refused, match="mine"):
+        load_scene_settings(scene(tmp_path, extra="[optimize]\nmine = 8"))
+
+
+def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
+    plain, spelled = (load_scene_settings(scene(tmp_path, extra=text)) for text in ("", "[optimize]\nsteps = 240"))
+    other = load_scene_settings(scene(tmp_path, extra="[optimize]\nsteps = 241"))
+    assert identifying(plain) == identifying(spelled) != identifying(other)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from patchproof.sheet.blank import blank_piece_mm, blank_sheet
-from patchproof.sheet.piece import lay_out_piece
-from patchproof.sheet.raster import attached_manifest, piece_pixels
-from patchproof.sheet.template import load_template
+from patchproof.sheets.blank import blank_piece_mm, blank_sheet
+from patchproof.sheets.piece import lay_out_piece
+from patchproof.sheets.raster import attached_manifest, piece_pixels
+from patchproof.sheets.template import load_template
 from patchproof.strict import Refused, shipped
 
 BLANK = shipped("print_templates", "blank_a4.toml")

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from patchproof.printing.sheet import blank_page
-from patchproof.sheet.blank import blank_sheet
-from patchproof.sheet.board import board_geometry, board_sheet, is_board, load_board
-from patchproof.sheet.manifest import load_manifest
-from patchproof.sheet.raster import attached_manifest, page_pixels
+from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.board import board_geometry, board_sheet, is_board, load_board
+from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.raster import attached_manifest, page_pixels
 from patchproof.strict import Refused, shipped
 
 FILE = shipped("print_templates", "charuco_a4.toml")

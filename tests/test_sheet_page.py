@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from patchproof.sheet.page import Box, largest_piece_mm, lay_out_page, prove_apart, qr_rects_mm
-from patchproof.sheet.piece import KINDS, lay_out_piece, marker_size_mm
-from patchproof.sheet.template import TextLine, load_template
+from patchproof.sheets.page import Box, largest_piece_mm, lay_out_page, prove_apart, qr_rects_mm
+from patchproof.sheets.piece import KINDS, lay_out_piece, marker_size_mm
+from patchproof.sheets.template import TextLine, load_template
 from patchproof.strict import Refused, shipped
 
 ID = "WWWWWWWWWW"  # the widest id there can be

@@ -10,25 +10,25 @@ import numpy as np
 import pikepdf
 import pytest
 
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import surface_of
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.label import label_of, read_label
 from patchproof.photo.read import Photo
-from patchproof.sheet.board import board_sheet, is_board
-from patchproof.sheet.chart_page import chart_sheet
-from patchproof.sheet.manifest import load_manifest
-from patchproof.sheet.page import Box, largest_piece_mm, prove_apart
-from patchproof.sheet.piece import lay_out_piece
-from patchproof.sheet.plan_page import PlanPage
-from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
-from patchproof.sheet.several import OneDesign, write_several
-from patchproof.sheet.template import load_template, template_names
-from patchproof.sheet.tiles import plan_tiles
-from patchproof.sheet.write import check_sheet, write_sheet
+from patchproof.sheets.board import board_sheet, is_board
+from patchproof.sheets.chart_page import chart_sheet
+from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.page import Box, largest_piece_mm, prove_apart
+from patchproof.sheets.piece import lay_out_piece
+from patchproof.sheets.plan_page import PlanPage
+from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
+from patchproof.sheets.several import OneDesign, write_several
+from patchproof.sheets.template import load_template, template_names
+from patchproof.sheets.tiles import plan_tiles
+from patchproof.sheets.write import check_sheet, write_sheet
 from patchproof.strict import Refused, read_toml, shipped
-from patchproof.verify.camera import view_of
-from patchproof.verify.measure import measure
-from patchproof.verify.ranges import promised_ranges
-from patchproof.verify.surface import surface_of
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
 
 NAMES = template_names()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.sheet.piece import (
+from patchproof.sheets.piece import (
     KINDS,
     black_runs,
     control_design,
@@ -65,7 +65,7 @@ def test_marker_ids_refuse_too_many_and_unknown_kinds():
 
 def test_ids_do_not_depend_on_the_hash_seed():
     code = (
-        "from patchproof.sheet.piece import marker_ids, sheet_id; "
+        "from patchproof.sheets.piece import marker_ids, sheet_id; "
         "print(sheet_id({'a': 1, 'b': 2}, 0), marker_ids('A1B2C3D4E5', 'noise', 5))"
     )
     runs = {

@@ -8,7 +8,7 @@ import pytest
 from pikepdf import Array, Name
 from PIL import Image
 
-from patchproof.sheet.shop import shop_lines
+from patchproof.sheets.shop import shop_lines
 from patchproof.strict import Refused
 from test_photo_label import sheet
 

@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from patchproof.sheet.chart import CORNERS, GRAYS, chart_colors, chart_swatches
-from patchproof.sheet.template import load_template, template_names
+from patchproof.sheets.chart import CORNERS, GRAYS, chart_colors, chart_swatches
+from patchproof.sheets.template import load_template, template_names
 from patchproof.strict import Refused, shipped
 
 A4 = shipped("print_templates", "a4.toml")

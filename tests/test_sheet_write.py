@@ -13,13 +13,13 @@ import pytest
 from PIL import Image, ImageCms
 
 from patchproof.color import linear_from_srgb
-from patchproof.sheet.manifest import dump_manifest, load_manifest
-from patchproof.sheet.pdf import srgb_profile
-from patchproof.sheet.piece import control_design, frame_image, lay_out_piece
-from patchproof.sheet.raster import attached_manifest, page_pixels, piece_pixels
-from patchproof.sheet.shop import shop_lines
-from patchproof.sheet.template import load_template
-from patchproof.sheet.write import check_sheet, write_sheet
+from patchproof.sheets.manifest import dump_manifest, load_manifest
+from patchproof.sheets.pdf import srgb_profile
+from patchproof.sheets.piece import control_design, frame_image, lay_out_piece
+from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
+from patchproof.sheets.shop import shop_lines
+from patchproof.sheets.template import load_template
+from patchproof.sheets.write import check_sheet, write_sheet
 from patchproof.strict import Refused
 
 ID = "A1B2C3D4E5"
@@ -367,7 +367,7 @@ def test_a_tampered_attachment_is_refused(tmp_path, sheet):
 
 def test_the_package_imports_without_heavy_libraries():
     code = (
-        "import sys; from patchproof.sheet import chart, page, pdf, piece, raster, template, write; "
+        "import sys; from patchproof.sheets import chart, page, pdf, piece, raster, template, write; "
         "print([m for m in ('torch', 'scipy', 'cv2', 'reportlab', 'pikepdf', 'pypdfium2') if m in sys.modules])"
     )
     run = subprocess.run(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from patchproof.claims import prediction_interval
+from patchproof.evidence.verdict import compare
 from patchproof.printing.shots import fewest, paired_power, plan_shots, unpaired_power
-from patchproof.sheet.manifest import Promise
-from patchproof.verify.verdict import compare
+from patchproof.sheets.manifest import Promise
 
 
 def promise_of(rate: float, control: float, n: int = 400, goal: str = "assist") -> Promise:

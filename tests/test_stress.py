@@ -11,6 +11,15 @@ import torch
 from scipy.stats import spearmanr
 
 from patchproof.experiments import mining, stress
+from patchproof.experiments.hard_views import (
+    CANDIDATES,
+    LIGHT,
+    POSE,
+    clean_losses,
+    expected_losses,
+    hardest,
+    training_conditions,
+)
 from patchproof.experiments.stress import OcclusionSettings, SearchSettings, occluded, worst_case
 from patchproof.experiments.stress_map import (
     Axis,
@@ -22,19 +31,9 @@ from patchproof.experiments.stress_map import (
     scene_cells,
     worst_cells,
 )
-from patchproof.optimize import loop, run
-from patchproof.optimize.loop import State, steps
-from patchproof.optimize.mining import (
-    CANDIDATES,
-    LIGHT,
-    POSE,
-    clean_losses,
-    expected_losses,
-    hardest,
-    training_conditions,
-)
-from patchproof.optimize.problem import set_problem
-from patchproof.optimize.run import optimize_scene
+from patchproof.optimizer import loop, run
+from patchproof.optimizer.loop import State, steps
+from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings
 from patchproof.strict import Refused, validated
@@ -84,15 +83,14 @@ def rows_of(conditions, names):
 
 
 def test_without_mining_the_views_are_those_drawn(tmp_path):
-    problem = problem_with(tmp_path)
-    every = [field.name for field in fields(training_conditions(problem))]
-    drawn = problem.scene.draw("train", 12)
-    np.testing.assert_array_equal(rows_of(training_conditions(problem), every), rows_of(drawn, every))
+    problem = problem_with(tmp_path, patch=PRINTED)
+    given, drawn = (list(steps(problem, conditions=views)) for views in (problem.scene.draw("train", 12), None))
+    assert torch.equal(given[-1].state.design, drawn[-1].state.design)
 
 
 def test_mined_views_take_pose_and_light_of_expectedly_bad_draws_and_nothing_else(tmp_path):
-    problem = problem_with(tmp_path, optimize={"mine": 64})
-    mined, drawn = training_conditions(problem), problem.scene.draw("train", 12 + 64 + 6 * CANDIDATES)
+    problem = problem_with(tmp_path)
+    mined, drawn = training_conditions(problem, 64), problem.scene.draw("train", 12 + 64 + 6 * CANDIDATES)
     assert len(mined) == 12
     names = POSE + LIGHT
     others = [field.name for field in fields(drawn) if field.name not in names]
@@ -120,12 +118,11 @@ def test_the_fit_finds_what_is_hard_and_ignores_what_does_not_vary(tmp_path):
 
 def test_views_from_behind_a_patch_are_not_mined(tmp_path):
     """The object fails there, too, but the patch cannot be seen; where too few are not, nothing is mined."""
-    around = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]}, optimize={"mine": 16})
-    mined, drawn = training_conditions(around), around.scene.draw("train", 12)
+    around = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]})
+    mined, drawn = training_conditions(around, 16), around.scene.draw("train", 12)
     changed = mined.azimuth_deg != drawn.azimuth_deg
     assert changed.any() and (np.abs(around.scene.piece_azimuth_deg(mined))[changed] < 90).all()
-    one = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]}, optimize={"mine": 1})  # too few to fit
-    np.testing.assert_array_equal(training_conditions(one).azimuth_deg, one.scene.draw("train", 12).azimuth_deg)
+    np.testing.assert_array_equal(training_conditions(around, 1).azimuth_deg, drawn.azimuth_deg)  # too few to fit
 
 
 def test_the_worst_of_every_eight_by_hand():
@@ -133,32 +130,14 @@ def test_the_worst_of_every_eight_by_hand():
 
 
 def test_a_step_of_mined_training_depends_on_state_and_number_alone(tmp_path):
-    whole = list(steps(problem_with(tmp_path, patch=PRINTED, optimize={"mine": 8})))
+    first, second = (problem_with(tmp_path, patch=PRINTED) for _ in range(2))
+    whole = list(steps(first, conditions=training_conditions(first, 8)))
     middle: State = whole[2].state
-    again = list(steps(problem_with(tmp_path, patch=PRINTED, optimize={"mine": 8}), middle))
+    again = list(steps(second, middle, training_conditions(second, 8)))
     assert [step.state.number for step in again] == [4, 5, 6]
     assert torch.equal(again[-1].state.design, whole[-1].state.design) and again[-1].loss == whole[-1].loss
     plain = list(steps(problem_with(tmp_path, patch=PRINTED)))
     assert not torch.equal(plain[-1].state.design, whole[-1].state.design)
-
-
-class Killed(Exception):
-    pass
-
-
-def test_a_mined_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path):
-    scene = toml(tmp_path / "scene.toml", patch=PRINTED, optimize={"mine": 8, "steps": 5})
-
-    def kill(step, total):
-        if step.state.number == 3:
-            raise Killed
-
-    optimize_scene(scene, tmp_path / "whole")
-    with pytest.raises(Killed):
-        optimize_scene(scene, tmp_path / "cut", on_step=kill)
-    optimize_scene(scene, tmp_path / "cut", resume=True)
-    for name in ("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png", "run.json"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes(), name
 
 
 def test_equal_cost_by_hand(monkeypatch):
@@ -169,7 +148,7 @@ def test_equal_cost_by_hand(monkeypatch):
     assert mining.passes(plain) == pytest.approx(320 + 256 / 3)
     # 192 tries cost 64 passes, which are 8 steps of 8 views
     assert mining.equal_steps(plain, 192) == 32 and mining.equal_steps(plain, 193) == 31
-    assert mining.passes(plain.model_copy(update={"steps": 32, "mine": 192})) == mining.passes(plain)
+    assert mining.passes(plain.model_copy(update={"steps": 32}), 192) == mining.passes(plain)
     # one step's worth of tries from the last training that can pay for them
     two = OptimizeSettings(steps=2, views=4)
     assert mining.equal_steps(two, 12) == 1

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from patchproof.channel.printer import load_printer
-from patchproof.optimize.problem import set_problem
+from patchproof.optimizer.problem import set_problem
 from patchproof.plan import cost as plan_cost
 from patchproof.strict import Refused
 from patchproof.study.study import Cell, Result

@@ -15,8 +15,8 @@ from patchproof.claims import LEAST_CLUSTERS, clustered_mean
 from patchproof.experiments import patch2d, patch3d
 from patchproof.experiments.image_classes import ImageClass, classes_of, write_renders
 from patchproof.geometry import local_scale
-from patchproof.optimize import loop
-from patchproof.optimize.problem import set_problem
+from patchproof.optimizer import loop
+from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, read_toml, validated
 from patchproof.study.study import Cell, Result, run_study

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from patchproof.claims import prediction_interval
-from patchproof.optimize import loop, run
+from patchproof.optimizer import loop, run
 from patchproof.study.study import Cell, Result, run_study
 from patchproof.validation import promises
 from test_optimize import SCENE

@@ -11,11 +11,11 @@ import trimesh
 from PIL import Image
 
 from patchproof.mesh.mesh import Material, Part, from_parts
-from patchproof.optimize import loop, run
-from patchproof.optimize.evaluate import evaluate_run
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import set_problem
-from patchproof.optimize.run import load_run, optimize_scene
+from patchproof.optimizer import loop, run
+from patchproof.optimizer.evaluate import evaluate_run
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.export import write_glb

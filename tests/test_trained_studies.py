@@ -11,10 +11,10 @@ import torch
 
 from patchproof.experiments import deceive, transfer
 from patchproof.experiments.turntable import attributions, from_sides, goal_log, mean_color, three_views
-from patchproof.optimize import loop, run
-from patchproof.optimize.evaluate import evaluate_run
-from patchproof.optimize.problem import set_problem
-from patchproof.optimize.run import optimize_scene
+from patchproof.optimizer import loop, run
+from patchproof.optimizer.evaluate import evaluate_run
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.run import optimize_scene
 from patchproof.report.tables import Estimate, mean
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, validated

@@ -16,13 +16,13 @@ import torch
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
+from patchproof.evidence import look
+from patchproof.evidence.journal import Journal
+from patchproof.evidence.run import gather_evidence
 from patchproof.journey.verify import verify_photos
 from patchproof.photo.read import read_photo
-from patchproof.sheet.manifest import dump_manifest
+from patchproof.sheets.manifest import dump_manifest
 from patchproof.strict import Refused
-from patchproof.verify import look
-from patchproof.verify.journal import Journal
-from patchproof.verify.run import gather_evidence
 from patchproof.workers import WorkerDied
 from test_photo_synthetic import make_manifest, save
 from test_verify_run import NET, promise, shot

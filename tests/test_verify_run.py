@@ -13,13 +13,13 @@ import torch
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo.read import Photo
 from patchproof.strict import Refused
-from patchproof.verify.camera import view_of
-from patchproof.verify.measure import measure
-from patchproof.verify.ranges import promised_ranges
-from patchproof.verify.run import gather_evidence
-from patchproof.verify.surface import promised_of, surface_of
 from test_photo_synthetic import COLORS, make_manifest, page_raster, photograph, save, view
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from patchproof.claims import prediction_interval
-from patchproof.sheet.manifest import ConditionClaim
-from patchproof.verify.ranges import matched_rate, promised_ranges, promised_side_px
-from patchproof.verify.results import PhotoEntry
-from patchproof.verify.verdict import compare, effect_of, judge
+from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
+from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.verdict import compare, effect_of, judge
+from patchproof.sheets.manifest import ConditionClaim
 from test_photo_synthetic import make_manifest
 
 

@@ -25,7 +25,7 @@ from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see
 from patchproof.scene.conditions import with_poses_of
 from patchproof.scene.scene import load_scene
-from patchproof.sheet.piece import frame_image
+from patchproof.sheets.piece import frame_image
 from patchproof.strict import Refused
 from tolerances import FLOAT32
 

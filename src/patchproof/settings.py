@@ -7,7 +7,7 @@ beside it where one was measured.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -185,10 +185,6 @@ class OptimizeSettings(Strict):
 
     steps: Annotated[int, Field(ge=1)] = 240
     views: Annotated[int, Field(ge=1)] = 4  # many small steps: as many views, 12 at a time, got less far in 3 scenes
-    # steps for which views keep their poses, lit and printed anew: 4 save a fifth of a step's time, and after as many
-    # views left a loss that was a quarter to a third higher (3 scenes, 3 and 4 seeds)
-    refresh: Annotated[int, Field(ge=1)] = 1
-    mine: Annotated[int, Field(ge=0)] = 0  # views tried beforehand: half of those trained on are like the worst
     seed: Annotated[int, Field(ge=0)] = 0
     optimizer: Literal["adam", "sign"] = "adam"
     # of sRGB's range, in which a larger one only jumps to the ends; by default 0.05 for a patch, 0.015 for a texture
@@ -198,7 +194,15 @@ class OptimizeSettings(Strict):
     # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).
     gamut: NotNegative = 1.0
     in_gamut: bool = False  # keep the design, after every step, to colors that the printer shows as asked (ΔE00 ≤ 3)
-    nps: NotNegative = 0.0  # loss for the non-printability score of Sharif et al., 1 for random colors; to compare with
+
+    @model_validator(mode="before")
+    @classmethod
+    def _forget_former_keys(cls, data):
+        # runs from before these keys went have them, nearly always at the values that changed nothing
+        former = {"refresh": 1, "mine": 0, "nps": 0.0}
+        if not isinstance(data, dict):
+            return data
+        return {key: value for key, value in data.items() if key not in former or value != former[key]}
 
 
 class SceneSettings(Strict):
@@ -229,3 +233,8 @@ class SceneSettings(Strict):
 def load_scene_settings(path: str | Path) -> SceneSettings:
     """The settings of a scene file as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
     return validated(SceneSettings, read_toml(path), str(path))
+
+
+def identifying(settings: SceneSettings) -> dict[str, Any]:
+    """What a sheet id is made of: settings that differ from their defaults, so that a key more changes no sheet."""
+    return settings.model_dump(mode="json", exclude_defaults=True)

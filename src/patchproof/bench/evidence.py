@@ -17,10 +17,10 @@ from patchproof.bench.sheets import markers_chart, models_chart
 from patchproof.calibrate.boards import View, corner_places_mm
 from patchproof.calibrate.lens_ladder import FREE, Rung, climb
 from patchproof.claims import prediction_interval, wilson
+from patchproof.evidence.verdict import LEAST_JUDGED, SLACK, judge
 from patchproof.journey.demo import PHOTOS
-from patchproof.optimize.promise import PROMISE_VIEWS
-from patchproof.sheet.board import load_board
-from patchproof.verify.verdict import LEAST_JUDGED, SLACK, judge
+from patchproof.optimizer.promise import PROMISE_VIEWS
+from patchproof.sheets.board import load_board
 
 SIZE_PX, FOCAL_PX = (1600, 1200), 1300.0
 LENSES = {

@@ -26,7 +26,7 @@ from patchproof.classifier.batches import MAX_BATCH, InBatches, few_on_cpu
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.view import center_square
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 
 VIEWS = 12

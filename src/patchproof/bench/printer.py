@@ -25,8 +25,8 @@ from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.claims import wilson
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.reprint.chart_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
-from patchproof.reprint.inkjets import DRIVERS, draw_inkjet
+from patchproof.reprints.chart_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
+from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
 
 SWATCHES = (6, 48, 96)
 TARGETS = {48: 2.5, 96: 1.8}

@@ -1,4 +1,4 @@
-"""The renderer's knobs: texture taps, supersampled edges, resolution of training views, and pool refresh.
+"""The renderer's knobs: texture taps, supersampled edges, and resolution of training views.
 
 In: the benchmarks' world. Out: one chart per knob; `speed` adds how the rasterizer's time grows and what share of a
 step it takes, `texture` what the taps buy.
@@ -21,23 +21,19 @@ from patchproof.bench.chart import Chart, OnStage, Point, Series, Table
 from patchproof.bench.measure import mean_interval, psnr, ratio, timed
 from patchproof.bench.speed import growth_chart, step_chart
 from patchproof.bench.texture import QUICK_WIDTHS_PX, SUBSAMPLES, WIDTHS_PX, texture_chart
-from patchproof.bench.world import World, set_world, with_settings
+from patchproof.bench.world import World, set_world
 from patchproof.channel.camera import encoded
-from patchproof.optimize.goals import target_loss
-from patchproof.optimize.loop import steps
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.pixels import from_pixels
 from patchproof.render.photograph import expose, shade
 from patchproof.render.pixels import PiecePicture
-from patchproof.render.views import relit, see
-from patchproof.reprint.reprint import take_photo
+from patchproof.render.views import see
+from patchproof.reprints.reprint import take_photo
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.settings import OptimizeSettings
 
 SUPERSAMPLES, EDGES_PX = (1, 2, 3), 192
 SIDES_PX = (96, 128, 192, 224, 384)
-REFRESHES = (1, 2, 4, 8)
 
 
 def render_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
@@ -46,7 +42,6 @@ def render_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     yield texture_chart(world, QUICK_WIDTHS_PX if quick else WIDTHS_PX, rounds, on_stage)
     yield edges_chart(world, 2 if quick else 8, rounds, on_stage)
     yield resolution_chart(world, 6 if quick else 40, rounds, on_stage)
-    yield refresh_chart(world.problem, *((30, 4, 2) if quick else (120, 4, 3)), on_stage)
     yield growth_chart(quick, on_stage)
     yield step_chart(world.problem, rounds, on_stage)
 
@@ -139,60 +134,3 @@ def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -
         (f"truth: photographs of {photo_px[0]} × {photo_px[1]} px as JPEG files, reduced as the classifier does it",),
         tables=(Table(("", "confidence - photograph's", "95 %"), tuple(rows)),),
     )
-
-
-# How long a pool of views may be kept
-
-
-def refresh_chart(problem: Problem, count: int, views: int, seeds: int, on_stage: OnStage) -> Chart:
-    """Steps for which views keep their poses against the selection loss after as many steps, and after as much time."""
-    seconds = _refresh_seconds(with_settings(problem, views=views))
-    cost = {n: seconds["see"] / n + seconds["rest"] for n in REFRESHES}
-    ratios = {n: cost[n] / cost[1] for n in REFRESHES}  # of rounds, in turn
-    ends = {n: max(count, round(count / np.median(ratios[n]))) for n in REFRESHES}
-    losses = {key: [] for key in [(n, when) for n in REFRESHES for when in ("steps", "time")]}
-    for seed in range(seeds):
-        for i, n in enumerate(REFRESHES):
-            loop = steps(with_settings(problem, seed, steps=ends[n], views=views, refresh=n))
-            best = {step.state.number: step.state.best_loss for step in loop}
-            losses[n, "steps"].append(best[count])
-            losses[n, "time"].append(best[ends[n]])
-            on_stage("refresh", seed * len(REFRESHES) + i + 1, seeds * len(REFRESHES))
-    table = np.array(list(losses.values()))  # settings × seeds
-    own = dict(zip(losses, table - table.mean(0) + table.mean(), strict=True))  # without what a seed's runs share
-    points = []
-    for when in ("steps", "time"):
-        for n in REFRESHES[when == "time" :]:
-            scale = ends[n] / count if when == "time" else 1.0
-            span = tuple(float(scale * bound) for bound in (ratios[n].min(), ratios[n].max()))
-            left = own[n, when]
-            error, between = float(left.mean()), (float(left.min()), float(left.max()))
-            middle = float(scale * np.median(ratios[n]))
-            default = when == "steps" and n == OptimizeSettings().refresh
-            done = count if when == "steps" else ends[n]
-            points.append(Point(f"refresh {n}, {done} steps", middle, error, span, between, default))
-    share = float(np.median(seconds["see"] / (seconds["see"] + seconds["rest"])))
-    return Chart(
-        "refresh",
-        "Steps for which views keep their poses",
-        f"time of the run, relative to {count} steps of refresh 1",
-        f"selection loss (mean and range of {seeds} seeds, without what a seed's runs share)",
-        (Series(f"{views} views a step", tuple(points)),),
-        (f"seeing views anew is {100 * share:.0f} % of a step with the built-in classifier, less with a larger one",),
-    )
-
-
-def _refresh_seconds(problem: Problem) -> dict[str, np.ndarray]:
-    """Times in turn of what a refresh costs and of the rest of a step."""
-    conditions = problem.scene.draw("train", problem.scene.settings.optimize.views)
-    (classifier,), (indices,) = problem.classifiers, problem.indices
-    start = problem.subject.start()
-    pool = problem.see(problem.subject.shown(start), conditions, problem.training_px)
-
-    def rest() -> None:
-        design = start.clone().requires_grad_()
-        logits = classifier.logits(expose(relit(pool, conditions), problem.subject.shown(design)))
-        torch.autograd.grad(target_loss(logits, indices, "assist").mean(), design)
-
-    anew = lambda: problem.see(problem.subject.shown(start), conditions, problem.training_px)  # noqa: E731
-    return timed({"see": anew, "rest": rest}, 9)

@@ -35,7 +35,7 @@ from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import DICTIONARY
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.unroll import explain, rolled, through_lens
-from patchproof.sheet.piece import MODULES, lay_out_piece
+from patchproof.sheets.piece import MODULES, lay_out_piece
 
 SIZE_PX = (1600, 1200)
 LENS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera

@@ -20,8 +20,8 @@ import torch
 from patchproof.bench.chart import Chart, Check, Growth, OnStage, Point, Series, Shares
 from patchproof.bench.measure import median_interval, slope, timed
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.optimize.goals import target_loss
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.fragments import Cameras
 from patchproof.render.photograph import expose
 from patchproof.render.raster import rasterize

@@ -21,7 +21,7 @@ from patchproof.render.fragments import Cameras
 from patchproof.render.pixels import DESIGN_TAPS, PiecePicture
 from patchproof.render.raster import rasterize
 from patchproof.render.texture import Layout, footprint, layout, look_up, texel_table
-from patchproof.sheet.piece import Piece
+from patchproof.sheets.piece import Piece
 
 TAPS = tuple(sorted({1, 2, 4, 6, 8, 12, DESIGN_TAPS}))
 WIDTHS_PX, QUICK_WIDTHS_PX, TILTS_DEG = (20, 45, 70, 110, 200), (20, 70, 200), (0, 60)

@@ -23,11 +23,11 @@ from patchproof.bench.chart import Chart, Interval, OnStage, Point, Series, Tabl
 from patchproof.bench.measure import checked_pick, mean_interval, median_interval, paired_means, timed
 from patchproof.bench.world import demo_problem, set_world, with_settings
 from patchproof.claims import CONFIDENCE
-from patchproof.optimize.goals import target_loss
-from patchproof.optimize.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, start, steps
-from patchproof.optimize.patch import Patch
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, start, steps
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.render.views import Seen
 from patchproof.scene.conditions import draw

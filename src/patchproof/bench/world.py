@@ -15,9 +15,9 @@ from torch import Tensor
 
 from patchproof.bench.chart import OnStage
 from patchproof.journey import demo
-from patchproof.optimize.loop import steps
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.loop import steps
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.patterns import background

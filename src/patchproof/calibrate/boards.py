@@ -19,7 +19,7 @@ import numpy as np
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import luminance
 from patchproof.photo.read import FORMATS, list_photos, read_photo
-from patchproof.sheet.board import Board
+from patchproof.sheets.board import Board
 from patchproof.strict import Refused
 
 FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four

@@ -22,7 +22,7 @@ from patchproof.calibrate.boards import FEWEST_CORNERS, Left, View, see_boards
 from patchproof.calibrate.lens_ladder import NUMBERS, Climbed, Fit, climb, fit_rung
 from patchproof.channel.lens import Camera, check_camera
 from patchproof.output import check_file, make_folder, write_whole
-from patchproof.sheet.board import Board, load_board
+from patchproof.sheets.board import Board, load_board
 from patchproof.strict import Refused
 
 FEWEST_PHOTOS = 6

@@ -34,7 +34,7 @@ from patchproof.channel.printer import (
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import SUFFIXES, read_photo
-from patchproof.sheet.manifest import Manifest
+from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
 
 PRIORS = ("coated", "uncoated")

@@ -23,7 +23,7 @@ from patchproof.photo.detect import Found, find_markers, is_mirrored
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
-from patchproof.sheet.manifest import Manifest
+from patchproof.sheets.manifest import Manifest
 
 LEAST_CORE_PX = 4.0  # a swatch's side between blurred borders
 MOST_CLIPPED = 0.05  # share of the white paper at full white: beyond it nobody knows how light it was

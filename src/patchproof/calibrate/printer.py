@@ -14,7 +14,7 @@ from patchproof.calibrate.icc import bake
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import Printer, save_printer
 from patchproof.output import check_file, make_folder, write_whole
-from patchproof.sheet.manifest import load_manifest
+from patchproof.sheets.manifest import load_manifest
 from patchproof.strict import Refused
 
 

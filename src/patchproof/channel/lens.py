@@ -118,12 +118,6 @@ def undistort_points(points_px: np.ndarray, camera: Camera, size_px: tuple[int, 
     return _from_unit(matrix, _straight(camera, _to_unit(matrix, points_px)))
 
 
-def largest_shift_px(camera: Camera, size_px: tuple[int, int]) -> float:
-    """How far the lens moves a pixel of a picture of this size, at most: what leaving distortion out would cost."""
-    edge = _edge_px(size_px)
-    return float(np.linalg.norm(undistort_points(edge, camera, size_px) - edge, axis=1).max())
-
-
 def pinhole_frame(camera: Camera, size_px: tuple[int, int]) -> Frame:
     """What to render so that `distorted` reads nothing from outside; with no distortion, the picture itself."""
     matrix = matrix_px(camera, size_px)

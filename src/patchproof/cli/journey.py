@@ -87,7 +87,7 @@ def optimize(
     seed: Seed = None,
 ) -> None:
     """Optimise the patch of a scene and promise its rate."""
-    from patchproof.optimize.run import optimize_scene
+    from patchproof.optimizer.run import optimize_scene
     from patchproof.report.summary import promise_lines
 
     with progress() as bar:
@@ -115,7 +115,7 @@ def evaluate(
     cluster: Cluster = None,
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers."""
-    from patchproof.optimize.evaluate import evaluate_run
+    from patchproof.optimizer.evaluate import evaluate_run
     from patchproof.report.summary import evaluation_lines
 
     with progress() as bar:
@@ -145,11 +145,11 @@ def sheet(
     overwrite: Overwrite = False,
 ) -> None:
     """Write the page: design, markers, chart and rulers at true size."""
-    from patchproof.optimize.run import load_run
+    from patchproof.optimizer.run import load_run
     from patchproof.output import check_file
     from patchproof.printing.sheet import blank_page, sheet_of, sheet_of_several
-    from patchproof.sheet.shop import shop_lines
-    from patchproof.sheet.write import check_sheet, manifest_paths
+    from patchproof.sheets.shop import shop_lines
+    from patchproof.sheets.write import check_sheet, manifest_paths
 
     runs = runs or []
     if copies > 1 and len(runs) != 1:
@@ -192,9 +192,9 @@ def reprint(
     overwrite: Overwrite = False,
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
-    from patchproof.optimize.run import load_run
-    from patchproof.reprint.reprint import reprint as reprint_sheet
-    from patchproof.reprint.reprint import scan
+    from patchproof.optimizer.run import load_run
+    from patchproof.reprints.reprint import reprint as reprint_sheet
+    from patchproof.reprints.reprint import scan
 
     scale = pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
@@ -212,7 +212,7 @@ def reprint(
         with progress() as bar:
             taken = {"seed": seed, "on_photo": lambda done, total: bar("photograph", done, total), **printed}
             if card:
-                from patchproof.reprint.card_photo import photograph_cards
+                from patchproof.reprints.card_photo import photograph_cards
 
                 truth = photograph_cards(pdf, made, n, out, **taken)
             else:

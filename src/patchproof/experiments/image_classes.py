@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from patchproof.color import srgb_from_linear
-from patchproof.optimize.pixels import as_pixels
+from patchproof.optimizer.pixels import as_pixels
 from patchproof.render.photograph import shade
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import see

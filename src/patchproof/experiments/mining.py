@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from patchproof.experiments.hard_views import training_conditions
 from patchproof.experiments.heat import heat_map
 from patchproof.experiments.stress_map import (
     Count,
@@ -33,9 +34,9 @@ from patchproof.experiments.stress_map import (
     scene_cells,
     worst_cells,
 )
-from patchproof.optimize.loop import SELECT_VIEWS, best_design, selections
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.loop import SELECT_VIEWS, best_design, selections
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown
 from patchproof.report.tables import Drawing, Table, difference, rate
 from patchproof.scene.conditions import Conditions
@@ -66,46 +67,50 @@ def cells(settings: MiningSettings, base: Path) -> list[Cell]:
 
 def run(settings: MiningSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Map, train twice, measure."""
-    plain, seed = problem_of(cell, base, mine=0), cell.values["seed"]
+    plain, seed = problem_of(cell, base), cell.values["seed"]
     steps_of_mined = equal_steps(plain.scene.settings.optimize, settings.mine)
-    mined = problem_of(cell, base, mine=settings.mine, steps=steps_of_mined)
+    mined = problem_of(cell, base, steps=steps_of_mined)
     both = axes(plain.scene.settings, settings.map)
     hits, confidence = map_of(plain, both, plain.scene.draw("select", settings.map.n, seed + _CHOOSING))
     worst = worst_cells(hits, confidence, plain.scene.settings.target.goal == "assist")
-    things = {"clean": None, "plain": _trained(plain), "mined": _trained(mined)}
+    things = {"clean": None, "plain": _trained(plain), "mined": _trained(mined, settings.mine)}
     drawn = plain.scene.draw("evaluate", settings.n * len(worst) + settings.n_all, seed + _MEASURING)
     return {
         "axes": axes_said(both),
         "rates": hits.mean(2).tolist(),
         "worst": [list(one) for one in worst],
         "steps": {"plain": plain.scene.settings.optimize.steps, "mined": steps_of_mined},
-        "passes": {name: passes(one.scene.settings.optimize) for name, one in (("plain", plain), ("mined", mined))},
+        "passes": {
+            "plain": passes(plain.scene.settings.optimize),
+            "mined": passes(mined.scene.settings.optimize, settings.mine),
+        },
         "in_worst": _hits(plain, things, in_cells(drawn[: settings.n * len(worst)], both, worst)),
         "over_all": _hits(plain, things, drawn[settings.n * len(worst) :]),
     }
 
 
-def passes(settings: OptimizeSettings) -> float:
+def passes(settings: OptimizeSettings, tries: int = 0) -> float:
     """What a training costs, in classifier passes (forward and backward) per classifier."""
-    return _thirds(settings) / BOTH
+    return _thirds(settings, tries) / BOTH
 
 
 def equal_steps(plain: OptimizeSettings, mine: int) -> int:
     """The most steps with which mined training costs no more than training without."""
     for count in range(plain.steps, 0, -1):
-        if _thirds(plain.model_copy(update={"steps": count, "mine": mine})) <= _thirds(plain):
+        if _thirds(plain.model_copy(update={"steps": count}), mine) <= _thirds(plain, 0):
             return count
     raise Refused(f"a training that costs more than {mine} tries", f"{plain.steps} steps", "raise steps or lower mine")
 
 
-def _thirds(settings: OptimizeSettings) -> int:
-    forward = selections(settings) * SELECT_VIEWS + settings.mine
+def _thirds(settings: OptimizeSettings, tries: int) -> int:
+    forward = selections(settings) * SELECT_VIEWS + tries
     return BOTH * settings.steps * settings.views + FORWARD * forward
 
 
-def _trained(problem: Problem) -> Shown:
-    """The best design of the whole loop, in 8 bits."""
-    return problem.subject.shown(from_pixels(best_design(problem), problem.device))
+def _trained(problem: Problem, tries: int = 0) -> Shown:
+    """The best design of the whole loop, in 8 bits; with `tries`, on mined views."""
+    conditions = training_conditions(problem, tries) if tries else None
+    return problem.subject.shown(from_pixels(best_design(problem, conditions), problem.device))
 
 
 def _hits(problem: Problem, things: dict[str, Shown], conditions: Conditions) -> dict[str, str]:

@@ -31,10 +31,10 @@ from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.experiments.image_classes import ImageClass, classes_of, render_class
-from patchproof.optimize.loop import best_design
-from patchproof.optimize.patch import Patch
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Estimate, Table, difference, rate
@@ -50,7 +50,7 @@ from patchproof.settings import (
     TargetSettings,
     ViewSettings,
 )
-from patchproof.sheet.piece import Piece
+from patchproof.sheets.piece import Piece
 from patchproof.strict import Positive, PositiveRange, Range, Refused, Share, Strict, expand, nearest
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trials import clustered, enlarged, grouped, logits_of, png_of, short

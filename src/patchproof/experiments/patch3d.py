@@ -29,10 +29,10 @@ from torch import Tensor
 
 from patchproof.experiments.image_classes import write_labels, write_renders
 from patchproof.geometry import local_scale
-from patchproof.optimize.loop import best_design
-from patchproof.optimize.patch import Patch
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Estimate, Table, difference, rate
@@ -40,7 +40,7 @@ from patchproof.scene.image_scene import largest_share, load_image_scene
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import build_scene
 from patchproof.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings, load_scene_settings
-from patchproof.sheet.piece import sheet_id
+from patchproof.sheets.piece import sheet_id
 from patchproof.strict import Range, Refused, Share, Strict, expand
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trials import clustered, enlarged, grouped, logits_of, passes, png_of, short

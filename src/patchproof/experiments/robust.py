@@ -29,9 +29,9 @@ from patchproof.experiments.turntable import (
     sides,
     turn,
 )
-from patchproof.optimize.loop import best_design
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.promise import judged
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.promise import judged
 from patchproof.report.tables import Drawing, Table
 from patchproof.settings import SceneSettings
 from patchproof.strict import validated

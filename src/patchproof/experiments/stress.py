@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from patchproof.experiments.hard_views import LIGHT, POSE, clean_losses, each_before_all
 from patchproof.experiments.heat import heat_map, picture_strip, position_map, said
 from patchproof.experiments.stress_map import (
     CHUNK,
@@ -38,9 +39,8 @@ from patchproof.experiments.stress_map import (
     verdicts,
     worst_cells,
 )
-from patchproof.optimize.mining import LIGHT, POSE, clean_losses, each_before_all
-from patchproof.optimize.pixels import as_pixels
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.pixels import as_pixels
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table, difference, rate

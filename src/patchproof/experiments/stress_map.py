@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, Conditions
 from patchproof.scene.scene import build_scene

@@ -20,8 +20,8 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.experiments.turntable import contact_sheet, pictures, sides, three_views
-from patchproof.optimize.loop import best_design
-from patchproof.optimize.promise import judged, shown_with_controls
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.promise import judged, shown_with_controls
 from patchproof.report.tables import Drawing, Estimate, Table, rate
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.study import Cell, Result, Study, short_name

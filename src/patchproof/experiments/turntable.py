@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from patchproof.color import srgb_from_linear
-from patchproof.optimize.goals import target_loss
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose, shade
 from patchproof.report.images import png
 from patchproof.scene.conditions import Conditions

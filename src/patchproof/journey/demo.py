@@ -11,11 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from patchproof.journey.verify import verify_photos
-from patchproof.optimize.run import optimize_scene
+from patchproof.optimizer.run import optimize_scene
 from patchproof.output import new_folder
 from patchproof.printing.sheet import sheet_of
 from patchproof.report.summary import promise_lines, verdict_lines
-from patchproof.reprint.reprint import reprint
+from patchproof.reprints.reprint import reprint
 from patchproof.scene.patterns import background
 
 PHOTOS = 40

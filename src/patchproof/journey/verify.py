@@ -16,14 +16,14 @@ from pathlib import Path
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
+from patchproof.evidence.look import WITH_PICTURES
+from patchproof.evidence.results import Evidence, Origin, Report
+from patchproof.evidence.run import LEDGER_PHOTOS, gather_evidence
 from patchproof.output import check_folder
 from patchproof.report.images import save_pictures
 from patchproof.report.write import write_report
-from patchproof.sheet.manifest import Manifest, load_manifest
+from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.strict import Refused
-from patchproof.verify.look import WITH_PICTURES
-from patchproof.verify.results import Evidence, Origin, Report
-from patchproof.verify.run import LEDGER_PHOTOS, gather_evidence
 
 _JOURNAL = "photos.jsonl"
 OWN = ("report.json", "report.csv", "report.html", "pictures", _JOURNAL, ".*.part")

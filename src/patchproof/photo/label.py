@@ -15,7 +15,7 @@ import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.rectify import rectify
-from patchproof.sheet.manifest import PAGE_CODE, Manifest
+from patchproof.sheets.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
 _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template

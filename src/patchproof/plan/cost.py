@@ -1,8 +1,7 @@
 """What one step of optimization costs on this machine, and where the time goes.
 
 In: a problem and a design. Out: `Cost`: median milliseconds of each part over a few steps' views, after a warm-up. The
-parts are those of the loop; what cannot be timed inside of `see` is the difference of two calls of it. Nothing is
-predicted but what keeping views for several steps would save, which is their share of `see`.
+parts are those of the loop; what cannot be timed inside of `see` is the difference of two calls of it.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from patchproof.optimize.goals import target_loss
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.problem import Problem
 from patchproof.render.fragments import Cameras
 from patchproof.render.photograph import expose
 from patchproof.render.raster import rasterize
@@ -24,7 +23,6 @@ from patchproof.scene.conditions import Conditions
 from patchproof.strict import Strict
 
 REPEATS = 5
-REFRESH = (2, 4)
 
 
 class Part(Strict):
@@ -36,17 +34,13 @@ class Part(Strict):
 
 
 class Cost(Strict):
-    """One step of `views` views of `side_px`; `refresh_ms` is the step at `optimize.refresh` = k by k, `see` shared by
-    k steps.
-    """
+    """One step of `views` views of `side_px`."""
 
     views: int
     side_px: int
     threads: int
-    refresh: int
     ms: float
     parts: tuple[Part, ...]
-    refresh_ms: dict[int, float]
 
 
 def measure_cost(
@@ -62,15 +56,12 @@ def measure_cost(
     median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
     total = sum(median.values())
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
-    see_ms = sum(ms for name, ms in median.items() if name.startswith("see"))
     return Cost(
         views=settings.views,
         side_px=problem.training_px,
         threads=torch.get_num_threads(),
-        refresh=settings.refresh,
         ms=total,
         parts=parts,
-        refresh_ms={k: total - see_ms * (1 - 1 / k) for k in REFRESH},
     )
 
 

@@ -20,8 +20,8 @@ from PIL import Image
 from torch import Tensor
 
 from patchproof.classifier.view import center_square
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
 from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
 from patchproof.render.photograph import expose, photograph
 from patchproof.render.views import PiecePicture, Seen, relit, see

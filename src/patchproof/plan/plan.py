@@ -18,9 +18,9 @@ import numpy as np
 from torch import Tensor
 
 from patchproof.geometry import local_scale
-from patchproof.optimize.loop import SELECT_VIEWS, selects, steps
-from patchproof.optimize.pixels import as_pixels, from_pixels
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.loop import SELECT_VIEWS, selects, steps
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.plan.cost import Cost, measure_cost
 from patchproof.plan.errors import TermError, Terms, measure_terms
 from patchproof.plan.samples import Sample, sample_lines, sample_plan
@@ -30,7 +30,7 @@ from patchproof.scene.photo_scene import PhotoScene
 from patchproof.scene.placement import Placement, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.scene import Scene, load_scene
-from patchproof.sheet.piece import MODULES, SMALLEST_MARKER_MM
+from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
 from patchproof.strict import Refused, Strict
 
 TERM_VIEWS = 16
@@ -349,6 +349,4 @@ def _term_line(term: TermError) -> str:
 
 def _cost_lines(cost: Cost) -> list[str]:
     lines = [f"cost of a step ({cost.views} views of {cost.side_px} px, {cost.threads} threads): {cost.ms:.0f} ms"]
-    lines += [f"  {part.name:32} {part.ms:7.0f} ms {part.share:6.1%}" for part in cost.parts]
-    saved = [f"{k}: {ms:.0f} ms (-{1 - ms / cost.ms:.0%})" for k, ms in cost.refresh_ms.items()]
-    return [*lines, f"  with optimize.refresh = {', '.join(saved)}; now {cost.refresh}"]
+    return [*lines, *(f"  {part.name:32} {part.ms:7.0f} ms {part.share:6.1%}" for part in cost.parts)]

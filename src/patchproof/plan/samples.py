@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from patchproof.claims import prediction_interval, wilson
 from patchproof.journey.demo import PHOTOS
-from patchproof.optimize.loop import SELECT_VIEWS
-from patchproof.optimize.promise import PROMISE_VIEWS
+from patchproof.optimizer.loop import SELECT_VIEWS
+from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.strict import Strict
 
 NEXT = 4

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from patchproof import geometry
 from patchproof.channel.printer import identity_printer
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.scene.conditions import Conditions

@@ -20,9 +20,9 @@ from patchproof.render.views import see
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.settings import BackgroundSettings
-from patchproof.sheet.plan_page import Hung
-from patchproof.sheet.template import Template
-from patchproof.sheet.tiles import plan_tiles
+from patchproof.sheets.plan_page import Hung
+from patchproof.sheets.template import Template
+from patchproof.sheets.tiles import plan_tiles
 
 AWAY = 60.0  # of the object's length
 PICTURE_PX = 600  # along the longer side

@@ -13,23 +13,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.optimize.problem import set_problem
-from patchproof.optimize.promise import PROMISE_VIEWS, promise_from, try_out
-from patchproof.optimize.run import Run
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import Scene, build_scene
-from patchproof.sheet.blank import blank_sheet
-from patchproof.sheet.board import board_sheet, is_board
-from patchproof.sheet.chart_page import chart_sheet
-from patchproof.sheet.manifest import Manifest, Promise
-from patchproof.sheet.page import size_text
-from patchproof.sheet.piece import MODULES, control_design, lay_out_piece
-from patchproof.sheet.plan_page import PlanPage, edges_mm
-from patchproof.sheet.several import OneDesign, write_several
-from patchproof.sheet.template import Template, load_template
-from patchproof.sheet.write import write_sheet
+from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.board import board_sheet, is_board
+from patchproof.sheets.chart_page import chart_sheet
+from patchproof.sheets.manifest import Manifest, Promise
+from patchproof.sheets.page import size_text
+from patchproof.sheets.piece import MODULES, control_design, lay_out_piece
+from patchproof.sheets.plan_page import PlanPage, edges_mm
+from patchproof.sheets.several import OneDesign, write_several
+from patchproof.sheets.template import Template, load_template
+from patchproof.sheets.write import write_sheet
 from patchproof.strict import Refused
 
 

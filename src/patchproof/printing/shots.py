@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.claims import CONFIDENCE, independent_difference
+from patchproof.evidence.verdict import judge
 from patchproof.settings import SceneSettings
-from patchproof.sheet.manifest import Promise
-from patchproof.verify.verdict import judge
+from patchproof.sheets.manifest import Promise
 
 POWER = 0.90
 MOST_PHOTOS = 150  # nobody takes more

@@ -37,7 +37,7 @@ _X_MASK, _OFFSET = (1 << _X_BITS) - 1, 1 << (_X_BITS - 1)
 
 
 @torch.no_grad()
-def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float, cull_back: bool = False) -> Fragments:
+def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float) -> Fragments:
     """The nearest face at every pixel center of every camera.
 
     `vertices` V×3 (world mm), `faces` F×3 (counter-clockwise seen from outside). Faces nearer than `near_mm` are cut
@@ -54,7 +54,7 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float,
     nearest = torch.zeros(math.prod(shape), dtype=torch.int64, device=faces.device)
     for view in groups:
         keys = nearest[view * height * width : (view + at_once) * height * width]
-        _settle(keys, _points(vertices, matrix[view : view + at_once]), faces, cameras.size_px, near_mm, cull_back)
+        _settle(keys, _points(vertices, matrix[view : view + at_once]), faces, cameras.size_px, near_mm)
     fragments = _allocated(nearest, shape)
     del nearest
     slopes = [fragments.slopes]
@@ -76,9 +76,7 @@ def _points(vertices: Tensor, matrix: Tensor) -> Tensor:
     return m[:, :, 0] * x + m[:, :, 1] * y + m[:, :, 2] * z + m[:, :, 3]
 
 
-def _settle(
-    nearest: Tensor, points: Tensor, faces: Tensor, size_px: tuple[int, int], near: float, cull_back: bool
-) -> None:
+def _settle(nearest: Tensor, points: Tensor, faces: Tensor, size_px: tuple[int, int], near: float) -> None:
     """Leave in `nearest` the greatest key at each of N·H·W pixels, 0 where nothing is seen."""
     width, height = size_px
     snapped = _snapped(points.flatten(1), near)
@@ -86,9 +84,7 @@ def _settle(
         block = faces[start : start + CHUNK]
         index = _corner_index(points, block)
         owner, corners = _triangles(points.flatten(1), snapped, index, size_px, near)
-        (_, _, plane), volume = _planes(_taken(points, [i.index_select(0, owner) for i in index]), near)
-        if cull_back:
-            corners = [corner * (volume < 0) for corner in corners]  # to a point: it has no rows
+        (_, _, plane), _ = _planes(_taken(points, [i.index_select(0, owner) for i in index]), near)
         first_pixel = owner // len(block) * (height * width)
         face_key = _FACE_MASK - start - owner % len(block)  # the lower face has the greater key
         trapezoids = _trapezoids(corners, height)

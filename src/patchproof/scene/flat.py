@@ -20,7 +20,7 @@ from patchproof.geometry import local_scale, scaled_about
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings
-from patchproof.sheet.piece import MODULES, Piece
+from patchproof.sheets.piece import MODULES, Piece
 from patchproof.strict import Refused
 
 VIEWS_TRIED = 256  # for figures over a scene's views

@@ -26,9 +26,9 @@ from patchproof.photo.read import read_photo
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
-from patchproof.settings import SceneSettings
-from patchproof.sheet.page import largest_piece_mm
-from patchproof.sheet.piece import (
+from patchproof.settings import SceneSettings, identifying
+from patchproof.sheets.page import largest_piece_mm
+from patchproof.sheets.piece import (
     MODULES,
     SMALLEST_MARKER_MM,
     Piece,
@@ -37,7 +37,7 @@ from patchproof.sheet.piece import (
     marker_size_mm,
     sheet_id,
 )
-from patchproof.sheet.template import load_template
+from patchproof.sheets.template import load_template
 from patchproof.strict import Refused, expand
 
 SPLIT_FROM = 20
@@ -137,7 +137,7 @@ class ImageScene:
         return np.full(len(conditions), np.nan)
 
 
-def load_image_scene(settings: SceneSettings, base: Path, seed: int) -> ImageScene:
+def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> ImageScene:
     """The scene of a folder of images and their labels; images that cannot be read are warned about.
 
     The target's label counts as an image's where it is the CSV's own text, one of its comma-separated names, or the
@@ -146,7 +146,7 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int) -> ImageSce
     flat.refuse_bending(settings)
     files = _files_of_class(settings, base)
     images, unread = _read_all(files, settings.camera.photo_px)
-    identity = sheet_id(settings.model_dump(mode="json"), seed)
+    identity = identity or sheet_id(identifying(settings), seed)
     piece = _piece(settings, identity)
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
     if len(images) < SPLIT_FROM:

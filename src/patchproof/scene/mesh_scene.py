@@ -23,11 +23,11 @@ from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.placement import Frame, Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
 from patchproof.scene.texture import Canvas, texture_canvas
-from patchproof.settings import SceneSettings
-from patchproof.sheet.page import largest_piece_mm
-from patchproof.sheet.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
-from patchproof.sheet.template import load_template
-from patchproof.sheet.tiles import plan_tiles
+from patchproof.settings import SceneSettings, identifying
+from patchproof.sheets.page import largest_piece_mm
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
+from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import plan_tiles
 from patchproof.strict import Refused, expand
 
 _VIEWS_TRIED = 1024
@@ -106,11 +106,11 @@ class MeshScene:
         return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
 
 
-def load_mesh_scene(settings: SceneSettings, base: Path, seed: int) -> MeshScene:
+def load_mesh_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> MeshScene:
     """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
     settings_object, camera = settings.object, settings.camera
     mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up)
-    frame, identity = patch_frame(mesh, settings.patch), sheet_id(settings.model_dump(mode="json"), seed)
+    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings), seed)
     backgrounds = load_backgrounds(settings.background, base)
     calibrated = None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px)
     ground = {"settings": settings, "base": base, "seed": seed, "frame": frame, "backgrounds": backgrounds}

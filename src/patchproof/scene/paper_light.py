@@ -18,7 +18,7 @@ from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import CLIPPED_CODE
-from patchproof.sheet.piece import Piece
+from patchproof.sheets.piece import Piece
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
 _MOST_CLIPPED = 0.5  # share of the white paper

@@ -32,12 +32,12 @@ from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.scene.resolution import design_grid
-from patchproof.settings import SceneSettings
-from patchproof.sheet.blank import blank_piece_mm
-from patchproof.sheet.manifest import Manifest, load_manifest
-from patchproof.sheet.page import largest_piece_mm
-from patchproof.sheet.piece import Piece, lay_out_piece, sheet_id
-from patchproof.sheet.template import load_template
+from patchproof.settings import SceneSettings, identifying
+from patchproof.sheets.blank import blank_piece_mm
+from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.page import largest_piece_mm
+from patchproof.sheets.piece import Piece, lay_out_piece, sheet_id
+from patchproof.sheets.template import load_template
 from patchproof.strict import Refused, expand
 
 LEAST_PHOTOS = 6
@@ -135,7 +135,7 @@ class PhotoScene:
         return [flat.turned(roll, zoom, shift, middle) for roll, zoom, shift in views]
 
 
-def load_photo_scene(settings: SceneSettings, base: Path, seed: int) -> PhotoScene:
+def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> PhotoScene:
     """The scene of a folder of photographs; those that cannot be used are warned about, fewer than six are refused.
 
     The scene's settings have the blank's `width_mm` and `height_mm`, also where the file gave none.
@@ -146,7 +146,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int) -> PhotoSce
     settings = _with_size(settings, design_mm)
     folder = Path(expand(settings.object.photos, base))
     known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
-    identity = sheet_id(settings.model_dump(mode="json") | known, seed)
+    identity = identity or sheet_id(identifying(settings) | known, seed)
     piece = lay_out_piece(design_mm, marker_mm, identity, "design")
     _refuse_larger_than_page(settings, piece)
     photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)

@@ -23,11 +23,11 @@ def load_scene(path: str | Path, seed: int | None = None) -> Scene:
     return build_scene(load_scene_settings(path), path.resolve().parent, seed)
 
 
-def build_scene(settings: SceneSettings, base: Path, seed: int | None = None) -> Scene:
-    """The scene of settings whose paths are relative to `base`."""
+def build_scene(settings: SceneSettings, base: Path, seed: int | None = None, identity: str | None = None) -> Scene:
+    """The scene of settings whose paths are relative to `base`; `identity` is the sheet id that it was printed with."""
     seed = settings.optimize.seed if seed is None else seed
     if settings.object.photos is not None:
-        return load_photo_scene(settings, base, seed)
+        return load_photo_scene(settings, base, seed, identity)
     if settings.object.images is not None:
-        return load_image_scene(settings, base, seed)
-    return load_mesh_scene(settings, base, seed)
+        return load_image_scene(settings, base, seed, identity)
+    return load_mesh_scene(settings, base, seed, identity)

@@ -22,9 +22,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.optimize.problem import Problem, set_problem
-from patchproof.optimize.promise import Outcomes
-from patchproof.optimize.texture import Texture
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import Outcomes
+from patchproof.optimizer.texture import Texture
 from patchproof.report.tables import Estimate, difference, mean, rate
 from patchproof.scene.export import write_glb
 from patchproof.scene.scene import Scene, build_scene

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from patchproof.claims import LEAST_CLUSTERS, clustered_mean
-from patchproof.optimize import loop
-from patchproof.optimize.problem import Problem
+from patchproof.optimizer import loop
+from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.report.tables import Estimate
 from patchproof.scene.conditions import Conditions

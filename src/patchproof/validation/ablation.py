@@ -24,18 +24,18 @@ from pydantic import Field
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier.network import recognized
-from patchproof.optimize.loop import best_design
-from patchproof.optimize.patch import Patch
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import Problem, set_problem
-from patchproof.optimize.promise import judged
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import judged
 from patchproof.plan.cost import relative_costs
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Seen, see
 from patchproof.report.tables import Drawing, Estimate, Table, mean
-from patchproof.reprint.path_traced import photograph_traced
+from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, Strict, expand, read_toml, validated
@@ -115,8 +115,6 @@ def cells(settings: AblationSettings, base: Path) -> list[Cell]:
     for file in settings.scenes:
         path = Path(expand(file, base))
         scene = validated(SceneSettings, read_toml(path), path.name)
-        # views are relit where they keep their poses, which would put effects back in
-        scene = scene.model_copy(update={"optimize": scene.optimize.model_copy(update={"refresh": 1})})
         for network in settings.networks:
             for seed in settings.seeds:
                 for effect in (ALL, *settings.effects):

@@ -126,10 +126,10 @@ class _Hall:
 
     def found(self, srgb, focal_px, truth) -> dict[str, Any]:
         """The entry's figures and, where there is a homography, the design's corner errors."""
+        from patchproof.evidence.camera import view_of
+        from patchproof.evidence.measure import measure
+        from patchproof.evidence.ranges import promised_ranges
         from patchproof.photo.read import Photo
-        from patchproof.verify.camera import view_of
-        from patchproof.verify.measure import measure
-        from patchproof.verify.ranges import promised_ranges
 
         view = view_of(Photo(srgb, focal_px, Path("photo.jpg")), None)
         entry = measure(view, "photo.jpg", self.surface, None, promised_ranges(())).entry
@@ -148,14 +148,14 @@ class _Hall:
 
 @lru_cache(maxsize=1)
 def _hall(scene_path: str, seed: int) -> _Hall:
+    from patchproof.evidence.surface import surface_of
     from patchproof.render.stage import set_stage
-    from patchproof.reprint.reprint import load_printer, printed_piece
+    from patchproof.reprints.reprint import load_printer, printed_piece
     from patchproof.scene.mesh_scene import MeshScene
     from patchproof.scene.scene import load_scene
-    from patchproof.sheet.piece import control_design
-    from patchproof.sheet.template import load_template
-    from patchproof.sheet.write import write_sheet
-    from patchproof.verify.surface import surface_of
+    from patchproof.sheets.piece import control_design
+    from patchproof.sheets.template import load_template
+    from patchproof.sheets.write import write_sheet
 
     scene = load_scene(scene_path, seed)
     if not isinstance(scene, MeshScene) or scene.piece is None or not scene.placement.is_flat:

@@ -25,10 +25,9 @@ from pydantic import Field
 
 from patchproof.channel.printer import IN_GAMUT, Printer, identity_printer, load_printer, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.optimize.goals import printable_colors
-from patchproof.optimize.loop import best_design
-from patchproof.optimize.pixels import from_pixels
-from patchproof.optimize.problem import Problem, set_problem
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import expose
 from patchproof.report.tables import Drawing, Estimate, Table, difference, rate
 from patchproof.scene.scene import Scene, build_scene, load_scene
@@ -47,13 +46,11 @@ class Way:
     printed: bool
     gamut: float = 0.0
     in_gamut: bool = False
-    nps: float = 0.0
 
 
 UNPRINTED = Way("any color (no printer)", printed=False)
 WAYS = (
     UNPRINTED,
-    Way("NPS alone", printed=False, nps=1.0),
     Way("printer's table", printed=True),
     Way("table and gamut term", printed=True, gamut=1.0),
     Way("table and gamut term × 10", printed=True, gamut=10.0),
@@ -137,14 +134,13 @@ def other_printers(known: Printer) -> list[Printer]:
 
 
 def way_problem(problem: Problem, way: Way) -> Problem:
-    """The problem as this way poses it; NPS keeps the colors of the printer that is meant, printed or not."""
+    """The problem as this way poses it."""
     scene = problem.scene
-    changed = {"gamut": way.gamut, "in_gamut": way.in_gamut, "nps": way.nps}
+    changed = {"gamut": way.gamut, "in_gamut": way.in_gamut}
     optimize = scene.settings.optimize.model_copy(update=changed)
     scene = replace(scene, settings=scene.settings.model_copy(update={"optimize": optimize}))
     printer = problem.printer if way.printed else identity_printer()
-    printable = printable_colors(problem.printer).to(problem.device) if way.nps else None
-    subject = replace(problem.subject, scene=scene, printer=printer, printable=printable)
+    subject = replace(problem.subject, scene=scene, printer=printer)
     return replace(problem, scene=scene, printer=printer, subject=subject)
 
 

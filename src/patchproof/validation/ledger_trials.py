@@ -146,8 +146,8 @@ class _Hall:
 
     def judged(self, photos: Sequence[bytes], loss: np.ndarray) -> dict[str, Any]:
         """What `verify` makes of the photographs, each of which lost so much."""
-        from patchproof.verify.ledger import LEAST_PHOTOS, usable
-        from patchproof.verify.run import gather_evidence
+        from patchproof.evidence.ledger import LEAST_PHOTOS, usable
+        from patchproof.evidence.run import gather_evidence
 
         with TemporaryDirectory() as folder:
             for i, photo in enumerate(photos):
@@ -179,12 +179,12 @@ def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
 
     from patchproof.channel.printer import load_printer
     from patchproof.classifier.load import load_classifier
-    from patchproof.optimize.run import load_run
+    from patchproof.evidence.classify import target_indices
+    from patchproof.optimizer.run import load_run
     from patchproof.printing.sheet import sheet_of
     from patchproof.render.stage import set_stage
-    from patchproof.reprint.reprint import DPI_RANGE, OVERSAMPLING
-    from patchproof.sheet.raster import piece_pixels
-    from patchproof.verify.classify import target_indices
+    from patchproof.reprints.reprint import DPI_RANGE, OVERSAMPLING
+    from patchproof.sheets.raster import piece_pixels
 
     made = load_run(folder)
     scene, own_px = made.scene, made.scene.settings.camera.photo_px
@@ -242,7 +242,7 @@ def _wrong_printer(rng: np.random.Generator, hall: _Hall):
     import torch
 
     from patchproof.channel.printer import load_printer
-    from patchproof.reprint.inkjets import draw_inkjet
+    from patchproof.reprints.inkjets import draw_inkjet
 
     which = rng.random()
     if which < 0.2:

@@ -66,9 +66,9 @@ def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise and count of one combination."""
     from patchproof.journey.verify import verify_photos
-    from patchproof.optimize.run import optimize_scene
+    from patchproof.optimizer.run import optimize_scene
     from patchproof.printing.sheet import sheet_of
-    from patchproof.reprint.reprint import reprint
+    from patchproof.reprints.reprint import reprint
     from patchproof.study.trained import scene_of
 
     with tempfile.TemporaryDirectory() as temporary:

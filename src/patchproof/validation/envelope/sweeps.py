@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.optimize.run import load_run
+from patchproof.optimizer.run import load_run
 from patchproof.strict import Finite, Refused, Strict, nearest
 from patchproof.study.study import Cell, Study
 from patchproof.validation.envelope.axes import AXES, MAPS, possible

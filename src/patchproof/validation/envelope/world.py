@@ -24,27 +24,27 @@ from torch import Tensor
 from patchproof import geometry
 from patchproof.channel import lens
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.optimize.problem import Problem, set_problem
-from patchproof.optimize.promise import CHUNK
-from patchproof.optimize.run import Run, load_run
+from patchproof.evidence.camera import ANY_FOCAL_ERROR, EXIF_FOCAL_ERROR, View
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import PromisedRanges
+from patchproof.evidence.surface import Surface, surface_of
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import CHUNK
+from patchproof.optimizer.run import Run, load_run
 from patchproof.photo.read import Photo
 from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import relit, see
-from patchproof.reprint.reprint import DPI_RANGE, OVERSAMPLING
+from patchproof.reprints.reprint import DPI_RANGE, OVERSAMPLING
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import Scene
-from patchproof.sheet.manifest import Manifest
-from patchproof.sheet.raster import piece_pixels
+from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.raster import piece_pixels
 from patchproof.strict import Refused
 from patchproof.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
-from patchproof.verify.camera import ANY_FOCAL_ERROR, EXIF_FOCAL_ERROR, View
-from patchproof.verify.measure import measure
-from patchproof.verify.ranges import PromisedRanges
-from patchproof.verify.surface import Surface, surface_of
 
 _MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
 _TAPE_SRGB = 0.45  # what hides a corner

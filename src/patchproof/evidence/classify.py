@@ -1,0 +1,76 @@
+"""What the networks make of the photographs: the whole photo's centered square, as in training, one by one.
+
+In: a square of every network's input size. Out: `Prediction`s. The target's labels are looked up in each network's own
+list; the promise fixes them for its primary network. No batches: a photograph's figures must not depend on which
+others lie beside it (they did, by 2e-5), and on a processor batches are no faster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from patchproof.evidence.results import Prediction
+from patchproof.sheets.manifest import Manifest, Promise
+from patchproof.strict import Refused
+
+if TYPE_CHECKING:
+    from patchproof.classifier import Classifier
+
+
+def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarray]:
+    """The centered square of an uint8 photograph at each size, float32 3×S×S in [0, 1]."""
+    import torch
+
+    from patchproof.classifier import center_square
+
+    height, width = srgb.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    square = srgb[top : top + side, left : left + side]  # before it becomes float, which takes 4 times the memory
+    photo = torch.from_numpy(np.ascontiguousarray(square.transpose(2, 0, 1))).float().div_(255)[None]
+    with torch.inference_mode():
+        return {size: center_square(photo, size)[0].numpy() for size in sizes_px}
+
+
+def target_indices(model: Classifier, manifest: Manifest) -> tuple[int, ...]:
+    """The labels of `model` that count as recognized; for the promise's primary network those of the promise itself."""
+    from patchproof.classifier import find_labels
+
+    target = manifest.promise.target
+    if model.name == manifest.promise.models[0].name and max(target.indices) < len(model.labels):
+        return target.indices
+    wanted = manifest.settings.get("target", {})
+    return find_labels(model.labels, wanted.get("label", target.label), wanted.get("accept", ()))
+
+
+def check_primary(models: Sequence[Classifier], promise: Promise) -> None:
+    """Refuse a judge other than the one that the promise was made for."""
+    primary = promise.models[0]
+    named = {model.name: model for model in models}
+    if primary.name not in named:
+        raise Refused(f"the promise's own network {primary.name}", ", ".join(named) or "none", f"add {primary.name}")
+    if primary.sha256 is not None and named[primary.name].sha256 != primary.sha256:
+        raise Refused(
+            f"the network {primary.name} that the promise was made for (SHA-256 {primary.sha256[:12]}...)",
+            "another file under that name",
+            "use the same weights, or make the sheet again",
+        )
+
+
+def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray) -> Prediction:
+    """What the network makes of one square of its size, float32 3×S×S."""
+    import torch
+
+    with torch.inference_mode():
+        logits = model.logits(torch.from_numpy(square)[None]).cpu()
+    likely = torch.softmax(logits.double(), 1)[0]
+    best = int(likely.argmax())
+    return Prediction(
+        label=model.labels[best],
+        confidence=float(likely[best]),
+        target_confidence=float(model.confidence(logits, indices)[0]),
+        recognized=bool(model.recognized(logits, indices)[0]),
+    )

@@ -1,0 +1,107 @@
+"""What is finished of a verification, one flushed line per photograph, so that a kill costs the photographs in work.
+
+In: a file of JSON lines and a key that stands for everything a result depends on besides the photograph itself. Out:
+what an earlier run said of a photograph of the same name and the same bytes under the same key. Lines of other keys
+and a last line that was cut short do not count, so a photograph, network, sheet or option that changed since is looked
+at anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import cv2
+import numpy as np
+
+import patchproof
+from patchproof.output import make_folder, write_whole
+
+if TYPE_CHECKING:
+    from patchproof.channel.printer import Printer
+    from patchproof.classifier import Classifier
+    from patchproof.sheets.manifest import Manifest
+
+
+class Journal:
+    """An open file of finished photographs; opening it drops what does not count, or all of it unless `resume`."""
+
+    def __init__(self, path: Path, key: str, resume: bool):
+        make_folder(path.parent)
+        self._key, self._kept = key, {}
+        for line in _lines(path) if resume else ():
+            if isinstance(line, dict) and line.get("key") == key and {"file", "sha256", "said"} <= line.keys():
+                self._kept[line["file"]] = line
+        text = "".join(json.dumps(line) + "\n" for line in self._kept.values())
+        write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+        self._file: TextIO = open(path, "a", encoding="utf-8")
+
+    def find(self, name: str, photo: Path) -> Any:
+        """What was said of the photograph under that name; None where nothing was, or its bytes have changed."""
+        line = self._kept.get(name)
+        return line["said"] if line is not None and line["sha256"] == file_sha256(photo) else None
+
+    def add(self, name: str, photo: Path, said: Any) -> None:
+        """Keep JSON values for the photograph."""
+        line = {"file": name, "sha256": file_sha256(photo), "key": self._key, "said": said}
+        self._file.write(json.dumps(line, allow_nan=False) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Nothing is added after this."""
+        self._file.close()
+
+
+def settings_key(
+    manifest: Manifest, models: Sequence[Classifier], printer: Printer | None, options: dict[str, Any]
+) -> str:
+    """SHA-256 of what a photograph's result depends on besides its bytes.
+
+    A network without a SHA-256 of its own (the user's code) is known by its name alone.
+    """
+    networks = [(model.name, model.sha256, model.input_px) for model in models]
+    said = {
+        "versions": (patchproof.__version__, cv2.__version__, np.__version__),
+        "manifest": manifest.model_dump(mode="json"),
+        "models": networks,
+        "printer": None if printer is None else _printer_sha256(printer),
+        "options": options,
+    }
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def file_sha256(path: Path) -> str | None:
+    """SHA-256 of a file's bytes; None where it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    except OSError:
+        return None
+    return digest.hexdigest()
+
+
+def _printer_sha256(printer: Printer) -> str:
+    digest = hashlib.sha256(repr(printer.paper).encode())
+    for table in (printer.lut, printer.gamut):
+        digest.update(table.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _lines(path: Path) -> list[Any]:
+    """The lines that are JSON; none where there is no file."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
+    found = []
+    for line in text.splitlines():
+        try:
+            found.append(json.loads(line))
+        except ValueError:  # cut short by a kill
+            continue
+    return found

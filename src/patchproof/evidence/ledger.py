@@ -1,0 +1,171 @@
+"""The gap ledger: how much confidence each step from the ideal picture to the photograph costs.
+
+    ideal → gamut → print → light and camera → blur and noise → photo
+
+In: `Shot`s of judged photographs, the manifest, the promise's primary network. Out: a `Ledger`: shares in confidence
+(for a goal of deceiving, confidence gained), mean over photographs, with bootstrap intervals over photographs. Each
+photograph is classified with its piece re-projected under all combinations of four effects on or off (`reproject`),
+and each effect gets its mean cost over all orders of switching them on (Shapley, A Value for n-Person Games, 1953):
+
+    share_k = Σ_{S ∌ k} |S|! (n - |S| - 1)! / n! · (v(S) - v(S ∪ {k}))
+
+`photo` is what remains between all effects on and the photograph itself: shadows, glare, curl, whatever no effect
+explains. Shares sum to the whole, v(nothing on) - v(photograph), and may be negative. "Off" means off by the promise:
+each photograph borrows light and blur from one of the promise's own conditions, so that what was promised is no loss.
+
+Gains and a veil that make paper white and marker black what was promised are light and camera, the rest of a color
+difference is print. Ink lighter than promised and a veil of stray light look alike but for one thing: a veil lies over
+the whole photograph, so what exceeds its darkest place is ink; up to there it counts as light. Without readable
+swatches print and light are one step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from math import factorial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from patchproof.color import linear_from_srgb
+from patchproof.evidence.print_fit import fit_print
+from patchproof.evidence.reproject import Reference, Shot, design_fit, light_fit, squares_with
+from patchproof.evidence.results import Ledger, LedgerShare
+from patchproof.evidence.surface import Promised, Surface, piece_picture, reduced
+from patchproof.sheets.manifest import Manifest
+
+if TYPE_CHECKING:
+    from patchproof.classifier import Classifier
+
+GAMUT, PRINT, LIGHT, BLUR, PHOTO = "gamut", "print", "light_and_camera", "blur_and_noise", "photo"
+PRINT_AND_LIGHT = "print_light_and_camera"
+LEAST_PHOTOS = 5  # below, a bootstrap says nothing
+LEAST_SHARE = 0.05  # a culprit costs at least as much
+_RESAMPLES = 2000
+_USABLE = (None, "clipped", "blurred", "too_small")  # codes of photographs whose homography can still be believed
+
+
+def usable(status: str, code: str | None) -> bool:
+    """Whether the ledger can work with a photograph of that status and code."""
+    return status in ("judged", "measured") and code in _USABLE
+
+
+def ledger_of(
+    shots: Sequence[Shot],
+    manifest: Manifest,
+    surface: Surface,
+    promised: Promised,
+    model: Classifier,
+    indices: tuple[int, ...],
+    confidence: Mapping[str, float],
+) -> Ledger | None:
+    """The ledger of photographs whose own target confidence is `confidence` by file; None where nothing can be said."""
+    conditions = [c for c in manifest.promise.conditions if c.contrast is not None and c.blur_px is not None]
+    if not shots or not conditions or promised.design is None:
+        return None
+    undo = [light_fit(shot, promised) for shot in shots]
+    relative = [fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)]
+    inks = [fit.apply(shot.light.ink) for fit, shot in zip(undo, shots, strict=True)]
+    printed = fit_print(relative, promised.swatches, np.median(inks, axis=0), promised.ink)
+    looks = _looks(manifest, surface, promised, printed)
+    values = []
+    for shot, fit, reference in zip(shots, undo, _references(conditions, shots, manifest, promised), strict=True):
+        print_light = fit if printed is not None else design_fit(shot, promised, surface)
+        squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
+        values.append(_confidences(squares, model, indices))
+    steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
+    seen = np.array([confidence[shot.file] for shot in shots])
+    return _ledger(steps, values, seen, -1.0 if manifest.promise.target.goal == "deceive" else 1.0)
+
+
+def shapley(values: Mapping[tuple[bool, ...], float]) -> np.ndarray:
+    """Mean cost of switching each of k players on, over all orders; `values` has all 2^k combinations."""
+    k = len(next(iter(values)))
+    cost = np.zeros(k)
+    for on in product((False, True), repeat=k):
+        weight = factorial(sum(on)) * factorial(max(k - sum(on) - 1, 0)) / factorial(k)
+        for player in range(k):
+            if not on[player]:
+                cost[player] += weight * (values[on] - values[(*on[:player], True, *on[player + 1 :])])
+    return cost
+
+
+def _ledger(steps, values, seen: np.ndarray, sign: float) -> Ledger:
+    parts = np.array([[*shapley(v), v[(True,) * len(steps)] - own] for v, own in zip(values, seen, strict=True)])
+    parts, names = sign * parts, (*steps, PHOTO)
+    means, resampled = parts.mean(0), None
+    if len(parts) >= LEAST_PHOTOS:
+        picks = np.random.default_rng(0).integers(0, len(parts), (_RESAMPLES, len(parts)))
+        resampled = parts[picks].mean(1)
+    shares = {}
+    for i, name in enumerate(names):
+        interval = None if resampled is None else tuple(float(v) for v in np.quantile(resampled[:, i], (0.025, 0.975)))
+        shares[name] = LedgerShare(share=float(means[i]), interval=interval)
+    ideal = float(np.mean([v[(False,) * len(steps)] for v in values]))
+    return Ledger(shares, _culprit(names, means, resampled), ideal, float(seen.mean()), len(values))
+
+
+def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | None) -> str | None:
+    """The step with the largest share, where resampling hardly ever lets another one be larger.
+
+    Gamut is no candidate: the promise was made with it. What no step explains is none, but stands in the way.
+    """
+    if resampled is None:
+        return None
+    rivals = [i for i, name in enumerate(names) if name != GAMUT]
+    top = max(rivals, key=lambda i: means[i])
+    others = [i for i in rivals if i != top]
+    lead = np.minimum(resampled[:, top] - resampled[:, others].max(1), resampled[:, top])
+    clear = np.quantile(lead, 0.025) > 0 and means[top] >= LEAST_SHARE
+    return names[top] if clear and names[top] != PHOTO else None
+
+
+def _looks(manifest: Manifest, surface: Surface, promised: Promised, printed) -> dict[tuple[bool, ...], np.ndarray]:
+    """The piece's light by (gamut, print), or by (gamut, False) alone where the print is not known."""
+    design = reduced(linear_from_srgb(manifest.design.pixels() / 255.0).astype(np.float32))
+    sent = piece_picture(surface, design, linear_from_srgb(surface.swatches_srgb), np.zeros(3))
+    looks = {
+        (False, False): sent,
+        (True, False): piece_picture(surface, promised.design, promised.swatches, promised.ink),
+    }
+    if printed is not None:
+        looks |= {(gamut, True): printed(look) for (gamut, _), look in list(looks.items())}
+    return looks
+
+
+def _references(conditions, shots: Sequence[Shot], manifest: Manifest, promised: Promised) -> list[Reference]:
+    """One of the promise's conditions for each photograph, spread evenly over their contrasts.
+
+    The brightest photograph gets the brightest, and so on: paired by chance, a few photographs' light share is mostly
+    the luck of the draw.
+    """
+    conditions = sorted(conditions, key=lambda c: c.contrast)
+    spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(conditions)).astype(int)
+    rank = np.argsort(np.argsort([float(np.mean(shot.light.paper - shot.light.ink)) for shot in shots]))
+    camera = manifest.settings.get("camera", {})
+    low, high = camera.get("noise", (0.0, 0.0))
+    noise = low + (high - low) * np.random.default_rng(1).permutation(len(shots) * 2)[: len(shots)] / (2 * len(shots))
+    references = []
+    for shot, i, level in zip(shots, spread[rank], noise, strict=True):
+        side = shot.square.shape[0]
+        scale = side / min(camera["photo_px"]) if "photo_px" in camera else shot.scale
+        white = conditions[i].contrast / (1 - float(promised.ink.mean()))
+        references.append(Reference(white, conditions[i].blur_px * scale, float(level) * scale))
+    return references
+
+
+def _confidences(squares, model: Classifier, indices) -> dict[tuple[bool, ...], float]:
+    """Target confidence by combination; the switch for print is dropped where it was never on."""
+    import torch
+
+    from patchproof.classifier import center_square
+
+    keys = list(squares)
+    with torch.inference_mode():
+        pictures = [torch.from_numpy(squares[key].transpose(2, 0, 1))[None].float() for key in keys]
+        batch = torch.cat([center_square(picture, model.input_px) for picture in pictures])
+        found = model.confidence(model.logits(batch), indices).double().cpu().tolist()
+    if any(key[1] for key in keys):
+        return dict(zip(keys, found, strict=True))
+    return {(gamut, light, blur): v for (gamut, _, light, blur), v in zip(keys, found, strict=True)}

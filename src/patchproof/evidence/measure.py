@@ -1,0 +1,299 @@
+"""One photograph against the printed surface: where it was taken from, how sharp, how far its colours are off.
+
+In: a `Photo`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
+the report. Every figure that can be had is filled in even where a later step fails. A photograph is `rejected` only
+for reasons that do not depend on the view (plus: outside of the promised ranges); where the sheet is identified but
+geometry or colour cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
+and leaving them out would flatter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.evidence.appearance import MOST_CLIPPED, appearance
+from patchproof.evidence.camera import View
+from patchproof.evidence.ranges import PromisedRanges
+from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.scan import is_scan, page_scales
+from patchproof.evidence.surface import Promised, Surface
+from patchproof.geometry import local_scale, plane_pose, view_angles
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.card import card_scale
+from patchproof.photo.card_lines import NoCard
+from patchproof.photo.complete import complete, find_sheet
+from patchproof.photo.detect import Found, find_markers, is_mirrored
+from patchproof.photo.label import read_label, refuse_other_page
+from patchproof.photo.quality import FrameLight, blur_px, frame_light
+from patchproof.photo.ratio import x_over_y
+from patchproof.photo.read import Photo
+from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
+from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
+
+MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighbouring cells melt together
+SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean colour
+MOST_TILT_DEG = 78.0  # foreshortened to a fifth
+MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
+MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
+MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
+MOST_SCALE_ERROR = 0.01
+MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
+# Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
+MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
+_ADVICE = {
+    "blurred": "hold still, tap to focus on the patch, or use more light",
+    "too_small": "come closer or use the camera's full resolution",
+    "tilted": "look at the patch less from the side",
+}
+
+
+_ONLY_UNCUT = "lay the card in its outline on the uncut, flat page, and show the page's own markers"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """An entry without predictions, whether it is counted, pictures by kind, and the light on the frame where seen."""
+
+    entry: PhotoEntry
+    counted: bool
+    pictures: dict[str, np.ndarray]
+    light: FrameLight | None = None
+
+
+def measure(
+    view: View,
+    name: str,
+    surface: Surface,
+    promised: Promised | None,
+    ranges: PromisedRanges,
+    scan_dpi: float | None = None,
+    card: bool = False,
+) -> Measured:
+    """Everything that one readable photograph says; `promised` None leaves colour unmeasured, `card` looks for one."""
+    photo = view.photo
+    try:
+        found, surface = identify(photo.srgb, surface)
+    except CannotJudge as cannot:
+        return Measured(_coded(PhotoEntry(file=name, status="rejected"), cannot), False, {})
+    size_px = photo.srgb.shape[1], photo.srgb.shape[0]
+    entry = PhotoEntry(file=name, status="judged", photo_px=size_px, markers_found=len(found.markers))
+    fit = _fit(found, surface)
+    if fit is None:
+        few = CannotJudge(
+            "too_few_markers", len(found.markers), 1, "the marker in view is distorted: show the whole patch"
+        )
+        return Measured(_coded(entry, few), True, {})
+    light = frame_light(photo.srgb, found.markers.values())
+    unrolled = _unrolled(view.photo, found, surface)
+    srgb, fit = (photo.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
+    entry = _with_geometry(entry, view, found, fit, light, surface)
+    if unrolled is not None:  # no homography maps the page to the photograph
+        figures = {"corner_uncertainty_mm": unrolled.uncertainty_mm, "curl_radius_mm": unrolled.radius_mm}
+        entry = entry.model_copy(update=figures | {"homography_px_from_mm": None, "scale_x_over_y": None})
+    # a lens may keep page and piece from one fit; who lays a card on a page has not cut it
+    page_check = _is_uncut(fit, found, surface) or (card and bool(found.markers.keys() & surface.page_ids))
+    if page_check and surface.page_mm is not None:
+        try:
+            refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
+        except CannotJudge as other:
+            return Measured(_coded(entry.model_copy(update={"status": "rejected"}), other), False, {})
+    if not surface.piece_ids:  # a page that shows none of the design's frame, or a part of it
+        promised = None
+    scan = scan_dpi is not None and is_scan(fit.px_from_mm, surface, scan_dpi)
+    counted = not (page_check or scan)
+    cannot, pictures = _trouble(entry, fit, found, surface), {}
+    if counted:
+        outside = ranges.violated(entry, trust_angles=cannot is None)
+        if outside is not None:
+            return Measured(_coded(entry.model_copy(update={"status": "rejected"}), outside), False, pictures)
+    if cannot is None and promised is not None and promised.design is not None:
+        look = appearance(srgb, fit.px_from_mm, surface, promised, light, entry)
+        entry, pictures = entry.model_copy(update=look.figures), look.pictures
+        if look.clipped > MOST_CLIPPED:
+            advice = "the patch is overexposed: lower the exposure by one or two steps"
+            cannot = CannotJudge("clipped", look.clipped, MOST_CLIPPED, advice)
+    entry = _coded(entry, cannot) if cannot else entry.model_copy(update={"status": "measured"})
+    if scan and cannot is None:
+        entry = _with_scale(entry, *page_scales(fit.px_from_mm, surface, scan_dpi))
+    elif card and cannot is None:
+        flat = page_check and unrolled is None
+        entry = _with_card(entry, view, fit, light, surface) if flat else _not_measured(entry, _ONLY_UNCUT)
+    if not counted and entry.code is None and entry.advice is None:
+        advice = (
+            "a scan checks the print and is not counted"
+            if scan
+            else "a photo of the uncut page checks the print and is not counted"
+        )
+        entry = entry.model_copy(update={"advice": advice})
+    return Measured(entry, counted, pictures, light)
+
+
+def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
+    """The sheet's markers and the surface they lie on: the whole, or one page of a piece in tiles. `CannotJudge` where
+    none is seen, or where it is not clear which sheet it is.
+    """
+    wanted = surface.piece_ids or surface.page_ids
+    if surface.pages:
+        pages = [frozenset(page.corners_mm) for page in surface.pages]
+        found = find_markers(srgb, wanted, surface.all_ids, surface.dictionary, pages)
+    else:
+        found = find_sheet(srgb, wanted, surface.corners_mm, surface.dictionary)
+    if not found.markers:
+        if is_mirrored(srgb, surface.all_ids, surface.dictionary):
+            raise CannotJudge(
+                "mirrored",
+                None,
+                None,
+                "the photo is mirrored: switch off the camera's mirror setting and save it again",
+            )
+        said = read_label(srgb)
+        if found.foreign or (said is not None and said != surface.label):
+            which = "another sheet" if said is None else f"sheet {said.sheet_id} ({said.printed})"
+            advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
+            raise CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
+        raise CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
+    if len(found.foreign) > 1 or len(found.doubled) > 1:
+        others = max(len(found.foreign), len(found.doubled))
+        raise CannotJudge("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
+    if not surface.pages:
+        return found, surface
+    surface = _page_in_view(found, surface)
+    ours = {i: borders for i, borders in found.markers.items() if i in surface.corners_mm}
+    found = Found(ours, found.foreign, found.doubled)
+    return complete(srgb, found, surface.corners_mm, surface.dictionary), surface
+
+
+def _page_in_view(found: Found, surface: Surface) -> Surface:
+    """The page that most of the markers belong to which an assembled piece hides; the whole where there is none."""
+    hidden = [len(found.markers.keys() & page.corners_mm.keys() - surface.corners_mm.keys()) for page in surface.pages]
+    return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
+
+
+def _fit(found: Found, surface: Surface) -> PageFit | None:
+    """The homography of the piece, with the page's own markers where they lie in the same plane."""
+    sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
+    corners = sure or found.corners_px
+    on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
+    try:
+        fit = fit_page(on_piece or corners, surface.corners_mm)
+        if on_piece and len(on_piece) < len(corners):
+            together = fit_page(corners, surface.corners_mm)
+            # a page that hangs elsewhere than its piece would drag the fit away
+            if set(on_piece) <= set(together.inlier_ids):
+                fit = together
+    except (np.linalg.LinAlgError, CannotJudge):
+        return None
+    return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
+
+
+def _unrolled(photo: Photo, found: Found, surface: Surface) -> Unrolled | None:
+    """The piece made flat where its markers do not lie in one plane and a cylinder or a lens says why."""
+    corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in surface.piece_ids}
+    try:
+        return unroll(photo.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, photo.focal_px)
+    except (np.linalg.LinAlgError, ValueError):
+        return None  # a shape that no camera sees is no explanation; the plane's residual decides
+
+
+def _is_uncut(fit: PageFit, found: Found, surface: Surface) -> bool:
+    pages = set(fit.inlier_ids) & surface.page_ids
+    return bool(pages) or not (found.markers.keys() & surface.piece_ids)
+
+
+def _with_geometry(
+    entry: PhotoEntry, view: View, found: Found, fit: PageFit, light: FrameLight, surface: Surface
+) -> PhotoEntry:
+    px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
+    figures = {
+        "residual_mm": fit.residual_mm,
+        "px_per_mm": px_per_mm,
+        "tilt_deg": tilt_deg,
+        "contrast": light.contrast,
+        "blur_px": blur_px(found.markers.values()),
+        "corner_uncertainty_mm": corner_uncertainty_mm(fit, surface.rect_mm),
+        "homography_px_from_mm": tuple(tuple(float(v) for v in row) for row in fit.px_from_mm),
+    }
+    if view.matrix_px is not None:
+        azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
+        angle, length = view_uncertainty(fit, view.matrix_px, surface.center_mm)
+        figures |= {
+            "azimuth_deg": azimuth if angle <= MOST_AZIMUTH_ERROR_DEG else None,
+            "azimuth_uncertainty_deg": angle,
+            "distance_mm": distance if length <= MOST_DISTANCE_ERROR * distance else None,
+        }
+    if view.calibrated:
+        ratio, uncertainty = x_over_y(fit, view.matrix_px, view.focal_error)
+        figures["scale_x_over_y"] = ratio if uncertainty <= MOST_RATIO_ERROR else None
+    return entry.model_copy(update=figures)
+
+
+def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
+    """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
+    side_mm = min(surface.rect_mm[2:])
+    module_px = float(np.median([b.module_px for b in found.markers.values()]))
+    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
+    uncertain = entry.corner_uncertainty_mm > most_uncertain
+    if entry.tilt_deg > MOST_TILT_DEG:
+        return CannotJudge("tilted", entry.tilt_deg, MOST_TILT_DEG, _ADVICE["tilted"])
+    if entry.blur_px > MOST_BLUR * module_px:
+        return CannotJudge("blurred", entry.blur_px, MOST_BLUR * module_px, _ADVICE["blurred"])
+    if side_mm * entry.px_per_mm < SMALLEST_DESIGN_PX:
+        return CannotJudge("too_small", side_mm * entry.px_per_mm, SMALLEST_DESIGN_PX, _ADVICE["too_small"])
+    agreeing = len(fit.inlier_ids)
+    least = min(LEAST_MARKERS, len(surface.piece_ids) or 1)
+    if agreeing < least:
+        advice = "too few markers agree to tell flat paper from bent: show all of the frame"
+        return CannotJudge("too_few_markers", agreeing, least, advice)
+    if entry.residual_mm > MOST_RESIDUAL * side_mm or agreeing < 0.5 * len(found.markers):
+        advice = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
+        return CannotJudge("curled", entry.residual_mm, MOST_RESIDUAL * side_mm, advice)
+    if uncertain and len(found.markers) < 3:
+        return CannotJudge(
+            "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"
+        )
+    if uncertain:
+        return CannotJudge("too_small", entry.corner_uncertainty_mm, most_uncertain, _ADVICE["too_small"])
+    return None
+
+
+def _with_card(entry: PhotoEntry, view: View, fit: PageFit, light: FrameLight, surface: Surface) -> PhotoEntry:
+    """The scale that a bank card in its outline shows, or why it shows none."""
+    if surface.card_mm is None:
+        return _not_measured(entry, "this sheet's JSON names no outline for a card: make the sheet again")
+    matrix, focal_error = view.likely_matrix_px, view.focal_error
+    ratio = x_over_y(fit, matrix, focal_error)
+    try:
+        card = card_scale(
+            view.photo.srgb,
+            fit.px_from_mm,
+            surface.card_mm,
+            surface.printed_mm,
+            matrix,
+            focal_error,
+            entry.blur_px,
+            light.paper,
+            ratio,
+        )
+    except NoCard as reason:
+        return _not_measured(entry, str(reason))
+    return _with_scale(entry.model_copy(update={"scale_uncertainty": card.uncertainty}), card.x, card.y)
+
+
+def _not_measured(entry: PhotoEntry, reason: str) -> PhotoEntry:
+    return entry.model_copy(update={"advice": f"scale not measured: {reason}"})
+
+
+def _with_scale(entry: PhotoEntry, scale_x: float, scale_y: float) -> PhotoEntry:
+    entry = entry.model_copy(update={"scale_x": scale_x, "scale_y": scale_y})
+    worst = max((scale_x, scale_y), key=lambda scale: abs(scale - 1))
+    if abs(worst - 1) <= MOST_SCALE_ERROR:
+        return entry
+    advice = f'it is printed {worst:.3f} times its size: print again at 100 %, "actual size", not "fit to page"'
+    return _coded(entry, CannotJudge("scale_off", worst, MOST_SCALE_ERROR, advice))
+
+
+def _coded(entry: PhotoEntry, cannot: CannotJudge) -> PhotoEntry:
+    codes = {"code": cannot.code, "figure": cannot.figure, "threshold": cannot.threshold, "advice": cannot.advice}
+    return entry.model_copy(update=codes)

@@ -1,0 +1,265 @@
+"""The digital piece put back into its photograph, with each effect of print, light and camera switched on or off.
+
+In: a `Shot` (the centered square of a photograph as a network nearly sees it, and what was measured in it), the piece
+as it could have been printed, and a `Reference`: light and blur of one of the promise's own conditions. Out: the
+square with the piece replaced, frame and all. Light and blur fall on the surroundings, too: there they are undone as
+far as noise allows (Wiener's filter for the known blur). Work is done at three times the network's size at most: finer
+detail is averaged away before the network sees it.
+
+Left out on purpose: JPEG, whose blocks are smaller than a network's pixel in a photograph of usual size; shadows, glare
+and uneven light, which the ledger counts as not explained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from patchproof.color import LUMINANCE, linear_from_srgb, srgb_from_linear
+from patchproof.evidence.appearance import piece_only, seen_swatches
+from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.surface import Promised, Surface
+from patchproof.photo.colorfit import ColorFit, affine12, white_black
+from patchproof.photo.pattern_light import pattern_light
+from patchproof.photo.quality import FrameLight
+from patchproof.photo.rectify import rectify
+
+FINER = 3  # times the network's input size
+_READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
+_CELLS = 16  # of the design, along its shorter side, where its own colors stand in for swatches
+_NOT_BLURRED_PX = 0.1
+_LEAST_AGREEMENT = 0.6  # of marker cells with the print, where right homographies reach 0.9 and more
+_LEAST_NOISE = 0.004  # of linear light: code values and JPEG
+_DARKEST, _PATCH = 0.002, 5  # share of a photograph that noise may bring under its veil, in means over so many pixels
+_SUPERSAMPLE = 2
+_LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph: `square` uint8 W×W×3, millimetres to its pixels, blur in its pixels, noise in linear light.
+
+    `swatches` N×3 are linear light as photographed, NaN where they cannot be read; `scale` is W over the photograph's
+    shorter side.
+    """
+
+    file: str
+    square: np.ndarray
+    px_from_mm: np.ndarray
+    light: FrameLight
+    blur_px: float
+    noise: float
+    swatches: np.ndarray
+    scale: float
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Light and camera of a promised condition: light of white paper, blur in pixels of the square, noise at white."""
+
+    white: float
+    blur_px: float
+    noise: float
+
+
+def shot_of(srgb: np.ndarray, entry: PhotoEntry, light: FrameLight, surface: Surface, input_px: int) -> Shot | None:
+    """What the ledger keeps of an uint8 photograph whose entry has a homography and a blur.
+
+    None where the markers do not lie where the homography says: few blurred corners can turn it far away.
+    """
+    height, width = srgb.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    work = min(side, FINER * input_px)
+    square = srgb[top : top + side, left : left + side]
+    if work < side:
+        square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
+    scale = work / side
+    homography = np.array(entry.homography_px_from_mm)
+    to_square = np.array([[scale, 0, -left * scale], [0, scale, -top * scale], [0, 0, 1.0]])
+    part, part_from_mm = piece_only(srgb, homography, surface)
+    blur_px = entry.blur_px
+    on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
+    unmixed = pattern_light(srgb, homography, on_piece, surface.dictionary, entry.blur_px)
+    if unmixed is not None:
+        if unmixed.agreement < _LEAST_AGREEMENT:
+            return None
+        light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
+    swatches = seen_swatches(part, _LINEAR[part], part_from_mm, surface, blur_px, light.paper)
+    square = np.ascontiguousarray(square)
+    return Shot(entry.file, square, to_square @ homography, light, blur_px * scale, noise_of(square), swatches, scale)
+
+
+def noise_of(srgb: np.ndarray) -> float:
+    """Standard deviation of an uint8 picture's luminance noise, in linear light, read where the picture is smooth.
+
+    Immerkaer, Fast Noise Variance Estimation, CVIU 64 (1996) 300-302, with a low quantile in place of the mean: a
+    fifth of most photographs is smooth, and texture would count as noise.
+    """
+    luminance = (_LINEAR[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # of white noise, it makes 6 times as much
+    detail = np.abs(cv2.filter2D(luminance, -1, mask)[1:-1, 1:-1])
+    return float(np.quantile(detail, 0.2) / 0.2533 / 6)
+
+
+def light_fit(shot: Shot, promised: Promised) -> ColorFit:
+    """From photographed to media-relative light by paper white and what veil of stray light lies over the photograph.
+
+    A veil lifts all of it alike: it is no lighter than the darkest place, nor than makes marker black what was
+    promised. Ink that is lighter still, or darker, is print.
+    """
+    paper, ink = shot.light.paper, shot.light.ink
+    # means, since noise that is cut off at zero lifts dark ink as it lifts them
+    darkest = np.quantile(cv2.blur(_LINEAR[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
+    veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
+    return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
+
+
+def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:
+    """Print, light and camera together, from the design's own coarse colors; paper and ink where these do not do."""
+    cells_per_mm = _CELLS / min(surface.rect_mm[2:])
+    seen = rectify(_LINEAR[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
+    expected = cv2.resize(promised.design, seen.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
+    inner = np.s_[1:-1, 1:-1]  # the rim has the white of the frame in it
+    frame = [[shot.light.paper, shot.light.ink], [np.ones(3), promised.ink]]  # which is put back, too
+    sides = [
+        np.concatenate([a[inner].reshape(-1, 3), *[f] * _CELLS]) for a, f in zip((seen, expected), frame, strict=True)
+    ]
+    fit = affine12(*sides)
+    return fit or light_fit(shot, promised)
+
+
+def squares_with(
+    shot: Shot,
+    looks: Mapping[tuple[bool, bool], np.ndarray],
+    rect_mm: tuple[float, float, float, float],
+    undo: ColorFit,
+    print_light: ColorFit,
+    reference: Reference,
+) -> dict[tuple[bool, bool, bool, bool], np.ndarray]:
+    """Float32 sRGB squares W×W×3 by (gamut, print, light, blur).
+
+    `looks` are the media-relative linear light of the piece at `rect_mm` by (gamut, print). `undo` takes photographed
+    light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
+    """
+    box = _box(shot, rect_mm)
+    seen = _LINEAR[shot.square]
+    around = {}
+    for blur, picture in ((True, seen), (False, deblurred(seen, shot.blur_px, reference.blur_px, shot.noise))):
+        around[True, blur] = picture
+        around[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
+    coded = {key: srgb_from_linear(picture) for key, picture in around.items()}
+    grain = np.random.default_rng(0).standard_normal((*box.shape, 3), np.float32)
+    lit = {True: _inverse(print_light), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
+    out = {}
+    for (gamut, printed), look in looks.items():
+        sharp = _layer(look, shot.px_from_mm, rect_mm, box)
+        for blur, sigma in ((True, shot.blur_px), (False, reference.blur_px)):
+            layer = _blurred(sharp, sigma)
+            share = layer[..., 3:]
+            for light, matrix in lit.items():
+                color = layer[..., :3] @ matrix[:, :3].T + share * matrix[:, 3]
+                mixed = color + (1 - share) * around[light, blur][box.slices]
+                # what the photograph's noise is at the reference's light, and the other way round
+                level = float(np.clip(np.mean(mixed), 0, 1))
+                noise = shot.noise if blur else reference.noise * np.sqrt(level + _READ_SHARE_SQUARE)
+                mixed = mixed + share * noise * grain
+                picture = coded[light, blur].copy()
+                picture[box.slices] = srgb_from_linear(np.clip(mixed, 0, 1))
+                out[gamut, printed, light, blur] = picture
+    return out
+
+
+def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) -> np.ndarray:
+    """Linear light H×W×3 whose Gaussian blur is brought from one sigma to another, by Wiener's filter.
+
+    Power is taken to fall with the square of frequency, as it does in pictures of nearly everything (Field, Relations
+    between the statistics of natural images and the response properties of cortical cells, JOSA A 4, 1987).
+    """
+    if from_px <= to_px:
+        return _blurred(linear, float(np.sqrt(to_px**2 - from_px**2)))
+    margin = int(np.ceil(6 * from_px))
+    wide = cv2.copyMakeBorder(linear, *[margin] * 4, cv2.BORDER_REFLECT)
+    height, width = wide.shape[:2]
+    square = np.fft.fftfreq(height)[:, None] ** 2 + np.fft.rfftfreq(width) ** 2  # cycles per pixel, squared
+    power = np.maximum(linear.var(), 1e-4) / (2 * np.pi * np.log(min(height, width) / 2))
+    transfer = np.exp(-2 * np.pi**2 * from_px**2 * square)
+    wanted = np.exp(-2 * np.pi**2 * to_px**2 * square)
+    gain = wanted * transfer / (transfer**2 + max(noise, _LEAST_NOISE) ** 2 * square / power)
+    back = np.fft.irfft2(np.fft.rfft2(wide, axes=(0, 1)) * gain[..., None], (height, width), axes=(0, 1))
+    return np.clip(back[margin:-margin, margin:-margin], 0, 1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A part of a square."""
+
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.y1 - self.y0, self.x1 - self.x0
+
+    @property
+    def slices(self):
+        return np.s_[self.y0 : self.y1, self.x0 : self.x1]
+
+
+def _box(shot: Shot, rect_mm) -> _Box:
+    """The part of the square that holds the piece and what blur carries beyond it."""
+    from patchproof.geometry import apply_homography, rect_corners
+
+    quad, side = apply_homography(shot.px_from_mm, rect_corners(rect_mm)), shot.square.shape[0]
+    margin = 3 + int(4 * max(shot.blur_px, 2.0))
+    low = np.clip(np.floor(quad.min(0)).astype(int) - margin, 0, side - 1)
+    high = np.clip(np.ceil(quad.max(0)).astype(int) + margin, low + 1, side)
+    return _Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+
+def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: _Box) -> np.ndarray:
+    """H×W×4: the look's light times its share of each pixel, and the share."""
+    x, y, w, h = rect_mm
+    height, width = box.shape
+    look = _no_finer_than(look, px_from_mm, rect_mm)
+    mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
+    to_fine = np.array(
+        [[_SUPERSAMPLE, 0, -_SUPERSAMPLE * box.x0], [0, _SUPERSAMPLE, -_SUPERSAMPLE * box.y0], [0, 0, 1]]
+    )
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centers
+    matrix = np.linalg.inv(half) @ to_fine @ px_from_mm @ mm_from_texel @ half
+    # one texel of margin repeats the rim, so that interpolation does not darken it; the share cuts it off again
+    size = (width * _SUPERSAMPLE, height * _SUPERSAMPLE)
+    color = cv2.warpPerspective(look, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = cv2.warpPerspective(np.ones(look.shape[:2], np.float32), matrix, size, flags=cv2.INTER_LINEAR)
+    share = (inside > 0.5).astype(np.float32)[..., None]
+    fine = np.concatenate([color * share, share], -1)
+    return cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _no_finer_than(look: np.ndarray, px_from_mm: np.ndarray, rect_mm) -> np.ndarray:
+    """The look averaged to about a texel per supersampled pixel, so that warping it does not alias."""
+    from patchproof.geometry import apply_homography, rect_corners
+
+    quad = apply_homography(px_from_mm, rect_corners(rect_mm))
+    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1) * _SUPERSAMPLE
+    width, height = int(np.ceil(max(sides[0], sides[2]))), int(np.ceil(max(sides[1], sides[3])))
+    width, height = min(look.shape[1], max(width, 2)), min(look.shape[0], max(height, 2))
+    return cv2.resize(look.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _blurred(layer: np.ndarray, sigma_px: float) -> np.ndarray:
+    if sigma_px < _NOT_BLURRED_PX:
+        return layer
+    return cv2.GaussianBlur(layer, (0, 0), float(sigma_px), borderType=cv2.BORDER_REPLICATE)
+
+
+def _inverse(fit: ColorFit) -> np.ndarray:
+    """3×4 from media-relative light to photographed light."""
+    back = np.linalg.inv(fit.matrix[:, :3])
+    return np.column_stack([back, -back @ fit.matrix[:, 3]])

@@ -1,0 +1,31 @@
+"""What the optimizer wants, as losses to descend on.
+
+In: logits and label indices, or a design. Out: scalars. Goals add. The target term is the cross-entropy of the *summed*
+probability of all accepted labels, the quantity that is reported as confidence; for `deceive`, of its complement.
+
+The paper's printed update Θ + α∇L raises the loss (Pestana et al., Algorithm 1); recognition needs the descent done
+here. TV: Mahendran and Vedaldi, CVPR 2015.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def target_loss(logits: Tensor, indices: Sequence[int], goal: str) -> Tensor:
+    """N losses: -log p of the accepted labels (`assist`) or of all others (`deceive`), in float64 so that none
+    saturates.
+    """
+    log_p = torch.log_softmax(logits.double(), 1)
+    wanted = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
+    wanted[list(indices)] = True
+    return -torch.logsumexp(log_p[:, wanted if goal == "assist" else ~wanted], 1)
+
+
+def total_variation(design_srgb: Tensor) -> Tensor:
+    """Mean absolute difference of neighboring pixels of a 3×h×w design."""
+    across = (design_srgb[:, :, 1:] - design_srgb[:, :, :-1]).abs().mean()
+    return across + (design_srgb[:, 1:] - design_srgb[:, :-1]).abs().mean()

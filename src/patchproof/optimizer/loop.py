@@ -1,0 +1,176 @@
+"""The loop: draw conditions, photograph the piece, descend.
+
+In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's
+business. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
+PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every so many views the design is tried on a
+fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
+promise set is never touched here.
+
+A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.optimizer.goals import target_loss
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.render.photograph import expose
+from patchproof.render.views import Seen
+from patchproof.scene.conditions import Conditions
+from patchproof.settings import OptimizeSettings
+from patchproof.strict import Refused
+
+SELECT_AFTER = 120  # training views
+SELECT_VIEWS = 64
+SELECT_CHUNK = 16
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that the next step depends on; designs 3×h×w, Adam's moments by level."""
+
+    number: int
+    design: Tensor
+    mean: tuple[Tensor, ...]
+    square: tuple[Tensor, ...]
+    best: Tensor
+    best_loss: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step did. Rates and confidence are over this step's training views; `select_*` where the design was
+    tried.
+    """
+
+    state: State
+    loss: float
+    confidence: float
+    rate: float
+    gradient: float  # the classifiers' largest, penalties apart; 0 means that they no longer tell designs apart
+    select_loss: float | None = None
+    select_rate: float | None = None
+    pictures: Tensor | None = field(default=None, repr=False)
+
+
+def start(problem: Problem) -> State:
+    """The state before the first step."""
+    design = problem.subject.start()
+    zeros = tuple(torch.zeros_like(level) for level in problem.subject.levels(design))
+    return State(0, design, zeros, zeros, design)
+
+
+def selects(settings: OptimizeSettings, number: int) -> bool:
+    """Whether the design is tried on the selection set after step `number`, counted from 1."""
+    done, before = (n * settings.views // SELECT_AFTER for n in (number, number - 1))
+    return done > before or number == settings.steps
+
+
+def selections(settings: OptimizeSettings) -> int:
+    """How often that is in all steps."""
+    return sum(selects(settings, number) for number in range(1, settings.steps + 1))
+
+
+def steps(problem: Problem, state: State | None = None, conditions: Conditions | None = None) -> Iterator[Step]:
+    """The steps from `state` (or from the start) to the last one that the scene's settings ask for; `conditions` of all
+    steps, `views` rows each, in place of the draws of the train stream.
+    """
+    state = start(problem) if state is None else state
+    settings = problem.scene.settings.optimize
+    conditions = problem.scene.draw("train", settings.steps * settings.views) if conditions is None else conditions
+    selection = _selection(problem)
+    while state.number < settings.steps:
+        first = state.number * settings.views
+        drawn = conditions[first : first + settings.views]
+        step = _step(problem, state, problem.see(problem.subject.shown(state.design), drawn, problem.training_px))
+        if selects(settings, step.state.number):
+            step = _select(problem, selection, step)
+        state = step.state
+        yield step
+
+
+def best_design(problem: Problem, conditions: Conditions | None = None) -> np.ndarray:
+    """Run the whole loop; the pixels of the design that the selection set liked best."""
+    state = start(problem)
+    for step in steps(problem, state, conditions):
+        state = step.state
+    return problem.subject.pixels(state.best)
+
+
+def _step(problem: Problem, state: State, seen: Seen) -> Step:
+    design = state.design.clone().requires_grad_()
+    pictures = expose(seen, problem.subject.shown(design))
+    losses, confidences, rates = _score(problem, pictures)
+    (gradient,) = torch.autograd.grad(losses, design)
+    largest, penalty = float(gradient.abs().max()), problem.subject.penalty(design)
+    if not math.isfinite(largest):  # one such step would turn the design into nothing for good
+        do = "check its number format: some pictures lead it to infinity"
+        raise Refused("finite gradients", f"{largest} in step {state.number + 1} from the networks", do)
+    if isinstance(penalty, Tensor):
+        gradient = gradient + torch.autograd.grad(penalty, design)[0]
+        penalty = float(penalty.detach())
+    loss = float(losses.detach()) + penalty
+    return Step(_descend(state, gradient, problem), loss, confidences, rates, largest, pictures=pictures.detach())
+
+
+def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
+    """One update of the design, clipped to what it may become."""
+    clipped, settings = problem.subject.clipped, problem.scene.settings.optimize
+    number, step_size = state.number + 1, settings.step_size or problem.subject.STEP_SIZE
+    if settings.optimizer == "sign":
+        design = clipped(state.design - step_size * gradient.sign())
+        return replace(state, number=number, design=design)
+    levels = problem.subject.levels(gradient)
+    mean = tuple(torch.lerp(now, old, _BETAS[0]) for now, old in zip(levels, state.mean, strict=True))
+    square = tuple(torch.lerp(now**2, old, _BETAS[1]) for now, old in zip(levels, state.square, strict=True))
+    updates = [
+        (m / (1 - _BETAS[0] ** number)) / ((v / (1 - _BETAS[1] ** number)).sqrt() + _EPSILON)
+        for m, v in zip(mean, square, strict=True)
+    ]
+    design = clipped(state.design - step_size * problem.subject.joined(updates))
+    return replace(state, number=number, design=design, mean=mean, square=square)
+
+
+def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
+    """Mean loss over classifiers and pictures; mean confidence and rate of the same."""
+    goal = problem.scene.settings.target.goal
+    losses, confidence, rate = [], 0.0, 0.0
+    for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
+        logits = classifier.logits(pictures)
+        losses.append(target_loss(logits, indices, goal).mean())
+        confidence += float(classifier.confidence(logits.detach(), indices).mean())
+        rate += float(classifier.recognized(logits.detach(), indices).double().mean())
+    count = len(losses)
+    return torch.stack(losses).mean(), confidence / count, rate / count
+
+
+def _selection(problem: Problem) -> list[Seen]:
+    """The selection views, seen once and shaded anew for each design."""
+    conditions = problem.scene.draw("select", SELECT_VIEWS)
+    shown = problem.subject.shown(start(problem).design)
+    with torch.no_grad():
+        parts = (conditions[i : i + SELECT_CHUNK] for i in range(0, SELECT_VIEWS, SELECT_CHUNK))
+        return [problem.see(shown, part, problem.training_px) for part in parts]
+
+
+def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
+    """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
+    state = step.state
+    printed = from_pixels(as_pixels(state.design), problem.device)
+    with torch.no_grad():
+        shown = problem.subject.shown(printed)
+        scores = [_score(problem, expose(seen, shown)) for seen in selection]
+    loss = sum(float(score[0]) for score in scores) / len(scores)
+    rate = sum(score[2] for score in scores) / len(scores)
+    if loss < state.best_loss:
+        state = replace(state, best=state.design, best_loss=loss)
+    return replace(step, state=state, select_loss=loss, select_rate=rate)

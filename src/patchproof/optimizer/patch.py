@@ -1,0 +1,117 @@
+"""A patch as the thing that is optimized: a design in its printed piece.
+
+In: a scene with a piece, and its printer. Out: `Patch`: where a design starts, what may become of it, how the whole
+piece looks on paper (design and printed frame, because that is what will hang there), and the pixels that go to the
+printer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.channel.printer import Printer
+from patchproof.optimizer import pyramid
+from patchproof.optimizer.goals import total_variation
+from patchproof.optimizer.pixels import as_pixels
+from patchproof.render.pixels import PiecePicture
+from patchproof.scene.scene import Scene
+from patchproof.sheets.piece import FrameImage, control_design, frame_image, lay_out_piece
+
+# A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
+# and not by others, and the frame, drawn on the same grid, would lose its markers.
+PRINTED_PX_PER_MM = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Designs are 3×h×w in [0, 1] on the optimized grid `design_px` (width, height); each pixel is printed as a
+    block.
+    """
+
+    scene: Scene
+    printer: Printer
+    design_px: tuple[int, int]
+    device: torch.device
+    STEP_SIZE: ClassVar[float] = 0.05
+
+    def start(self) -> Tensor:
+        """A mid-gray design."""
+        width, height = self.design_px
+        return torch.full((3, height, width), 0.5, device=self.device)
+
+    def clipped(self, design: Tensor) -> Tensor:
+        """The nearest design that can be printed; with `in_gamut`, that the printer shows as it is asked to."""
+        if self.scene.settings.optimize.in_gamut:
+            return self.printer.into_gamut(design[None])[0]
+        return design.clamp(0, 1)
+
+    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+        """The gradient's pyramid."""
+        return pyramid.levels(gradient)
+
+    def joined(self, updates: Sequence[Tensor]) -> Tensor:
+        """The update of a design that the pyramid's own add up to."""
+        return pyramid.joined(updates)
+
+    def penalty(self, design: Tensor) -> Tensor | float:
+        """What the scene's settings charge a design for: total variation, colors that the printer misses."""
+        settings = self.scene.settings.optimize
+        cost = settings.tv * total_variation(design) if settings.tv else 0.0
+        if settings.gamut:
+            # ΔE00 / 100: one unit of loss for black in place of white
+            cost = cost + settings.gamut * self.printer.gamut_distance(design[None]).mean() / 100
+        return cost
+
+    def pixels(self, design: Tensor) -> np.ndarray:
+        """The uint8 H×W×3 that goes to the printer."""
+        block = self.printed_px[0] // design.shape[2]
+        return as_pixels(design).repeat(block, 0).repeat(block, 1)
+
+    def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
+        """What the control sheet of this kind prints in place of the design's pixels."""
+        return control_design(kind, pixels, self.scene.sheet_id)
+
+    def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
+        """The printed piece round a design, on the design's own grid (the optimized one, or as printed);
+        differentiable.
+        """
+        height, width = design.shape[1:]
+        frame, printed_frame = self._frame(kind, (width, height))
+        x0, y0, *_ = frame.design_box_px
+        printed = self.printer.apply(design[None])[0].permute(1, 2, 0)
+        rows = torch.cat(
+            [printed_frame[y0 : y0 + height, :x0], printed, printed_frame[y0 : y0 + height, x0 + width :]], 1
+        )
+        picture = torch.cat([printed_frame[:y0], rows, printed_frame[y0 + height :]])
+        return PiecePicture(picture, frame.piece_box_px, (x0, y0, x0 + width, y0 + height))
+
+    @property
+    def design_mm(self) -> tuple[float, float]:
+        """(width, height) of the design on paper."""
+        return self.scene.piece.design_rect_mm[2:]
+
+    @property
+    def printed_px(self) -> tuple[int, int]:
+        """(width, height) of the design as it is printed: in whole blocks of at least PRINTED_PX_PER_MM."""
+        width, height = self.design_px
+        block = math.ceil(PRINTED_PX_PER_MM * max(self.design_mm[0] / width, self.design_mm[1] / height))
+        return width * block, height * block
+
+    @lru_cache(maxsize=8)  # noqa: B019 - a patch lives as long as its run
+    def _frame(self, kind: str, design_px: tuple[int, int]) -> tuple[FrameImage, Tensor]:
+        """The frame of a kind of sheet, as drawn and as printed (H×W×3)."""
+        piece = self.scene.piece
+        if kind != "design":
+            # the control's own marker ids, as they will be printed
+            piece = lay_out_piece(self.design_mm, piece.module_mm * 7, self.scene.sheet_id, kind)
+        frame = frame_image(piece, design_px)
+        sent = torch.tensor(np.asarray(frame.srgb), dtype=torch.float32, device=self.device).permute(2, 0, 1)[None]
+        return frame, self.printer.apply(sent)[0].permute(1, 2, 0)

@@ -1,0 +1,262 @@
+"""A run's folder: what an optimization leaves behind, written so that a kill at any moment loses 120 views at most.
+
+In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
+(one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically). Nothing in it depends on
+the time of day, so that the same seed gives the same bytes on one machine with one thread count and device.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+import patchproof
+from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimizer.result import RESULT_FILES, read_result, save_result
+from patchproof.output import check_folder, make_folder, write_whole
+from patchproof.scene.scene import Scene, build_scene, load_scene
+from patchproof.settings import SceneSettings
+from patchproof.sheets.manifest import Promise
+from patchproof.strict import Refused, validated
+
+_CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
+OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, *RESULT_FILES, "evaluate.json", ".*.part")
+
+
+LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, read back."""
+
+    folder: Path
+    scene: Scene
+    design: np.ndarray  # uint8 h×w×3; of a texture run 1×M×3, as in `optimize.texture.Texture`
+    promise: Promise
+    details: dict[str, Any]
+
+
+def optimize_scene(
+    scene: str | Path | Scene,
+    out: str | Path,
+    *,
+    seed: int | None = None,
+    device: str = "cpu",
+    resume: bool = False,
+    overwrite: bool = False,
+    controls: Sequence[str] = CONTROLS,
+    on_step: Callable[[Step, int], None] = lambda step, total: None,
+    on_promise: Callable[[int, int], None] = lambda done, total: None,
+    on_scene: Callable[[Scene], None] = lambda scene: None,
+) -> Run:
+    """Optimize the patch of a scene or its file into the folder `out` and promise its rate.
+
+    `seed` replaces the file's; `resume` goes on from the checkpoint. A page names the best of `controls`, one at least.
+    """
+    out = Path(out)
+    if not resume:
+        check_folder(out, OWN, overwrite)
+    scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    on_scene(scene)
+    problem = set_problem(scene, device)
+    if not resume:
+        _clear(out)
+    make_folder(out)
+    state = _resumed(out, problem) if resume else start(problem)
+    design = _loop(problem, state, out, on_step)
+    save_result(problem, design, out)
+    promise = _promise(problem, design, controls, on_promise)
+    details = _details(problem, promise, out, device)
+    write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
+    return Run(out, scene, design, promise, details)
+
+
+def load_run(folder: str | Path) -> Run:
+    """A finished run; refused where it is none, or not finished."""
+    folder = Path(folder)
+    if not (folder / _RUN).is_file():
+        begun = (folder / _CHECKPOINT).is_file()
+        do = "finish it with --resume" if begun else "name the folder that optimize wrote"
+        raise Refused("a finished run", f"{'an unfinished one' if begun else 'none'} at {folder}", do)
+    try:
+        details = json.loads((folder / _RUN).read_text(encoding="utf-8"))
+        settings = validated(SceneSettings, details["settings"], str(folder / _RUN))
+        promise = validated(Promise, details["promise"], str(folder / _RUN))
+        base, seed = folder / details["scene_folder"], details["seed"]
+        scene = build_scene(settings, base.resolve(), seed, details["sheet_id"])
+        design = read_result(scene, folder)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, Refused):
+            raise
+        raise Refused("a finished run", f"{folder} that cannot be read ({error})", "optimize again") from error
+    return Run(folder, scene, design, promise, details)
+
+
+def _clear(out: Path) -> None:
+    """Remove an earlier run, now that everything the new one needs has been read."""
+    for name in OWN[:-1]:
+        for path in out.glob(name):
+            path.unlink()
+
+
+def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, int], None]) -> np.ndarray:
+    """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
+    total = problem.scene.settings.optimize.steps
+    _cut_log(out / _LOG, state.number)
+    largest = None
+    with open(out / _LOG, "a", encoding="utf-8") as log:
+        for step in steps(problem, state):
+            state = step.state
+            log.write(json.dumps(_log_line(step)) + "\n")
+            log.flush()
+            if step.select_loss is not None:
+                write_whole(out / _CHECKPOINT, lambda path, state=state: _save(state, problem, path))
+            if state.number == total:
+                write_whole(out / _VIEWS, lambda path, step=step: _contact_sheet(step.pictures).save(path, "PNG"))
+            largest = max(step.gradient, largest or 0.0)
+            on_step(step, total)
+    _doubt(float((state.best - start(problem).design).abs().max()), largest)
+    return problem.subject.pixels(state.best)
+
+
+def _doubt(moved: float, gradient: float | None) -> None:
+    """Warn of a design that is none; `moved` is its largest change, `gradient` the largest of all steps."""
+    if moved > LEAST_MOVE or gradient is None:
+        return
+    why = "give it more optimize.steps or a larger optimize.step_size"
+    if gradient == 0:
+        why = "no network's answer depends on it: do the views show it, and is it large enough in them?"
+    warnings.warn(f"the design is still what it began as: {why}", stacklevel=3)
+
+
+def _promise(
+    problem: Problem, design: np.ndarray, controls: Sequence[str], on_promise: Callable[[int, int], None]
+) -> Promise:
+    done = 0
+
+    def progress(n: int) -> None:
+        nonlocal done
+        done += n
+        on_promise(done, PROMISE_VIEWS)
+
+    conditions = problem.scene.draw("promise", PROMISE_VIEWS)
+    return promise_from(problem, try_out(problem, design, conditions, progress, controls))
+
+
+def _log_line(step: Step) -> dict[str, Any]:
+    line = {
+        "step": step.state.number,
+        "loss": step.loss,
+        "confidence": step.confidence,
+        "rate": step.rate,
+        "gradient": step.gradient,
+    }
+    if step.select_loss is not None:
+        line |= {"select_loss": step.select_loss, "select_rate": step.select_rate}
+    return line
+
+
+def _save(state: State, problem: Problem, path: Path) -> None:
+    from safetensors.torch import save_file
+
+    tensors = {"design": state.design, "best": state.best}
+    tensors |= {f"mean{level}": one for level, one in enumerate(state.mean)}
+    tensors |= {f"square{level}": one for level, one in enumerate(state.square)}
+    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
+    # the loss as text keeps every bit; the sheet id tells whose checkpoint this is
+    note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
+    # one key: safetensors writes several in an order of its own
+    save_file(tensors, path, metadata={"state": json.dumps(note)})
+
+
+def _resumed(out: Path, problem: Problem) -> State:
+    """The checkpoint's state, or the start where there is none; refused where it belongs to another scene or seed."""
+    path = out / _CHECKPOINT
+    if not path.is_file():
+        return start(problem)
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt", device=str(problem.device)) as file:
+            note = json.loads((file.metadata() or {})["state"])
+            design, best = file.get_tensor("design"), file.get_tensor("best")
+            levels = range(len(start(problem).mean))
+            mean, square = (tuple(file.get_tensor(f"{name}{n}") for n in levels) for name in ("mean", "square"))
+        state = State(note["number"], design, mean, square, best, float.fromhex(note["best_loss"]))
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise Refused(
+            "a checkpoint", f"{path} that cannot be read ({error})", "start anew in another folder"
+        ) from error
+    if note.get("sheet_id") != problem.scene.sheet_id:
+        raise Refused(
+            "the checkpoint of this scene and seed",
+            f"one of another in {out}",
+            "resume with the same scene file and seed, or start anew in another folder",
+        )
+    return state
+
+
+def _cut_log(path: Path, number: int) -> None:
+    """Drop log lines after the step that the run goes on from."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[:number] if path.is_file() else []
+    write_whole(path, lambda part: part.write_text("".join(lines), encoding="utf-8"))
+
+
+def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict[str, Any]:
+    scene = problem.scene
+    packages = ("torch", "numpy", "kornia", "trimesh")  # those that pixels depend on
+    return {
+        "sheet_id": scene.sheet_id,
+        "seed": scene.seed,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "versions": {"patchproof": patchproof.__version__} | {name: version(name) for name in packages},
+        "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
+        "settings": scene.settings.model_dump(mode="json"),
+        "printer": problem.printer.provenance | {"method": problem.printer.method},
+        "placement": _placement(scene),
+        "warnings": list(scene.warnings),
+        "select_after_views": SELECT_AFTER,
+        "promise": promise.model_dump(mode="json"),
+    }
+
+
+def _placement(scene: Scene) -> dict[str, Any] | None:
+    """Where the piece lies and how well it fits; None where there is no piece."""
+    if scene.piece is None:
+        return None
+    piece = {
+        "piece_mm": scene.piece.size_mm,
+        "marker_mm": scene.piece.module_mm * 7,
+        "unreadable_share": scene.unreadable_share,
+    }
+    placement = getattr(scene, "placement", None)
+    if placement is None:
+        return piece
+    names = ("family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
+    return piece | {name: getattr(placement, name) for name in names}
+
+
+def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:
+    """The step's training views side by side."""
+    pixels = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+    rows = -(-len(pixels) // columns)
+    count, height, width, _ = pixels.shape
+    blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)
+    grid = np.concatenate([pixels, blank]).reshape(rows, columns, height, width, 3)
+    return Image.fromarray(grid.swapaxes(1, 2).reshape(rows * height, columns * width, 3))

@@ -1,0 +1,208 @@
+"""Ink: page layouts and designs become the bytes of a PDF at true size.
+
+Each marker, and the QR code, is one path of black runs that touch, and a swatch one path of two halves: readers snap
+a lone rectangle to whole pixels but antialias a path of several, which keeps marker corners within hundredths of a
+millimetre. The design is embedded losslessly, pixel for pixel, without interpolation. All colours are sRGB and say
+so: the design's colour space is ICCBased, and the page's DefaultRGB gives vector colours the same one. PrintScaling
+None asks viewers not to scale. Nothing depends on time, place or hash order: equal input gives equal bytes. PDF
+points (1/72 inch, y up) and their conversion exist here alone.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from patchproof.sheets.fonts import font_name
+from patchproof.sheets.page import CUT_LINE_MM, PageLayout
+from patchproof.sheets.piece import marker_rects_mm
+from patchproof.sheets.swatches import RectMm, Srgb
+
+if TYPE_CHECKING:
+    from reportlab.pdfgen.canvas import Canvas
+
+POINTS_PER_MM = 72 / 25.4
+ATTACHMENT = "sheet.json"
+
+
+def numbered(name: str, index: int) -> str:
+    """sheet.json as sheet_1.json, the first of several."""
+    stem, dot, suffix = name.rpartition(".")
+    return f"{stem}_{index + 1}{dot}{suffix}"
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A page and its pictures: (rectangle in mm, uint8 H×W×3 sRGB). Those of `windowed` show in the window alone."""
+
+    layout: PageLayout
+    pictures: tuple[tuple[RectMm, np.ndarray], ...] = ()
+    windowed: tuple[tuple[RectMm, np.ndarray], ...] = ()
+
+
+def page_pdf(layout: PageLayout, design: np.ndarray | None, title: str, manifest_json: str) -> bytes:
+    """One page: the layout, the uint8 H×W×3 design (None leaves white paper) and the manifest attached."""
+    pictures = () if design is None else tuple((rect, design) for rect in layout.designs_mm)
+    return pages_pdf([Printed(layout, pictures)], title, {ATTACHMENT: manifest_json})
+
+
+def pages_pdf(pages: Sequence[Printed], title: str, attachments: dict[str, str]) -> bytes:
+    """The finished PDF of pages of any sizes, with manifests attached by their names."""
+    return _finished(_drawn(pages, title), attachments)
+
+
+def srgb_profile() -> bytes:
+    """An ICC profile of sRGB without the day it was made."""
+    from PIL import ImageCms
+
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    # ICC.1 7.2: bytes 24-35 are date and time (here 2000-01-01), 84-99 the profile's id (zeros: not computed)
+    profile[24:36] = b"".join(value.to_bytes(2, "big") for value in (2000, 1, 1, 0, 0, 0))
+    profile[84:100] = bytes(16)
+    return bytes(profile)
+
+
+def _drawn(pages: Sequence[Printed], title: str) -> bytes:
+    from reportlab import rl_config
+    from reportlab.pdfgen.canvas import Canvas
+
+    buffer = io.BytesIO()
+    before, rl_config.useA85 = rl_config.useA85, 0  # ASCII85 would make the image a quarter larger
+    try:
+        canvas = Canvas(buffer, invariant=1, pdfVersion=(1, 7), pageCompression=1, lang="en")
+        canvas.setTitle(title)
+        canvas.setViewerPreference("PrintScaling", "None")
+        for page in pages:
+            size = tuple(side * POINTS_PER_MM for side in page.layout.page_mm)
+            canvas.setPageSize(size)
+            canvas.setTrimBox((0, 0, *size))
+            canvas.setBleedBox((0, 0, *size))
+            # from here on millimetres with y up
+            canvas.scale(POINTS_PER_MM, POINTS_PER_MM)
+            _draw(canvas, page)
+            canvas.showPage()
+        canvas.save()
+    finally:
+        rl_config.useA85 = before
+    return buffer.getvalue()
+
+
+def _draw(canvas: Canvas, page: Printed) -> None:
+    layout, height = page.layout, page.layout.page_mm[1]
+    _draw_parts(canvas, page.pictures, layout.swatches, layout.markers, height)
+    for rects in (layout.qr_mm, layout.squares_mm):
+        if rects:
+            _fill(canvas, rects, (0.0, 0.0, 0.0), height)
+    if layout.window is not None:
+        x, y, w, h = layout.window.rect_mm
+        canvas.saveState()
+        path = canvas.beginPath()
+        path.rect(x, height - y - h, w, h)
+        canvas.clipPath(path, stroke=0, fill=0)
+        _draw_parts(canvas, page.windowed, layout.window.swatches, layout.window.markers, height)
+        canvas.restoreState()
+    canvas.setStrokeGray(0)
+    for line in layout.ticks:
+        x0, y0, x1, y1 = line.ends_mm
+        canvas.setLineWidth(line.width_mm)
+        canvas.line(x0, height - y0, x1, height - y1)
+    _outlines(canvas, layout)
+    for line in layout.texts:
+        canvas.setFillGray(line.gray)
+        canvas.setFont(font_name(line.bold), line.size_mm)
+        canvas.drawString(line.at_mm[0], height - line.at_mm[1], line.text)
+
+
+def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> None:
+    for rect, pixels in pictures:
+        _image(canvas, pixels, rect, height)
+    for rect, srgb in swatches:
+        x, y, w, h = rect
+        _fill(canvas, [(x, y, w / 2, h), (x + w / 2, y, w / 2, h)], srgb, height)
+    for marker in markers:
+        _fill(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
+
+
+def _outlines(canvas: Canvas, layout: PageLayout) -> None:
+    """The card's outline, and the cut lines just outside of what is cut out."""
+    height = layout.page_mm[1]
+    canvas.setStrokeGray(0.45)
+    if layout.card_mm is not None:
+        x, y, w, h = layout.card_mm
+        canvas.setLineWidth(0.2)
+        canvas.roundRect(x, height - y - h, w, h, layout.card_radius_mm)
+    half = CUT_LINE_MM / 2
+    for x, y, w, h in layout.cuts_mm:
+        canvas.setLineWidth(CUT_LINE_MM)
+        canvas.setDash(2.0, 1.5)
+        canvas.rect(x - half, height - y - h - half, w + 2 * half, h + 2 * half)
+        canvas.setDash()
+
+
+def _image(canvas: Canvas, pixels: np.ndarray, rect: RectMm, height: float) -> None:
+    from PIL import Image
+    from reportlab.lib.utils import ImageReader
+
+    x, y, w, h = rect
+    canvas.drawImage(ImageReader(Image.fromarray(pixels)), x, height - y - h, w, h, mask=None)
+
+
+def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
+    path = canvas.beginPath()
+    for x, y, w, h in rects:
+        path.rect(x, height - y - h, w, h)
+    canvas.setFillColorRGB(*srgb)
+    canvas.drawPath(path, stroke=0, fill=1)
+
+
+def _finished(drawn: bytes, attachments: dict[str, str]) -> bytes:
+    """Colour spaces, attachments and plain metadata, which reportlab cannot write."""
+    import pikepdf
+    from pikepdf import Array, Name
+
+    with pikepdf.open(io.BytesIO(drawn)) as pdf:
+        icc = pdf.make_stream(srgb_profile(), N=3, Alternate=Name.DeviceRGB)
+        space = pdf.make_indirect(Array([Name.ICCBased, icc]))
+        for page in pdf.pages:
+            resources = page.obj.Resources
+            resources.ColorSpace = pikepdf.Dictionary(DefaultRGB=space)
+            for image in resources.get("/XObject", {}).values():
+                image.ColorSpace = space
+        for name, text in attachments.items():
+            pdf.attachments[name] = pikepdf.AttachedFileSpec(
+                pdf,
+                text.encode(),
+                filename=name,
+                mime_type="application/json",
+                relationship=Name.Data,
+                description="geometry and promise of this sheet",
+            )
+        for key in ("/CreationDate", "/ModDate", "/Author", "/Subject", "/Keywords", "/Creator"):
+            if key in pdf.docinfo:
+                del pdf.docinfo[key]
+        _drop_unused_font(pdf)
+        buffer = io.BytesIO()
+        pdf.save(buffer, deterministic_id=True, compress_streams=True)
+    return buffer.getvalue()
+
+
+def _drop_unused_font(pdf: Any) -> None:
+    """Take out Helvetica, which reportlab selects at the top of every page: unused, but not embedded either."""
+    import pikepdf
+
+    fonts = pdf.pages[0].obj.Resources.Font  # one dictionary that all pages share
+    loose = [name for name, font in fonts.items() if "/FontDescriptor" not in font]
+    for page in pdf.pages:
+        content = [
+            instruction
+            for instruction in pikepdf.parse_content_stream(page)
+            if not (str(instruction.operator) == "Tf" and str(instruction.operands[0]) in loose)
+        ]
+        page.Contents = pdf.make_stream(pikepdf.unparse_content_stream(content))
+        for name in loose:
+            if name in page.obj.Resources.Font:
+                del page.obj.Resources.Font[name]

@@ -1,0 +1,159 @@
+"""The last page: where the piece goes on the object, and how to photograph it so that the photographs can tell.
+
+In: a `PlanPage`: a picture of the object with its millimetres, the piece's outline on it, and paragraphs. Out: the
+page. Dimension chains above and beside the picture run from edge to edge of the object's side. The picture is passed
+in; this module knows paper only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
+from patchproof.sheets.page import Box, Line, PageLayout, prove_apart, text_box
+from patchproof.sheets.pdf import Printed
+from patchproof.sheets.swatches import RectMm
+from patchproof.sheets.template import Template, TextLine
+from patchproof.strict import Refused
+
+PICTURE_SHARE = 0.42  # of the page's height at most
+ABOVE_MM, BESIDE_MM = 13.0, 22.0  # for the dimension chains
+HEADING_MM, TEXT_MM, LEADING = 3.2, 2.6, 1.45
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Hung:
+    """The piece on the object, seen straight from its side; millimetres x right, y down."""
+
+    picture: np.ndarray  # uint8 H×W×3
+    picture_mm: RectMm
+    object_mm: RectMm  # the object's extent
+    outline_mm: tuple[Point, ...]  # the piece's cut line
+    seams_mm: tuple[tuple[Point, Point], ...] = ()
+    names_mm: tuple[tuple[Point, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class PlanPage:
+    """A picture, where there is one, and sections of (heading, lines)."""
+
+    hung: Hung | None
+    sections: tuple[tuple[str, tuple[str, ...]], ...]
+
+
+def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> Printed:
+    """The page, of the template's size, proved apart and within its margins."""
+    (width, height), margin = template.page_mm, template.margin_mm
+    texts = [TextLine(at_mm=(margin, margin + 5.4), size_mm=5.2, text="patchproof", bold=True)]
+    texts.append(TextLine(at_mm=(margin + 39, margin + 5.4), size_mm=2.7, text=f"plan of sheet {sheet_id}", gray=0.35))
+    lines, labels, boxes, pictures, top = [], [], [], (), margin + 10.0
+    if plan.hung is not None:
+        drawing = _drawing(plan.hung, (margin, top, width - 2 * margin, PICTURE_SHARE * height))
+        lines, labels, pictures, box = drawing
+        boxes.append(box)
+        top = box.rect_mm[1] + box.rect_mm[3] + 3.0
+    for heading, paragraphs in plan.sections:
+        texts.append(TextLine(at_mm=(margin, top + HEADING_MM), size_mm=HEADING_MM, text=heading, bold=True))
+        top += HEADING_MM * LEADING + 1.2
+        for paragraph in paragraphs:
+            for line in wrapped(paragraph, TEXT_MM, width - 2 * margin):
+                texts.append(TextLine(at_mm=(margin, top + TEXT_MM), size_mm=TEXT_MM, text=line))
+                top += TEXT_MM * LEADING
+            top += 0.9
+        top += 2.0
+    layout = PageLayout(
+        page_mm=template.page_mm,
+        cuts_mm=(),
+        designs_mm=(),
+        markers=(),
+        swatches=(),
+        qr_mm=(),
+        ticks=tuple(lines),
+        card_mm=None,
+        card_radius_mm=0.0,
+        texts=(*texts, *labels),
+        boxes=(*boxes, *(text_box(line) for line in texts)),
+    )
+    prove_apart(layout.boxes, template.page_mm, margin)
+    return Printed(layout, pictures)
+
+
+def wrapped(text: str, size_mm: float, width_mm: float) -> list[str]:
+    """The text in lines no longer than the width."""
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if lines[-1] and text_width_mm(longer, size_mm, False) > width_mm:
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    return lines
+
+
+def _drawing(hung: Hung, room: RectMm):
+    """(lines, labels, pictures, box): the picture with outline and dimension chains, scaled into the room."""
+    x, y, w, h = room
+    left, up, wide, high = hung.picture_mm
+    scale = min((w - BESIDE_MM) / wide, (h - ABOVE_MM) / high)
+    if not scale > 0:
+        raise Refused("a picture of the object", f"one of {wide:g} × {high:g} mm", "leave the plan out")
+    corner = (x + (w - BESIDE_MM - scale * wide) / 2, y + ABOVE_MM)
+
+    def at(point: Point) -> Point:
+        return corner[0] + (point[0] - left) * scale, corner[1] + (point[1] - up) * scale
+
+    closed = zip(hung.outline_mm, (*hung.outline_mm[1:], hung.outline_mm[0]), strict=True)
+    lines = [Line((*at(a), *at(b)), 0.5) for a, b in closed] + [Line((*at(a), *at(b)), 0.25) for a, b in hung.seams_mm]
+    labels = []
+    for point, name in hung.names_mm:
+        cx, cy = at(point)
+        labels.append(
+            TextLine(at_mm=(cx - text_width_mm(name, 2.8, True) / 2, cy + 1.0), size_mm=2.8, text=name, bold=True)
+        )
+    shown = (*corner, scale * wide, scale * high)
+    for more_lines, more_labels in (_chain_above(hung, at, shown), _chain_beside(hung, at, shown)):
+        lines, labels = lines + more_lines, labels + more_labels
+    box = (x, y, w, ABOVE_MM + scale * high)
+    return lines, labels, ((shown, hung.picture),), Box("picture of the object", box)
+
+
+def edges_mm(hung: Hung) -> dict[str, float]:
+    """From the piece's outermost points to the edges of the object's side; negative where the piece goes beyond."""
+    xs, ys = zip(*hung.outline_mm, strict=True)
+    x, y, w, h = hung.object_mm
+    return {"left": min(xs) - x, "right": x + w - max(xs), "top": min(ys) - y, "bottom": y + h - max(ys)}
+
+
+def _chain_above(hung: Hung, at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
+    xs, (x, _, w, _) = [p[0] for p in hung.outline_mm], hung.object_mm
+    stops, names, row = [x, min(xs), max(xs), x + w], ("left edge", "", "right edge"), shown[1] - 2.0
+    lines, labels = [], []
+    for i, (a, b, name) in enumerate(zip(stops, stops[1:], names, strict=False)):
+        start, end = at((a, 0))[0], at((b, 0))[0]
+        lines += [Line((start, row, end, row), 0.2), *(Line((s, row - 1, s, row + 1), 0.2) for s in (start, end))]
+        text = f"{b - a:.0f} mm {'from ' + name if name else 'piece'}"
+        # a row for each, so that narrow parts cannot write over their neighbors
+        middle = (start + end) / 2 - text_width_mm(text, 2.3, False) / 2
+        middle = min(max(middle, shown[0]), shown[0] + shown[2] + BESIDE_MM - text_width_mm(text, 2.3, False))
+        labels.append(TextLine(at_mm=(middle, row - 1.6 - (2 - i) * 3.1), size_mm=2.3, text=text))
+    return lines, labels
+
+
+def _chain_beside(hung: Hung, at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
+    ys, (_, y, _, h) = [p[1] for p in hung.outline_mm], hung.object_mm
+    stops, names, column = [y, min(ys), max(ys), y + h], ("from top", "piece", "from bottom"), shown[0] + shown[2] + 2.0
+    lines, labels, free = [], [], shown[1]
+    for a, b, name in zip(stops, stops[1:], names, strict=False):
+        start, end = at((0, a))[1], at((0, b))[1]
+        lines += [
+            Line((column, start, column, end), 0.2),
+            *(Line((column - 1, s, column + 1, s), 0.2) for s in (start, end)),
+        ]
+        middle = max((start + end) / 2 - 1.2, free)
+        labels.append(TextLine(at_mm=(column + 2, middle + 2.3 * CAP_HEIGHT), size_mm=2.3, text=f"{b - a:.0f} mm"))
+        labels.append(TextLine(at_mm=(column + 2, middle + 2.6 + 2.3 * CAP_HEIGHT), size_mm=2.0, text=name, gray=0.35))
+        free = middle + 2.6 + 2.3 * (CAP_HEIGHT + DESCENT) + 0.6
+    return lines, labels

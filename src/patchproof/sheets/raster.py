@@ -1,0 +1,124 @@
+"""The way back: a sheet's PDF as pixels on an exact millimetre grid, and the manifest that it carries.
+
+In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
+stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the part wanted is first made a page of
+its own whose size is a whole number of pixels; then pixel and millimetre differ by a scale alone.
+Left out on purpose: threads. PDFium is not thread-safe; render in processes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.sheets.manifest import Manifest, Tile
+from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
+from patchproof.strict import Refused, validated
+
+LARGEST_PX = 20_000  # along a side; more would be gigabytes
+
+
+def page_pixels(pdf_path: str | Path, page: int = 1, dpi: float = 150.0) -> np.ndarray:
+    """A page (from 1) with pixel = mm × dpi / 25.4; the last row and column may pass the page's edge."""
+    pdf, opened = _open_page(pdf_path, page)
+    with pdf:
+        points = opened.get_size()
+        size_px = tuple(math.ceil(side / 72 * dpi - 1e-3) for side in points)
+        return _render(opened, (0.0, 0.0, size_px[0] * 72 / dpi, size_px[1] * 72 / dpi), size_px)
+
+
+def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
+    """The piece alone: its cut line is exactly the picture's border, so that pixel = mm × width_px / width_mm.
+
+    The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
+    """
+    size_px = tuple(max(round(side / 25.4 * dpi), 1) for side in manifest.cut_mm[2:])
+    if not manifest.tiles:
+        page = manifest.design.page if manifest.design else 1
+        return _part_pixels(pdf_path, page, manifest.cut_mm, size_px)
+    pixels = np.full((size_px[1], size_px[0], 3), 255, np.uint8)
+    px_per_mm = np.array(size_px) / manifest.cut_mm[2:]
+    for tile in manifest.tiles:
+        start_mm = _piece_from_page(manifest, tile, tile.cut_mm[:2])
+        # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
+        first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
+        last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=size_px)
+        corner = np.array(tile.cut_mm[:2]) + first / px_per_mm - start_mm
+        size = last - first
+        rect = (*corner, *(size / px_per_mm))
+        pixels[first[1] : last[1], first[0] : last[0]] = _part_pixels(pdf_path, tile.page, rect, tuple(size.tolist()))
+    return pixels
+
+
+def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
+    pdf, page = _open_page(pdf_path, number)
+    with pdf:
+        return _render(page, tuple(float(v) * POINTS_PER_MM for v in rect_mm), size_px)
+
+
+def _piece_from_page(manifest: Manifest, tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
+    """A point of a tile's page in piece millimetres."""
+    (_, _, dx), (_, _, dy) = tile.page_from_design_mm
+    frame = np.array(manifest.design.rect_mm[:2]) - manifest.cut_mm[:2] if manifest.design else np.zeros(2)
+    return np.array(point_mm) - (dx, dy) + frame
+
+
+def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
+    """The manifest inside a sheet's PDF; of several designs' page that of `sheet_id`, else the first."""
+    import pikepdf
+
+    _existing(pdf_path)
+    try:
+        with pikepdf.open(pdf_path) as pdf:
+            names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered(ATTACHMENT, i) for i in range(99))})
+            texts = [json.loads(pdf.attachments[name].get_file().read_bytes()) for name in names]
+    except pikepdf.PdfError as error:
+        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
+    except (KeyError, ValueError, RecursionError) as error:
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again") from error
+    if not texts:
+        raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again")
+    manifests = [validated(Manifest, data, f"{name} of {pdf_path}") for name, data in zip(names, texts, strict=True)]
+    return next((one for one in manifests if one.sheet_id == sheet_id), manifests[0])
+
+
+def _existing(pdf_path: str | Path) -> None:
+    if not Path(pdf_path).is_file():
+        raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
+
+
+def _open_page(pdf_path: str | Path, page: int):
+    """The document, to be closed by the caller, and one page of it."""
+    import pypdfium2
+
+    _existing(pdf_path)
+    try:
+        pdf = pypdfium2.PdfDocument(str(pdf_path))
+    except pypdfium2.PdfiumError as error:
+        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
+    if not 1 <= page <= len(pdf):
+        pages = len(pdf)
+        pdf.close()
+        raise Refused(f"a page from 1 to {pages} of {pdf_path}", f"{page}", "ask for another page")
+    return pdf, pdf[page - 1]
+
+
+def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
+    """The rectangle (x, y, width, height from the page's top-left, in points) as exactly that many pixels."""
+    import pypdfium2
+    import pypdfium2.raw as pdfium
+
+    if max(size_px) > LARGEST_PX:
+        raise Refused(f"at most {LARGEST_PX} pixels along a side", f"{max(size_px)}", "lower the resolution")
+    left, _, _, top = page.get_mediabox()
+    x, y, w, h = rect_points
+    box = (left + x, top - y - h, left + x + w, top - y)
+    page.set_mediabox(*box)
+    page.set_cropbox(*box)
+    bitmap = pypdfium2.PdfBitmap.new_native(*size_px, pdfium.FPDFBitmap_BGR)
+    bitmap.fill_rect((255, 255, 255, 255), 0, 0, *size_px)
+    pdfium.FPDF_RenderPageBitmap(bitmap, page, 0, 0, *size_px, 0, pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER)
+    return bitmap.to_numpy().copy()

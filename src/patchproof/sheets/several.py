@@ -1,0 +1,119 @@
+"""Several designs on one page, each with its own piece, markers and manifest.
+
+In: what `write_sheet` takes, once for each design. Out: SHEET.pdf and SHEET_1.json, SHEET_2.json... in the order of the
+designs, all of which the PDF carries. The page has an id of its own and one code for all of them: a code that lists
+three designs or more is too fine to be read at 150 dpi. Frames keep the marker ids that they were promised with. Ids
+come from 1000 by hash, so two sheets may share one; the page's own markers avoid all of them, and in a design's
+manifest the others' markers stand among the page's where nothing else has their id, so that a photograph of the uncut
+page is known as one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from patchproof.sheets.manifest import Manifest, Promise, Swatch, design_sha256
+from patchproof.sheets.page import PageLayout, lay_out_parts, moved, moved_marker, place_pieces, size_text
+from patchproof.sheets.pdf import Printed
+from patchproof.sheets.piece import Piece, hash_order, sheet_id
+from patchproof.sheets.template import Template
+from patchproof.sheets.write import (
+    check_pixels,
+    manifest_paths,
+    pdf_name,
+    printed_design,
+    printed_marker,
+    save_sheets,
+)
+from patchproof.strict import Refused
+
+
+@dataclass(frozen=True)
+class OneDesign:
+    """A piece and what belongs to it."""
+
+    piece: Piece
+    sheet_id: str
+    kind: str
+    design_srgb8: np.ndarray
+    promise: Promise | None
+    settings: dict[str, Any]
+
+
+def write_several(pdf_path: str | Path, template: Template, designs: Sequence[OneDesign]) -> list[Manifest]:
+    """Write the page and a manifest for each design; refused where two of them are the same sheet."""
+    pdf_path = pdf_name(pdf_path)
+    if template.tiles is not None:
+        raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")
+    same = [key for key, count in Counter((one.sheet_id, one.kind) for one in designs).items() if count > 1]
+    if len(designs) < 2:
+        raise Refused("several designs", f"{len(designs)}", "use write_sheet for one")
+    if same:
+        raise Refused("designs of different runs", f"sheet {same[0][0]} twice", "use --copies for more of the same")
+    for one in designs:
+        check_pixels(one.design_srgb8)
+    pieces = [one.piece for one in designs]
+    places = place_pieces(template, pieces)
+    identity = sheet_id({"sheets": [[one.sheet_id, one.kind] for one in designs]}, 0)
+    code = _page_code(identity, designs)
+    page = lay_out_parts(template, pieces, places, _page_ids(designs, template), code, _words(identity, designs))
+    manifests = [_manifest(template, page, designs, places, i, code) for i in range(len(designs))]
+    pictures = tuple((rect, one.design_srgb8) for rect, one in zip(page.designs_mm, designs, strict=True))
+    paths = manifest_paths(pdf_path, len(designs))
+    save_sheets(pdf_path, [Printed(page, pictures)], dict(zip(paths, manifests, strict=True)))
+    return manifests
+
+
+def _page_ids(designs: Sequence[OneDesign], template: Template) -> list[int]:
+    """Ids for the page's own markers that no piece has."""
+    used = {marker.id for one in designs for marker in one.piece.markers}
+    order = hash_order(" ".join(one.sheet_id for one in designs), 1000)
+    return [i for i in order if i not in used][: len(template.marker.corners_mm)]
+
+
+def _page_code(identity: str, designs: Sequence[OneDesign]) -> str:
+    """The page's id, and 16 digits of a SHA-256 over those of its designs."""
+    hashes = "".join(design_sha256(one.design_srgb8) for one in designs)
+    return f"patchproof:{identity}:{hashlib.sha256(hashes.encode()).hexdigest()[:16]}"
+
+
+def _words(identity: str, designs: Sequence[OneDesign]) -> dict[str, str]:
+    sizes = sorted({size_text(one.piece.size_mm) for one in designs})
+    return {
+        "sheet_id": identity,
+        "kind": f"{len(designs)} designs,",
+        "design": " and ".join(sorted({size_text(one.piece.design_rect_mm[2:]) for one in designs})),
+        "piece": " and ".join(sizes),
+    }
+
+
+def _manifest(
+    template: Template, page: PageLayout, designs: Sequence[OneDesign], places, index: int, code: str
+) -> Manifest:
+    """One design's: its own piece first, then everything else on the page whose id cannot be mistaken."""
+    one, corner = designs[index], places[index]
+    own = [moved_marker(marker, corner) for marker in one.piece.markers]
+    counts = Counter(marker.id for marker in page.markers)
+    others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in own]
+    frame = [(moved(rect, corner), srgb) for rect, srgb in one.piece.swatches]
+    chart = [*page.swatches[: template.chart.columns * template.chart.rows], *frame]
+    return Manifest(
+        sheet_id=one.sheet_id,
+        kind=one.kind,
+        page_mm=page.page_mm,
+        design=printed_design(one.design_srgb8, page.designs_mm[index]),
+        markers=tuple(printed_marker(marker) for marker in [*own, *others]),
+        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in chart),
+        cut_mm=page.cuts_mm[index],
+        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
+        page_code=code,
+        promise=one.promise,
+        settings=one.settings,
+    )

@@ -1,0 +1,128 @@
+"""Print templates: pages as data, all in millimetres.
+
+In: the name of a shipped template ("a4") or a TOML file of one's own. Out: a frozen `Template`, every key known and
+every number checked. A template says where things lie and how large they are; what they show (ids, colours, the
+design) comes from elsewhere. Whether its parts lie apart and inside the margins is proved by `page.lay_out_page`,
+with the piece on it.
+Left out on purpose: expressions, inheritance and includes. A page is short enough to be written out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from patchproof.sheets.manifest import Point, Rect
+from patchproof.strict import NotNegative, Positive, Refused, Share, Strict, nearest, read_toml, shipped, validated
+
+Count = Annotated[int, Field(ge=1)]
+
+
+class PieceZone(Strict):
+    """Where on the page the piece may lie."""
+
+    zone_mm: Rect
+
+
+class ChartGrid(Strict):
+    """The colour chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
+
+    corner_mm: Point
+    columns: Annotated[int, Field(ge=4)]
+    rows: Annotated[int, Field(ge=2)]
+    swatch_mm: Annotated[Positive, Field(ge=4)]  # below this a phone's photograph of a whole page has too few pixels
+    gap_mm: NotNegative
+
+
+class Rulers(Strict):
+    """A ruler to the right and one downwards, from their zero ticks."""
+
+    length_mm: Positive
+    x_start_mm: Point
+    y_start_mm: Point
+
+
+class CardOutline(Strict):
+    """The outline that a bank card is laid into."""
+
+    corner_mm: Point
+    size_mm: tuple[Positive, Positive]
+    radius_mm: NotNegative
+
+
+class QrCode(Strict):
+    """The QR code's black square; its quiet zone of 4 modules lies outside."""
+
+    corner_mm: Point
+    size_mm: Positive
+
+
+class PageMarkers(Strict):
+    """The page's own markers by the top-left corners of their black squares; fewer than two would be a poor fix."""
+
+    size_mm: Annotated[Positive, Field(ge=8)]
+    corners_mm: Annotated[tuple[Point, ...], Field(min_length=2)]
+
+
+class BlankPiece(Strict):
+    """The piece of a page that is printed without a design, before there is a scene."""
+
+    design_mm: tuple[Positive, Positive]
+    marker_mm: Annotated[Positive, Field(ge=8)]  # of the frame; smaller ones are lost in photographs
+
+
+class TilePages(Strict):
+    """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
+
+    zone_mm: Rect  # a tile's part of the piece at its largest; what is printed of it starts at the corner
+    overlap_mm: Annotated[Positive, Field(ge=8)]  # the flap that the next tile is glued on; it holds a marker
+    marker_mm: Annotated[Positive, Field(ge=5)]  # for scans and photographs of single pages
+
+
+class TextLine(Strict):
+    """One line of text; {sheet_id}, {kind}, {design} and {piece} are filled in; gray 0 is black."""
+
+    at_mm: Point
+    size_mm: Positive
+    text: str
+    bold: bool = False
+    gray: Share = 0.0
+
+
+class Template(Strict):
+    """A whole template file."""
+
+    page_mm: tuple[Positive, Positive]
+    margin_mm: NotNegative
+    piece: PieceZone | None = None  # none on a page that is a chart alone
+    chart: ChartGrid
+    ruler: Rulers
+    card: CardOutline | None = None
+    qr: QrCode
+    marker: PageMarkers
+    blank: BlankPiece | None = None
+    tiles: TilePages | None = None
+    plan_page: bool = False  # a last page that says where the piece goes and how to photograph it
+    text: tuple[TextLine, ...] = ()
+
+
+def load_template(name_or_file: str | Path) -> Template:
+    """The shipped template of that name, or the one in that file; an unknown name is refused with the nearest."""
+    path = Path(name_or_file)
+    if path.suffix != ".toml":
+        names = template_names()
+        if str(name_or_file) not in names:
+            raise Refused("a print template's name or a .toml file", f'"{name_or_file}"', nearest(str(path), names))
+        path = shipped("print_templates", f"{name_or_file}.toml")
+    template = validated(Template, read_toml(path), str(path))
+    swatches = template.chart.columns * template.chart.rows
+    if swatches < 48:
+        raise Refused(f"at least 48 swatches in the chart of {path}", f"{swatches}", "add columns or rows")
+    return template
+
+
+def template_names() -> list[str]:
+    """The shipped templates' names."""
+    return sorted(path.stem for path in shipped("print_templates").glob("*.toml"))

@@ -1,0 +1,252 @@
+"""A piece larger than the page, cut into tiles that are printed on pages of their own and glued together.
+
+In: a template with a [tiles] table and a piece. Out: `Tile`s (which part of the piece, on which page, where) and their
+page layouts. A tile shows its part of the piece; to the right and below, where another tile follows, a flap of 10 mm
+goes on: the piece's picture for one more millimetre, so that no gap shows where scissors slip, then white paper with a
+marker that the next tile will hide. Each tile has five markers of its own, in flaps and trimmed margins, which tell its
+scan or photograph from any other's; when all is glued, the piece's own frame alone is left to be seen.
+Seams are as even as they can be without cutting through a marker of the frame (nor, where there is room, a swatch).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from patchproof.sheets.fonts import text_width_mm
+from patchproof.sheets.page import (
+    CUT_LINE_MM,
+    MOST_TILES,
+    Box,
+    Line,
+    PageLayout,
+    Parts,
+    Window,
+    grown,
+    marker_rect,
+    moved,
+    moved_marker,
+    prove_apart,
+    quiet_box,
+    size_text,
+    text_box,
+)
+from patchproof.sheets.piece import MODULES, Piece, marker_at
+from patchproof.sheets.swatches import RectMm
+from patchproof.sheets.template import Template, TextLine
+from patchproof.strict import Refused
+
+BLEED_MM = 1.0  # of the piece's picture on a flap
+MARKERS = 5  # of a tile's own: whichever corner is hidden, four are left that surround most of it
+
+
+@dataclass(frozen=True)
+class TilePlan:
+    """A tile: its name (row letter, column number), its part of the piece, and where that lies on its page."""
+
+    name: str
+    part_mm: RectMm  # in piece millimetres
+    corner_mm: tuple[float, float]  # of the part, on the page
+    right: str | None  # the name of the tile that is glued on the right flap
+    below: str | None
+
+    @property
+    def page_from_piece_mm(self) -> tuple[float, float]:
+        """What to add to piece millimetres."""
+        return self.corner_mm[0] - self.part_mm[0], self.corner_mm[1] - self.part_mm[1]
+
+    @property
+    def page_rect_mm(self) -> RectMm:
+        """The part on its page."""
+        return (*self.corner_mm, *self.part_mm[2:])
+
+
+def plan_tiles(template: Template, piece: Piece) -> list[TilePlan]:
+    """The tiles row by row; refused where there are more than marker ids last for."""
+    width, height = template.tiles.zone_mm[2:]
+    xs = _seams(piece, 0, width)
+    ys = _seams(piece, 1, height)
+    columns, rows = len(xs) - 1, len(ys) - 1
+    if columns * rows > MOST_TILES:
+        raise Refused(
+            f"a piece of at most {MOST_TILES} tiles, for which there are marker ids",
+            f"{size_text(piece.size_mm)} mm on {columns} × {rows} = {columns * rows} tiles",
+            "make the patch smaller or choose a template with larger tiles, such as a3_tiles",
+        )
+    names = [[f"{chr(ord('A') + row)}{column + 1}" for column in range(columns)] for row in range(rows)]
+    return [
+        TilePlan(
+            name=names[row][column],
+            part_mm=(xs[column], ys[row], round(xs[column + 1] - xs[column], 6), round(ys[row + 1] - ys[row], 6)),
+            corner_mm=template.tiles.zone_mm[:2],
+            right=names[row][column + 1] if column + 1 < columns else None,
+            below=names[row + 1][column] if row + 1 < rows else None,
+        )
+        for row in range(rows)
+        for column in range(columns)
+    ]
+
+
+def lay_out_tile(template: Template, piece: Piece, tile: TilePlan, ids: Sequence[int], sheet_id: str) -> PageLayout:
+    """One tile's page, proved apart and within the margins; its own markers are the layout's, the piece's lie in
+    the window.
+    """
+    by, part = tile.page_from_piece_mm, tile.page_rect_mm
+    window = (*part[:2], part[2] + (BLEED_MM if tile.right else 0), part[3] + (BLEED_MM if tile.below else 0))
+    flap = template.tiles.overlap_mm
+    cut = (*part[:2], part[2] + (flap if tile.right else 0), part[3] + (flap if tile.below else 0))
+    own = [marker_at(i, at, template.tiles.marker_mm) for i, at in zip(ids, _places(template, part), strict=True)]
+    texts, module = _words(template, tile, part, sheet_id), template.tiles.marker_mm / MODULES
+    boxes = [Box("tile", grown(cut, CUT_LINE_MM)), Box("its picture", window, "tile")]
+    for i, marker in enumerate(own):
+        inside = "tile" if _meets(cut, marker_rect(marker)) else None
+        boxes.append(Box(f"tile marker {i + 1}", quiet_box(marker_rect(marker), module, template), inside))
+    for line in texts:
+        box = text_box(line)
+        boxes.append(Box(box.name, box.rect_mm, "tile" if _meets(cut, box.rect_mm) else None))
+    layout = PageLayout(
+        page_mm=template.page_mm,
+        cuts_mm=(cut,),
+        designs_mm=(moved(piece.design_rect_mm, by),),
+        markers=tuple(own),
+        swatches=(),
+        qr_mm=(),
+        ticks=(),
+        card_mm=None,
+        card_radius_mm=0.0,
+        texts=tuple(texts),
+        boxes=tuple(boxes),
+        window=Window(
+            window,
+            tuple(moved_marker(m, by) for m in piece.markers if _meets(grown(window, 1e-6), _placed(m, by))),
+            tuple((moved(r, by), srgb) for r, srgb in piece.swatches if _meets(window, moved(r, by))),
+        ),
+    )
+    prove_apart(layout.boxes, template.page_mm, template.margin_mm)
+    return layout
+
+
+def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[Parts, RectMm]:
+    """The assembled piece drawn small in a zone: outline, seams and names, and where the design's picture goes."""
+    x, y, w, h = grown(zone_mm, -6.0)
+    scale = min(w / piece.size_mm[0], h / piece.size_mm[1])
+    x, y = x + (w - scale * piece.size_mm[0]) / 2, y + (h - scale * piece.size_mm[1]) / 2
+
+    def small(rect: RectMm) -> RectMm:
+        return tuple(round(v, 3) for v in (x + scale * rect[0], y + scale * rect[1], scale * rect[2], scale * rect[3]))
+
+    lines, texts = [], []
+    for tile in tiles:
+        left, top, width, height = small(tile.part_mm)
+        right, bottom = left + width, top + height
+        lines += [Line((left, top, right, top), 0.25), Line((left, top, left, bottom), 0.25)]
+        lines += [Line((right, top, right, bottom), 0.25), Line((left, bottom, right, bottom), 0.25)]
+        size = min(6.0, height / 3, width / 3)
+        at = (left + (width - text_width_mm(tile.name, size, True)) / 2, top + height / 2 + size / 3)
+        texts.append(TextLine(at_mm=at, size_mm=size, text=tile.name, bold=True))
+    design = small(piece.design_rect_mm)
+    return Parts(tuple(lines), tuple(texts), (Box("plan of the tiles", small((0, 0, *piece.size_mm))),)), design
+
+
+def own_markers(tile: TilePlan, piece: Piece) -> list:
+    """The piece's markers that the tile shows, in page millimetres."""
+    return [
+        moved_marker(m, tile.page_from_piece_mm)
+        for m in piece.markers
+        if _holds_middle(tile.page_rect_mm, _placed(m, tile.page_from_piece_mm))
+    ]
+
+
+def own_swatches(tile: TilePlan, piece: Piece) -> list:
+    """The piece's swatches that lie wholly on the tile, in page millimetres."""
+    rects = [(moved(rect, tile.page_from_piece_mm), srgb) for rect, srgb in piece.swatches]
+    return [(rect, srgb) for rect, srgb in rects if _inside(tile.page_rect_mm, rect)]
+
+
+def _seams(piece: Piece, axis: int, most_mm: float) -> list[float]:
+    """0, the seams along an axis, and the piece's end."""
+    length = round(piece.size_mm[axis], 6)
+    markers = [_span(marker_rect(m), axis, piece.module_mm) for m in piece.markers]
+    swatches = [_span(rect, axis, 0.0) for rect, _ in piece.swatches]
+    fewest = max(math.ceil(length / most_mm - 1e-9), 1)
+    for count in range(fewest, fewest + 3):
+        for blocked in (markers + swatches, markers):
+            seams = [0.0, *(_free(length * i / count, blocked) for i in range(1, count)), length]
+            if all(0 < b - a <= most_mm + 1e-6 for a, b in pairwise(seams)):
+                return seams
+    raise Refused(
+        "a piece that can be cut into tiles without cutting a marker",
+        f"markers of {piece.module_mm * MODULES:.0f} mm on tiles of {most_mm:.0f} mm",
+        "choose a template with larger tiles, such as a3_tiles",
+    )
+
+
+def _span(rect: RectMm, axis: int, room: float) -> tuple[float, float]:
+    return rect[axis] - room, rect[axis] + rect[axis + 2] + room
+
+
+def _free(at: float, blocked: list[tuple[float, float]]) -> float:
+    """The place nearest to `at` that lies in no blocked span, to 0.01 mm."""
+    places = [at, *(end for span in blocked for end in span)]
+    free = [p for p in places if not any(low + 1e-6 < p < high - 1e-6 for low, high in blocked)]
+    return round(min(free, key=lambda p: abs(p - at)), 2)
+
+
+def _places(template: Template, part: RectMm) -> list[tuple[float, float]]:
+    """Corners of a tile's own markers: left and right, above and below, and under the part at the right."""
+    size, (x, y, w, h) = template.tiles.marker_mm, part
+    module = size / MODULES
+    aside = BLEED_MM + module  # from the part's edge: the picture that runs on, and a quiet zone
+    left = x - CUT_LINE_MM - module - size
+    return [
+        (left, y),
+        (left, y + h - size),
+        (x + w + aside, y + module),
+        (x + w + aside, y + h - size - module),
+        (x + w - size - module, y + h + aside),
+    ]
+
+
+def _words(template: Template, tile: TilePlan, part: RectMm, sheet_id: str) -> list[TextLine]:
+    """The tile's name above it, and on its flaps what is glued there."""
+    x, y, w, h = part
+    top = template.margin_mm + 3.4
+    lines = [
+        TextLine(at_mm=(x, top), size_mm=3.6, text=tile.name, bold=True),
+        TextLine(at_mm=(x + 9, top), size_mm=2.2, text=f"patchproof {sheet_id}", gray=0.35),
+        TextLine(at_mm=(x, top + 3.4), size_mm=2.0, text=f"Cut along the dashed line{_and_flaps(tile)}.", gray=0.35),
+    ]
+    if w < 60:  # a narrow tile has room for its name alone
+        lines = lines[:2] if w > 45 else lines[:1]
+    if tile.right:
+        middle = x + w + template.tiles.overlap_mm / 2 + BLEED_MM / 2
+        for i, word in enumerate(("glue", tile.right, "here")):
+            at = (middle - text_width_mm(word, 2.2, False) / 2, y + h / 2 + 3.2 * (i - 1))
+            lines.append(TextLine(at_mm=at, size_mm=2.2, text=word, gray=0.35))
+    if tile.below:
+        at = (x + 4.0, y + h + template.tiles.overlap_mm / 2 + 1.2)
+        lines.append(TextLine(at_mm=at, size_mm=2.2, text=f"glue {tile.below} here", gray=0.35))
+    return lines
+
+
+def _and_flaps(tile: TilePlan) -> str:
+    flaps = [name for name in (tile.right, tile.below) if name]
+    return f"; the white {'flaps go' if len(flaps) > 1 else 'flap goes'} under {' and '.join(flaps)}" if flaps else ""
+
+
+def _placed(marker, by: tuple[float, float]) -> RectMm:
+    return moved(marker_rect(marker), by)
+
+
+def _holds_middle(outer: RectMm, rect: RectMm) -> bool:
+    return all(outer[i] <= rect[i] + rect[i + 2] / 2 < outer[i] + outer[i + 2] for i in (0, 1))
+
+
+def _meets(a: RectMm, b: RectMm) -> bool:
+    return all(a[i] < b[i] + b[i + 2] and b[i] < a[i] + a[i + 2] for i in (0, 1))
+
+
+def _inside(outer: RectMm, rect: RectMm) -> bool:
+    return all(outer[i] <= rect[i] + 1e-6 and rect[i] + rect[i + 2] <= outer[i] + outer[i + 2] + 1e-6 for i in (0, 1))
