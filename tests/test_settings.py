@@ -237,3 +237,15 @@ def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
     plain, spelled = (load_scene_settings(scene(tmp_path, extra=text)) for text in ("", "[optimize]\nsteps = 240"))
     other = load_scene_settings(scene(tmp_path, extra="[optimize]\nsteps = 241"))
     assert identifying(plain) == identifying(spelled) != identifying(other)
+
+
+def test_settings_change_through_a_door_that_checks(tmp_path):
+    plain = load_scene_settings(scene(tmp_path))
+    changed = plain.changed(optimize={"steps": 3}, light={"gloss": (0.1, 0.2)})
+    assert (changed.optimize.steps, changed.light.gloss) == (3, (0.1, 0.2))
+    assert changed.changed(optimize={"steps": 240}, light={"gloss": (0, 0)}) == plain
+    for wrong, named in (({"steps": -3}, "steps"), ({"stepz": 3}, 'did you mean "steps"')):
+        with pytest.raises(Refused, match=named):
+            plain.changed(optimize=wrong)
+    with pytest.raises(Refused, match="optimise"):
+        plain.changed(optimise={"steps": 3})

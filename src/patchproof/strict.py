@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from typing_extensions import Self
 
 
 class Refused(ValueError):
@@ -69,6 +70,17 @@ class Strict(BaseModel):
     """Frozen settings that know all their keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def changed(self, **values: Any) -> Self:
+        """These settings with other values, checked like a file's; a dictionary changes single keys of a table:
+        `scene.changed(optimize={"steps": 10})`.
+        """
+        tables = {name: getattr(self, name) for name in type(self).model_fields}
+        for name, value in values.items():
+            table = tables.get(name)
+            nested = isinstance(table, Strict) and isinstance(value, dict)
+            tables[name] = table.changed(**value) if nested else value
+        return validated(type(self), tables, type(self).__name__)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
