@@ -63,7 +63,7 @@ def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
 def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     """The same sheet from 10° to the right: at 1.5 m the corners know it to 1°, at 8 m neither it nor how far it is."""
     light, matrix = SimpleNamespace(contrast=0.5), intrinsics(40, (1200, 900))
-    seen = View(Photo(np.zeros((900, 1200, 3), np.uint8), None, Path("a")), matrix, 0.005, False)
+    seen = View(Photo(np.zeros((900, 1200, 3), np.uint8), None, Path("a")), matrix, False)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
         found = Found({i: Borders(corners[i], 1.0, 0.0, 1.0, 4.0, True) for i in PIECE_IDS}, (), ())

@@ -166,30 +166,6 @@ def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_
     assert (typed["scale_x"], typed["scale_y"]) == pytest.approx((0.971, 0.973))
 
 
-def test_a_card_on_the_uncut_page_shows_its_scale(journey, tmp_path):
-    arguments = (
-        "--run",
-        journey / "run",
-        "--n",
-        2,
-        "--out",
-        tmp_path / "photos",
-        "--card",
-        "--print-scale",
-        "0.96x1.02",
-    )
-    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
-    sheet = ("--sheet", journey / "sheet.json")
-    assert command("verify", tmp_path / "photos", *sheet, "--out", tmp_path / "card", "--card") == 0
-    assert command("verify", tmp_path / "photos", *sheet, "--out", tmp_path / "none") == 0
-    report, without = (json.loads((tmp_path / name / "report.json").read_text()) for name in ("card", "none"))
-    assert report["summary"]["rate"] is None  # the uncut page is not counted
-    for photo, plain in zip(report["photos"], without["photos"], strict=True):
-        assert (photo["status"], photo["code"]) == ("measured", "scale_off")
-        assert photo["scale_x"] == pytest.approx(0.96, rel=0.005) and photo["scale_y"] == pytest.approx(1.02, rel=0.005)
-        assert plain["scale_x"] is None and plain["scale_uncertainty"] is None
-
-
 def test_control_photographs_test_the_effect(journey, tmp_path, report):
     for control in ("bare", "grey"):
         arguments = ("--run", journey / "run", "--n", PHOTOS, "--out", tmp_path / "controls" / control)

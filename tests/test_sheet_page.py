@@ -63,11 +63,11 @@ def test_overlap_is_caught():
 
 
 def test_two_parts_in_one_holder_must_lie_apart_and_stay_in():
-    holder = Box("card", (20, 20, 80, 50))
+    holder = Box("tile", (20, 20, 80, 50))
     with pytest.raises(Refused, match="a over b"):
-        prove_apart((holder, Box("a", (30, 30, 9, 9), "card"), Box("b", (35, 35, 9, 9), "card")), PAGE, MARGIN)
-    with pytest.raises(Refused, match="a within card"):
-        prove_apart((holder, Box("a", (95, 30, 9, 9), "card")), PAGE, MARGIN)
+        prove_apart((holder, Box("a", (30, 30, 9, 9), "tile"), Box("b", (35, 35, 9, 9), "tile")), PAGE, MARGIN)
+    with pytest.raises(Refused, match="a within tile"):
+        prove_apart((holder, Box("a", (95, 30, 9, 9), "tile")), PAGE, MARGIN)
 
 
 @pytest.mark.parametrize("rect", [(6.9, 50, 5, 5), (50, 6.9, 5, 5), (198.1, 50, 5, 5), (50, 285.1, 5, 5)])
@@ -79,7 +79,7 @@ def test_ink_in_the_margin_is_caught(rect):
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ("corner_mm = [7.0, 218.0]", "corner_mm = [12.0, 218.0]", "chart swatch 1 over card outline"),
+        ("corner_mm = [95.4, 218.2]", "corner_mm = [95.4, 222.2]", "chart swatch 71 over page marker 3"),
         ("corner_mm = [179.0, 20.0]", "corner_mm = [175.0, 20.0]", "piece over QR code"),
         ("y_start_mm = [179.1, 72.0]", "y_start_mm = [179.1, 60.0]", "y ruler over text"),
         ("[[7.0, 200.0]", "[[24.0, 200.0]", "page marker 1 over x ruler"),

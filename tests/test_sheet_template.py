@@ -26,10 +26,6 @@ def test_shipped_template_by_name_and_by_file():
     assert load_template("a4").page_mm == (210, 297)
 
 
-def test_bank_card_has_the_standard_s_size():
-    assert load_template("a4").card.size_mm == (85.60, 53.98)  # ISO/IEC 7810 ID-1
-
-
 def test_unknown_name_is_refused_with_the_nearest():
     with pytest.raises(Refused, match='got "a44": did you mean "a4"'):
         load_template("a44")
@@ -45,6 +41,8 @@ def test_unknown_key_and_wrong_values_are_refused(tmp_path):
         load_template(changed(tmp_path, "margin_mm = 7.0", "margin_mm = 7.0\nmargins_mm = 7.0"))
     with pytest.raises(Refused, match="page_mm"):
         load_template(changed(tmp_path, "page_mm = [210.0, 297.0]", "page_mm = [nan, 297.0]"))
+    with pytest.raises(Refused, match=r"no bank card in .*mine\.toml, got \[card\]: delete it and its text"):
+        load_template(changed(tmp_path, "[qr]", "[card]\ncorner_mm = [7.0, 218.0]\n\n[qr]"))
     with pytest.raises(Refused, match="at least 48 swatches"):
         load_template(changed(tmp_path, "rows = 6", "rows = 3"))
 

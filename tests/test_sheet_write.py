@@ -365,6 +365,22 @@ def test_a_tampered_attachment_is_refused(tmp_path, sheet):
         attached_manifest(path)
 
 
+@pytest.mark.parametrize("outline", [[7.0, 218.0, 85.6, 53.98], None])
+def test_a_sheet_that_was_printed_with_a_bank_card_s_outline_is_read_without_it(tmp_path, sheet, outline):
+    path, (pdf_path, manifest) = tmp_path / "sheet.json", sheet
+    data = json.loads(dump_manifest(manifest))
+    assert "card_mm" not in data
+    path.write_text(json.dumps(data | {"card_mm": outline}), encoding="utf-8")
+    assert load_manifest(path) == manifest
+    with pikepdf.open(pdf_path) as pdf:
+        pdf.attachments["sheet.json"] = pikepdf.AttachedFileSpec(pdf, path.read_bytes(), filename="sheet.json")
+        pdf.save(tmp_path / "sheet.pdf")
+    assert attached_manifest(tmp_path / "sheet.pdf") == manifest
+    path.write_text(json.dumps(data | {"cards_mm": outline}), encoding="utf-8")
+    with pytest.raises(Refused, match="only known keys"):
+        load_manifest(path)
+
+
 def test_the_package_imports_without_heavy_libraries():
     code = (
         "import sys; from patchproof.sheets import chart, page, pdf, piece, raster, template, write; "

@@ -143,7 +143,7 @@ class Deadly:
 
 
 def test_a_photograph_that_ends_its_process_each_time_is_rejected_and_the_others_go_on(folder):
-    task = look.set_task(make_manifest(promise()), [NET], identity_printer(), None, None, False)
+    task = look.set_task(make_manifest(promise()), [NET], identity_printer(), None, None)
     paths = sorted(folder.iterdir())
     seen = look.look_at_all(task, paths, lambda squares: {}, Deadly(), None, lambda *_: None, lambda done: None)
     codes = {one.entry.file: (one.entry.status, one.entry.code) for one in seen}

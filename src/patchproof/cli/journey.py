@@ -181,9 +181,6 @@ def reprint(
     print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
     control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
     scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
-    card: Annotated[
-        bool, typer.Option("--card", help="Photograph the uncut page with a bank card on it instead.")
-    ] = False,
     path_traced: Annotated[
         bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
     ] = False,
@@ -199,26 +196,26 @@ def reprint(
     scale = pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
         raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
-    if card and (scan_dpi is not None or control is not None):
-        raise typer.BadParameter("takes the page as it is; leave --scan-dpi and --control out", param_hint="--card")
-    if path_traced and (card or scan_dpi is not None):
-        raise typer.BadParameter(
-            "is of the piece on its object; leave --scan-dpi and --card out", param_hint="--path-traced"
-        )
+    if path_traced and scan_dpi is not None:
+        raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
     made, printed = load_run(run), {"printer": printer, "print_scale": scale, "overwrite": overwrite}
     if scan_dpi is not None:
         truth = scan(pdf, made, n, out, scan_dpi, **printed)
     else:
         with progress() as bar:
-            taken = {"seed": seed, "on_photo": lambda done, total: bar("photograph", done, total), **printed}
-            if card:
-                from patchproof.reprints.card_photo import photograph_cards
-
-                truth = photograph_cards(pdf, made, n, out, **taken)
-            else:
-                shown = control.value if control else None
-                workers = {"jobs": jobs, "cluster": cluster}
-                truth = reprint_sheet(pdf, made, n, out, control=shown, path_traced=path_traced, **workers, **taken)
+            truth = reprint_sheet(
+                pdf,
+                made,
+                n,
+                out,
+                seed=seed,
+                control=control.value if control else None,
+                path_traced=path_traced,
+                jobs=jobs,
+                cluster=cluster,
+                on_photo=lambda done, total: bar("photograph", done, total),
+                **printed,
+            )
     say(f"{len(truth)} photographs: {out}")
 
 
@@ -232,7 +229,6 @@ def verify(
         float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
     ] = None,
     ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
-    card: Annotated[bool, typer.Option("--card", help="A bank card lies in its outline on the uncut page.")] = False,
     camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
     require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
     ledger: Annotated[int, typer.Option(min=0, help="Photographs in the gap ledger at most; 0 for none.")] = 24,
@@ -257,7 +253,6 @@ def verify(
             scan_dpi=scan_dpi,
             ruler_mm=None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm"),
             ledger_photos=ledger,
-            card=card,
             camera=camera,
             jobs=jobs,
             cluster=cluster,

@@ -16,25 +16,16 @@ import numpy as np
 from patchproof.channel import lens
 from patchproof.photo.read import Photo
 
-FILE_FOCAL_ERROR, EXIF_FOCAL_ERROR = 0.005, 0.04  # relative, 95 %: EXIF's is a whole number of mm, often nominal
-ANY_FOCAL_ERROR, USUAL_FOCAL = 0.6, 0.65  # of no file and no EXIF: a phone's main camera, in picture diagonals
+FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
 
 
 @dataclass(frozen=True)
 class View:
-    """A photograph with straight lines straight, its matrix (None: unknown), the focal length's relative 95 % error."""
+    """A photograph with straight lines straight, its matrix (None: unknown), and whether a camera file says so."""
 
     photo: Photo
     matrix_px: np.ndarray | None
-    focal_error: float
     calibrated: bool
-
-    @property
-    def likely_matrix_px(self) -> np.ndarray:
-        """The matrix, or a phone's usual one."""
-        if self.matrix_px is not None:
-            return self.matrix_px
-        return _centered(USUAL_FOCAL * float(np.hypot(*self.photo.srgb.shape[:2])), self.photo)
 
 
 def view_of(photo: Photo, camera: lens.Camera | None) -> View:
@@ -45,10 +36,10 @@ def view_of(photo: Photo, camera: lens.Camera | None) -> View:
         matrix = lens.matrix_px(fitting, size_px) if size_px[0] != size_px[1] else None
         if matrix is not None:
             straight = Photo(_straightened(photo, fitting, matrix), float(matrix[0, 0]), photo.path)
-            return View(straight, matrix, FILE_FOCAL_ERROR, True)
+            return View(straight, matrix, True)
     if photo.focal_px is not None:
-        return View(photo, _centered(photo.focal_px, photo), EXIF_FOCAL_ERROR, False)
-    return View(photo, None, ANY_FOCAL_ERROR, False)
+        return View(photo, _centered(photo.focal_px, photo), False)
+    return View(photo, None, False)
 
 
 def _centered(focal_px: float, photo: Photo) -> np.ndarray:

@@ -48,7 +48,6 @@ class Task:
     sizes_px: tuple[int, ...]
     scan_dpi: float | None
     camera: Camera | None
-    card: bool
     ledger_px: int | None  # the primary network's input size, where there can be a ledger
 
 
@@ -80,7 +79,7 @@ class Glanced:
     predictions: dict[str, Prediction]
 
 
-def set_task(manifest, models, printer, scan_dpi, camera, card) -> Task:
+def set_task(manifest, models, printer, scan_dpi, camera) -> Task:
     """What all photographs of a verification are measured against; the manifest's printer where none is given."""
     surface = surface_of(manifest)
     conditions = manifest.promise.conditions if manifest.promise else ()
@@ -96,7 +95,7 @@ def set_task(manifest, models, printer, scan_dpi, camera, card) -> Task:
     if manifest.promise and promised is not None:
         ledger_px = next(m.input_px for m in models if m.name == manifest.promise.models[0].name)
     ranges = promised_ranges(conditions, promised_side_px(manifest))
-    return Task(surface, promised, ranges, sizes, scan_dpi, camera, card, ledger_px)
+    return Task(surface, promised, ranges, sizes, scan_dpi, camera, ledger_px)
 
 
 def look_at_all(
@@ -142,7 +141,7 @@ def _look(task: Task, numbered: tuple[int, Path]) -> Looked:
         photo = read_photo(path)
         squares = squares_of(photo.srgb, task.sizes_px)
         view = view_of(photo, task.camera)
-        measured = measure(view, path.name, task.surface, task.promised, task.ranges, task.scan_dpi, task.card)
+        measured = measure(view, path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
         # checked here, where a figure that is no number costs one photograph
         entry = PhotoEntry.model_validate(measured.entry.model_dump(mode="json") | {"sha256": sha256})
         pictures = {}

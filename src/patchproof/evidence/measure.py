@@ -14,15 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
-from patchproof.evidence.camera import View
+from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.scan import is_scan, page_scales
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.card import card_scale
-from patchproof.photo.card_lines import NoCard
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import Found, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
@@ -49,9 +47,6 @@ _ADVICE = {
 }
 
 
-_ONLY_UNCUT = "lay the card in its outline on the uncut, flat page, and show the page's own markers"
-
-
 @dataclass(frozen=True)
 class Measured:
     """An entry without predictions, whether it is counted, pictures by kind, and the light on the frame where seen."""
@@ -69,9 +64,8 @@ def measure(
     promised: Promised | None,
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
-    card: bool = False,
 ) -> Measured:
-    """Everything that one readable photograph says; `promised` None leaves colour unmeasured, `card` looks for one."""
+    """Everything that one readable photograph says; `promised` None leaves colour unmeasured."""
     photo = view.photo
     try:
         found, surface = identify(photo.srgb, surface)
@@ -92,8 +86,7 @@ def measure(
     if unrolled is not None:  # no homography maps the page to the photograph
         figures = {"corner_uncertainty_mm": unrolled.uncertainty_mm, "curl_radius_mm": unrolled.radius_mm}
         entry = entry.model_copy(update=figures | {"homography_px_from_mm": None, "scale_x_over_y": None})
-    # a lens may keep page and piece from one fit; who lays a card on a page has not cut it
-    page_check = _is_uncut(fit, found, surface) or (card and bool(found.markers.keys() & surface.page_ids))
+    page_check = _is_uncut(fit, found, surface)
     if page_check and surface.page_mm is not None:
         try:
             refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
@@ -117,9 +110,6 @@ def measure(
     entry = _coded(entry, cannot) if cannot else entry.model_copy(update={"status": "measured"})
     if scan and cannot is None:
         entry = _with_scale(entry, *page_scales(fit.px_from_mm, surface, scan_dpi))
-    elif card and cannot is None:
-        flat = page_check and unrolled is None
-        entry = _with_card(entry, view, fit, light, surface) if flat else _not_measured(entry, _ONLY_UNCUT)
     if not counted and entry.code is None and entry.advice is None:
         advice = (
             "a scan checks the print and is not counted"
@@ -224,7 +214,7 @@ def _with_geometry(
             "distance_mm": distance if length <= MOST_DISTANCE_ERROR * distance else None,
         }
     if view.calibrated:
-        ratio, uncertainty = x_over_y(fit, view.matrix_px, view.focal_error)
+        ratio, uncertainty = x_over_y(fit, view.matrix_px, FOCAL_ERROR)
         figures["scale_x_over_y"] = ratio if uncertainty <= MOST_RATIO_ERROR else None
     return entry.model_copy(update=figures)
 
@@ -256,33 +246,6 @@ def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) ->
     if uncertain:
         return CannotJudge("too_small", entry.corner_uncertainty_mm, most_uncertain, _ADVICE["too_small"])
     return None
-
-
-def _with_card(entry: PhotoEntry, view: View, fit: PageFit, light: FrameLight, surface: Surface) -> PhotoEntry:
-    """The scale that a bank card in its outline shows, or why it shows none."""
-    if surface.card_mm is None:
-        return _not_measured(entry, "this sheet's JSON names no outline for a card: make the sheet again")
-    matrix, focal_error = view.likely_matrix_px, view.focal_error
-    ratio = x_over_y(fit, matrix, focal_error)
-    try:
-        card = card_scale(
-            view.photo.srgb,
-            fit.px_from_mm,
-            surface.card_mm,
-            surface.printed_mm,
-            matrix,
-            focal_error,
-            entry.blur_px,
-            light.paper,
-            ratio,
-        )
-    except NoCard as reason:
-        return _not_measured(entry, str(reason))
-    return _with_scale(entry.model_copy(update={"scale_uncertainty": card.uncertainty}), card.x, card.y)
-
-
-def _not_measured(entry: PhotoEntry, reason: str) -> PhotoEntry:
-    return entry.model_copy(update={"advice": f"scale not measured: {reason}"})
 
 
 def _with_scale(entry: PhotoEntry, scale_x: float, scale_y: float) -> PhotoEntry:

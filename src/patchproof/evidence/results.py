@@ -52,7 +52,6 @@ class PhotoEntry(Strict):
     px_per_mm: Finite | None = None
     scale_x: Finite | None = None
     scale_y: Finite | None = None
-    scale_uncertainty: Finite | None = None  # 95 %, relative, of the worse axis; of card photographs
     scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
     tilt_deg: Finite | None = None
     azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right

@@ -47,7 +47,6 @@ def gather_evidence(
     scan_dpi: float | None = None,
     controls: str | Path | None = None,
     camera: Camera | None = None,
-    card: bool = False,
     ledger_photos: int = LEDGER_PHOTOS,
     jobs: int = 1,
     cluster: str | None = None,
@@ -59,7 +58,7 @@ def gather_evidence(
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
     `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
-    `camera` replaces the EXIF focal length and takes out the lens; `card` looks for a bank card in its outline.
+    `camera` replaces the EXIF focal length and takes out the lens.
     `ledger_photos` of the photographs at most, spread evenly, go into the gap ledger (0: no ledger). Photographs are
     measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is finished;
     with `resume`, what it has of an earlier run is not done again. `on_pictures` gets the pictures of each photograph
@@ -71,10 +70,10 @@ def gather_evidence(
     if manifest.promise:
         check_primary(models, manifest.promise)
     indices = {m.name: target_indices(m, manifest) for m in models} if manifest.promise else {}
-    task = set_task(manifest, models, printer, scan_dpi, camera, card)
+    task = set_task(manifest, models, printer, scan_dpi, camera)
     judge_all = partial(_predictions, models, indices)
     total, done = len(paths) + sum(map(len, control_paths.values())), 0
-    options = {"scan_dpi": scan_dpi, "camera": camera and camera.model_dump(mode="json"), "card": card}
+    options = {"scan_dpi": scan_dpi, "camera": camera and camera.model_dump(mode="json")}
     kept = Journal(journal, settings_key(manifest, models, printer, options), resume) if journal is not None else None
     with closing(kept) if kept is not None else nullcontext(), open_workers(jobs, cluster) as workers:
         step = lambda more: progress(done + more, total)  # noqa: E731

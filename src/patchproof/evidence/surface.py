@@ -38,10 +38,6 @@ class Surface:
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
 
-    # the outline for a bank card, and all swatches and markers round it; of pages that are not tiles
-    card_mm: tuple[float, float, float, float] | None = None
-    printed_mm: tuple[tuple[float, float, float, float], ...] = ()
-
     @property
     def all_ids(self) -> frozenset[int]:
         """Its own markers and those of its pages."""
@@ -110,7 +106,6 @@ def _surface(manifest, corners, piece, rect, swatch_rects=(), colors=(), pages=(
         label_of(manifest),
         None if manifest.tiles else manifest.page_mm,
         pages,
-        *((None, ()) if manifest.tiles else (manifest.card_mm, _printed(manifest, corners))),
     )
 
 
@@ -169,13 +164,6 @@ def reduced(linear: np.ndarray) -> np.ndarray:
 
 def _known(manifest: Manifest) -> list:
     return [m for m in manifest.markers if m.dictionary == manifest.markers[0].dictionary]
-
-
-def _printed(manifest: Manifest, corners) -> tuple[tuple[float, float, float, float], ...]:
-    """Rectangles of the page's swatches and markers."""
-    page = manifest.design.page if manifest.design else min(m.page for m in manifest.markers)
-    boxes = [(*quad.min(0), *np.ptp(quad, axis=0)) for quad in corners.values()]
-    return *(s.rect_mm for s in manifest.chart if s.page == page), *(tuple(map(float, box)) for box in boxes)
 
 
 def _inside(rect, points: np.ndarray) -> bool:

@@ -40,7 +40,6 @@ def verify_photos(
     scan_dpi: float | None = None,
     ruler_mm: tuple[float, float] | None = None,
     ledger_photos: int = LEDGER_PHOTOS,
-    card: bool = False,
     camera: str | None = None,
     jobs: int = 1,
     cluster: str | None = None,
@@ -50,9 +49,9 @@ def verify_photos(
 ) -> Report:
     """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
 
-    `card` looks for a bank card in its outline on the uncut page; `camera` is a camera file's name or path. Model and
-    printer names are looked up from the manifest's folder, then as the scene's were. `resume` goes on from what an
-    earlier run finished, whole or killed: only photographs that are new, or differ, are measured.
+    `camera` is a camera file's name or path. Model and printer names are looked up from the manifest's folder, then as
+    the scene's were. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are
+    new, or differ, are measured.
     """
     out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
     _check_out(out, resume, overwrite)
@@ -67,7 +66,6 @@ def verify_photos(
         controls=controls,
         ledger_photos=ledger_photos,
         camera=None if camera is None else load_camera(camera),
-        card=card,
         jobs=jobs,
         cluster=cluster,
         journal=out / _JOURNAL,
@@ -77,7 +75,7 @@ def verify_photos(
     )
     if ruler_mm is not None:
         evidence = _with_ruler(evidence, manifest, ruler_mm)
-    options = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "card": card or None, "camera": camera and Path(camera).name}
+    options = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "camera": camera and Path(camera).name}
     hashes = {"manifest": hashlib.sha256(Path(sheet).read_bytes()).hexdigest()}
     hashes |= {f"network {network.name}": network.sha256 for network in networks}
     origin = Origin(options=options | {"ledger_photos": ledger_photos}, sha256=hashes, versions=_versions())

@@ -154,14 +154,12 @@ def _lay_out(page: BoardTemplate, identity: str) -> parts.PageLayout:
         swatches=(),
         qr_mm=qr,
         ticks=tuple(tick for start, down in starts for tick in parts._ruler_ticks(ruler, start, down)),
-        card_mm=None,
-        card_radius_mm=0.0,
         texts=tuple(lines + [digit for start, down in starts for digit in parts._ruler_digits(ruler, start, down)]),
         boxes=(
             parts.Box("board", _rect(grid)),
             parts.Box("QR code", parts._qr_box(page, qr)),
             *(parts._ruler_box(f"{'y' if down else 'x'} ruler", ruler, start, down) for start, down in starts),
-            *(parts.text_box(line, _rect(grid)) for line in lines),
+            *(parts.text_box(line) for line in lines),
         ),
         squares_mm=_black(grid),
     )

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from patchproof.strict import Finite, Positive, Refused, Share, Strict, validated
 
@@ -143,12 +143,17 @@ class Manifest(Strict):
     chart: tuple[Swatch, ...]
     cut_mm: Rect
     ruler_mm: tuple[Positive, Positive]
-    card_mm: Rect | None = None  # the printed outline that a bank card is laid into, on the design's page
     page_code: Annotated[str, Field(pattern=PAGE_CODE)] | None = None  # of a page that several designs share
     plan_page: Page | None = None  # the page for people: where the piece goes, and how to photograph it
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_card(cls, data: Any) -> Any:
+        """Pages once carried a bank card's outline; those that were printed then must still be judged."""
+        return {key: data[key] for key in data if key != "card_mm"} if isinstance(data, dict) else data
 
 
 def design_sha256(pixels: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""One page: the piece, chart, rulers, card outline, QR code, page markers and words, each in its place.
+"""One page: the piece, chart, rulers, QR code, page markers and words, each in its place.
 
 In: a template and a piece. Out: a `PageLayout`, plain geometry in page millimetres that `pdf` turns into ink and
 `write` into the manifest. Every part also leaves a `Box`, the rectangle that is its own, white borders included;
@@ -75,8 +75,6 @@ class PageLayout:
     swatches: tuple[SwatchRect, ...]  # the chart's first
     qr_mm: tuple[RectMm, ...]
     ticks: tuple[Line, ...]
-    card_mm: RectMm | None
-    card_radius_mm: float
     texts: tuple[TextLine, ...]
     boxes: tuple[Box, ...]
     squares_mm: tuple[RectMm, ...] = ()  # a board's black squares
@@ -128,7 +126,6 @@ def lay_out_parts(
     cuts = [_round((*corner, *piece.size_mm)) for piece, corner in zip(pieces, places, strict=True)]
     own = [marker_at(i, at, template.marker.size_mm) for i, at in zip(ids, template.marker.corners_mm, strict=True)]
     chart = tuple((_round(rect), srgb) for rect, srgb in chart_swatches(template.chart))
-    card = None if template.card is None else (*template.card.corner_mm, *template.card.size_mm)
     qr = qr_rects_mm(qr_text, template.qr.corner_mm, template.qr.size_mm)
     digits = [
         *_ruler_digits(template.ruler, template.ruler.x_start_mm, False),
@@ -149,18 +146,15 @@ def lay_out_parts(
             *_ruler_ticks(template.ruler, template.ruler.y_start_mm, True),
             *more.lines,
         ),
-        card_mm=card,
-        card_radius_mm=0.0 if template.card is None else template.card.radius_mm,
         texts=(*lines, *digits, *more.texts),
         boxes=(
             *(box for i, (piece, corner) in enumerate(put) for box in _piece_boxes(piece, corner, i)),
             *(Box(f"chart swatch {i + 1}", rect) for i, (rect, _) in enumerate(chart)),
             *(Box(f"page marker {i + 1}", _marker_box(marker, template)) for i, marker in enumerate(own)),
-            *([] if card is None else [Box("card outline", card)]),
             Box("QR code", _qr_box(template, qr)),
             _ruler_box("x ruler", template.ruler, template.ruler.x_start_mm, False),
             _ruler_box("y ruler", template.ruler, template.ruler.y_start_mm, True),
-            *(text_box(line, card) for line in lines),
+            *(text_box(line) for line in lines),
             *more.boxes,
         ),
     )
@@ -318,12 +312,12 @@ def _filled(line: TextLine, words: dict[str, str]) -> TextLine:
     return line.model_copy(update={"text": re.sub(r"\{(.*?)\}", word, line.text)})
 
 
-def text_box(line: TextLine, card: RectMm | None = None) -> Box:
-    """The rectangle that a line of text takes; it may lie inside the card's outline."""
+def text_box(line: TextLine) -> Box:
+    """The rectangle that a line of text takes."""
     (x, baseline), size = line.at_mm, line.size_mm
     top = baseline - CAP_HEIGHT * size
     rect = (x, top, text_width_mm(line.text, size, line.bold), (CAP_HEIGHT + DESCENT) * size)
-    return Box(f'text "{line.text}"', rect, "card outline" if card and _holds(card, rect) else None)
+    return Box(f'text "{line.text}"', rect)
 
 
 def size_text(size_mm: tuple[float, ...]) -> str:

@@ -128,13 +128,9 @@ def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> N
 
 
 def _outlines(canvas: Canvas, layout: PageLayout) -> None:
-    """The card's outline, and the cut lines just outside of what is cut out."""
+    """The cut lines, just outside of what is cut out."""
     height = layout.page_mm[1]
     canvas.setStrokeGray(0.45)
-    if layout.card_mm is not None:
-        x, y, w, h = layout.card_mm
-        canvas.setLineWidth(0.2)
-        canvas.roundRect(x, height - y - h, w, h, layout.card_radius_mm)
     half = CUT_LINE_MM / 2
     for x, y, w, h in layout.cuts_mm:
         canvas.setLineWidth(CUT_LINE_MM)

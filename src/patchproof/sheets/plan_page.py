@@ -72,8 +72,6 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> Printed:
         swatches=(),
         qr_mm=(),
         ticks=tuple(lines),
-        card_mm=None,
-        card_radius_mm=0.0,
         texts=(*texts, *labels),
         boxes=(*boxes, *(text_box(line) for line in texts)),
     )

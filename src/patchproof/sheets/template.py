@@ -44,14 +44,6 @@ class Rulers(Strict):
     y_start_mm: Point
 
 
-class CardOutline(Strict):
-    """The outline that a bank card is laid into."""
-
-    corner_mm: Point
-    size_mm: tuple[Positive, Positive]
-    radius_mm: NotNegative
-
-
 class QrCode(Strict):
     """The QR code's black square; its quiet zone of 4 modules lies outside."""
 
@@ -99,7 +91,6 @@ class Template(Strict):
     piece: PieceZone | None = None  # none on a page that is a chart alone
     chart: ChartGrid
     ruler: Rulers
-    card: CardOutline | None = None
     qr: QrCode
     marker: PageMarkers
     blank: BlankPiece | None = None
@@ -116,7 +107,12 @@ def load_template(name_or_file: str | Path) -> Template:
         if str(name_or_file) not in names:
             raise Refused("a print template's name or a .toml file", f'"{name_or_file}"', nearest(str(path), names))
         path = shipped("print_templates", f"{name_or_file}.toml")
-    template = validated(Template, read_toml(path), str(path))
+    data = read_toml(path)
+    if "card" in data:  # pages once had a bank card's outline, with words in it that would be printed alone
+        raise Refused(
+            f"no bank card in {path}", "[card]", "delete it and its text: a scan or a ruler shows a print's size"
+        )
+    template = validated(Template, data, str(path))
     swatches = template.chart.columns * template.chart.rows
     if swatches < 48:
         raise Refused(f"at least 48 swatches in the chart of {path}", f"{swatches}", "add columns or rows")

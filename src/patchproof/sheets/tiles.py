@@ -114,8 +114,6 @@ def lay_out_tile(template: Template, piece: Piece, tile: TilePlan, ids: Sequence
         swatches=(),
         qr_mm=(),
         ticks=(),
-        card_mm=None,
-        card_radius_mm=0.0,
         texts=tuple(texts),
         boxes=tuple(boxes),
         window=Window(

@@ -195,7 +195,6 @@ def _manifest(
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
         cut_mm=page.cuts_mm[0] if page.cuts_mm else (0.0, 0.0, *page.page_mm),
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
-        card_mm=page.card_mm,
         promise=promise,
         settings=settings,
     )

@@ -24,7 +24,7 @@ from torch import Tensor
 from patchproof import geometry
 from patchproof.channel import lens
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.evidence.camera import ANY_FOCAL_ERROR, EXIF_FOCAL_ERROR, View
+from patchproof.evidence.camera import View
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
@@ -278,7 +278,7 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
         matrix_px = scene.matrix_px(whole_px).copy()
         matrix_px[:2, 2] -= origin_px
     photo = Photo(srgb, None if matrix_px is None else float(matrix_px[0, 0]), Path("photo"))
-    view = View(photo, matrix_px, ANY_FOCAL_ERROR if matrix_px is None else EXIF_FOCAL_ERROR, calibrated=False)
+    view = View(photo, matrix_px, calibrated=False)
     entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
     if entry.status == "measured" and entry.homography_px_from_mm is not None:
