@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from patchproof import strict
+from patchproof.goal import Goal
 from patchproof.settings import SceneSettings, identifying, load_scene_settings
+from patchproof.sheets.manifest import Target
 from patchproof.strict import Refused, Strict, expand, nearest, shipped, validated
 
 SCENE = """
@@ -249,3 +251,11 @@ def test_settings_change_through_a_door_that_checks(tmp_path):
             plain.changed(optimize=wrong)
     with pytest.raises(Refused, match="optimise"):
         plain.changed(optimise={"steps": 3})
+
+
+def test_a_goal_that_is_none_is_refused_wherever_it_stands(tmp_path):
+    with pytest.raises(Refused, match="goal"):
+        load_scene_settings(scene(tmp_path, ('label = "jeep"', 'label = "jeep"\ngoal = "assits"')))
+    with pytest.raises(Refused, match="goal"):
+        validated(Target, {"label": "jeep", "indices": [1], "goal": "confuse"}, "sheet.json")
+    assert [(str(goal), goal.sign) for goal in Goal] == [("assist", 1), ("deceive", -1)]

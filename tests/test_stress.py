@@ -31,6 +31,7 @@ from patchproof.experiments.stress_map import (
     scene_cells,
     worst_cells,
 )
+from patchproof.goal import Goal
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.loop import State, steps
 from patchproof.optimizer.problem import set_problem
@@ -184,7 +185,7 @@ def test_the_worst_tenth_by_hand():
     sure = np.full((4, 5, 2), 0.5)
     sure[3, 0] = 0.1
     assert worst_cells(hits, sure) == [(3, 0), (1, 2)]  # equal rates: the less sure one first
-    assert (1, 2) not in worst_cells(hits, sure, wants_hits=False)
+    assert (1, 2) not in worst_cells(hits, sure, goal=Goal.deceive)
     assert worst_cells(hits[:1, :1], sure[:1, :1]) == [(0, 0)]
     assert len(worst_cells(np.ones((3, 7, 1), bool), np.ones((3, 7, 1)))) == 3  # a tenth of 21, rounded up
 

@@ -8,6 +8,7 @@ from patchproof.claims import prediction_interval
 from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
 from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.verdict import compare, effect_of, judge
+from patchproof.goal import Goal
 from patchproof.sheets.manifest import ConditionClaim
 from test_photo_synthetic import make_manifest
 
@@ -15,58 +16,58 @@ from test_photo_synthetic import make_manifest
 def test_the_rule_at_both_sides_of_the_interval():
     low, high = prediction_interval(360, 400, 40)
     assert (low, high) == (32, 39)  # mean 36, standard deviation √(40 · 0.9 · 0.1 · 441/402) = 1.99
-    assert judge(32, 40, 0.9, 400, "assist", 0).verdict == "kept"
-    assert judge(31, 40, 0.9, 400, "assist", 0).verdict == "broken"
-    assert judge(40, 40, 0.9, 400, "assist", 0).verdict == "kept"
+    assert judge(32, 40, 0.9, 400, Goal.assist, 0).verdict == "kept"
+    assert judge(31, 40, 0.9, 400, Goal.assist, 0).verdict == "broken"
+    assert judge(40, 40, 0.9, 400, Goal.assist, 0).verdict == "kept"
 
 
 def test_a_wide_interval_cannot_tell_but_can_still_break():
     # 6 photographs at 0.8: k_lo = 2, and 2/6 lies below 0.8 - 0.2
     low, _ = prediction_interval(320, 400, 6)
     assert low / 6 < 0.6
-    assert judge(6, 6, 0.8, 400, "assist", 0).verdict == "cannot_tell"
-    assert judge(low - 1, 6, 0.8, 400, "assist", 0).verdict == "broken"
+    assert judge(6, 6, 0.8, 400, Goal.assist, 0).verdict == "cannot_tell"
+    assert judge(low - 1, 6, 0.8, 400, Goal.assist, 0).verdict == "broken"
 
 
 def test_deceive_is_the_mirror_image_of_assist():
     for k in range(41):
-        assert judge(k, 40, 0.9, 400, "assist", 0).verdict == judge(40 - k, 40, 0.1, 400, "deceive", 0).verdict
+        assert judge(k, 40, 0.9, 400, Goal.assist, 0).verdict == judge(40 - k, 40, 0.1, 400, Goal.deceive, 0).verdict
 
 
 def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
-    assert judge(0, 4, 0.9, 400, "assist", 0).verdict == "cannot_tell"
-    assert judge(0, 5, 0.9, 400, "assist", 0).verdict == "broken"
-    assert judge(0, 0, 0.9, 400, "assist", 0).prediction_interval is None
+    assert judge(0, 4, 0.9, 400, Goal.assist, 0).verdict == "cannot_tell"
+    assert judge(0, 5, 0.9, 400, Goal.assist, 0).verdict == "broken"
+    assert judge(0, 0, 0.9, 400, Goal.assist, 0).prediction_interval is None
     # 4 of 40 readable ones are 10 %, 5 of 41 are more
-    assert judge(36, 36, 0.9, 400, "assist", 4).verdict == "kept"
-    assert judge(36, 36, 0.9, 400, "assist", 5).verdict == "cannot_tell"
+    assert judge(36, 36, 0.9, 400, Goal.assist, 4).verdict == "kept"
+    assert judge(36, 36, 0.9, 400, Goal.assist, 5).verdict == "cannot_tell"
 
 
 def test_pairs_by_file_name_go_to_mcnemar():
     patch = {f"{i}.jpg": True for i in range(10)}
     control = {f"{i}.jpg": i < 4 for i in range(10)}
-    compared = compare(patch, control, "assist")
+    compared = compare(patch, control, Goal.assist)
     # six discordant pairs, all one way: 2 · (1/2)⁶ = 0.03125
     assert (compared.pairs, compared.p_value, compared.shown) == (10, pytest.approx(0.03125), True)
-    assert not compare(patch, control, "deceive").shown
-    assert compare(control, patch, "deceive").shown
+    assert not compare(patch, control, Goal.deceive).shown
+    assert compare(control, patch, Goal.deceive).shown
     control["4.jpg"] = True  # five pairs: 0.0625
-    assert not compare(patch, control, "assist").shown
+    assert not compare(patch, control, Goal.assist).shown
 
 
 def test_different_names_go_to_newcombe():
     patch, control = {f"a{i}": True for i in range(20)}, {f"b{i}": i < 5 for i in range(20)}
-    compared = compare(patch, control, "assist")
+    compared = compare(patch, control, Goal.assist)
     assert compared.pairs == 0 and compared.p_value is None and compared.shown
     assert compared.difference == pytest.approx(0.75) and compared.interval[0] > 0
 
 
 def test_every_control_must_be_beaten_and_none_is_no_test():
     patch = {f"{i}": True for i in range(10)}
-    good, bad = compare(patch, {f"{i}": False for i in range(10)}, "assist"), compare(patch, patch, "assist")
+    good, bad = compare(patch, {f"{i}": False for i in range(10)}, Goal.assist), compare(patch, patch, Goal.assist)
     assert effect_of([good]) == "shown" and effect_of([good, bad]) == "not_shown"
     assert effect_of([]) == effect_of([None]) == "not_tested"
-    assert compare(patch, {}, "assist") is None
+    assert compare(patch, {}, Goal.assist) is None
 
 
 def conditions(scales, recognized):

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from patchproof.goal import Goal
 from patchproof.strict import (
     Finite,
     NotNegative,
@@ -101,7 +102,7 @@ class TargetSettings(Strict):
     label: str | int
     models: Annotated[tuple[str, ...], Field(min_length=1)]
     accept: tuple[str | int, ...] = ()
-    goal: Literal["assist", "deceive"] = "assist"
+    goal: Goal = Goal.assist
 
 
 class ViewSettings(Strict):

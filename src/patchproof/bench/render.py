@@ -23,6 +23,7 @@ from patchproof.bench.speed import growth_chart, step_chart
 from patchproof.bench.texture import QUICK_WIDTHS_PX, SUBSAMPLES, WIDTHS_PX, texture_chart
 from patchproof.bench.world import World, set_world
 from patchproof.channel.camera import encoded
+from patchproof.goal import Goal
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.render.photograph import expose, shade
@@ -113,7 +114,7 @@ def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -
     def work(side: int) -> None:
         design = world.design.clone().requires_grad_()
         logits = classifier.logits(pictures(side, problem.subject.shown(design), conditions[:8]))
-        torch.autograd.grad(target_loss(logits, indices, "assist").mean(), design)
+        torch.autograd.grad(target_loss(logits, indices, Goal.assist).mean(), design)
 
     seconds, points, rows = timed({side: lambda side=side: work(side) for side in SIDES_PX}, rounds), [], []
     with torch.no_grad():

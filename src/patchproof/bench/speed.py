@@ -19,6 +19,7 @@ import torch
 
 from patchproof.bench.chart import Chart, Check, Growth, OnStage, Point, Series, Shares
 from patchproof.bench.measure import median_interval, slope, timed
+from patchproof.goal import Goal
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem, set_problem
@@ -164,7 +165,7 @@ def step_shares(problem: Problem, rounds: int, spot: Callable[[], object] | None
     def network() -> None:
         pictures = made["pictures"].detach().requires_grad_()
         logits = problem.classifiers[0].logits(pictures)
-        torch.autograd.grad(target_loss(logits, problem.indices[0], "assist").mean(), pictures)
+        torch.autograd.grad(target_loss(logits, problem.indices[0], Goal.assist).mean(), pictures)
 
     def alone() -> None:
         rasterize(surface.vertices, surface.faces, cameras, _NEAR_MM)

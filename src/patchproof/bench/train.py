@@ -23,6 +23,7 @@ from patchproof.bench.chart import Chart, Interval, OnStage, Point, Series, Tabl
 from patchproof.bench.measure import checked_pick, mean_interval, median_interval, paired_means, timed
 from patchproof.bench.world import demo_problem, set_world, with_settings
 from patchproof.claims import CONFIDENCE
+from patchproof.goal import Goal
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, start, steps
 from patchproof.optimizer.patch import Patch
@@ -272,7 +273,7 @@ def ensemble_chart(count: int, seeds: int, on_stage: OnStage) -> Chart:
             logits = judge.logits(design)
             for j, other in enumerate(k for k in range(len(NETWORKS)) if k not in team):
                 indices = problem.indices[other]
-                loss = target_loss(logits[other], indices, "assist").mean()
+                loss = target_loss(logits[other], indices, Goal.assist).mean()
                 rate = problem.classifiers[other].recognized(logits[other], indices).double().mean()
                 held_out[team][seed, j] = float(loss), float(rate)
             on_stage("ensembles", seed * len(teams) + i + 1, seeds * len(teams))

@@ -76,7 +76,7 @@ def ledger_of(
         values.append(_confidences(squares, model, indices))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
     seen = np.array([confidence[shot.file] for shot in shots])
-    return _ledger(steps, values, seen, -1.0 if manifest.promise.target.goal == "deceive" else 1.0)
+    return _ledger(steps, values, seen, manifest.promise.target.goal.sign)
 
 
 def shapley(values: Mapping[tuple[bool, ...], float]) -> np.ndarray:

@@ -25,6 +25,7 @@ from patchproof.evidence.ranges import at_side, matched_rate, promised_side_px
 from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Control, Evidence, ModelRate, Prediction, Report, Summary
 from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
+from patchproof.goal import Goal
 from patchproof.photo.read import list_photos, pictures_in
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
@@ -165,7 +166,7 @@ def _rate(results: list[bool]) -> ModelRate:
     return ModelRate(rate=sum(results) / len(results), interval=wilson(sum(results), len(results)))
 
 
-def _compared(primary: str, results: dict[str, bool], glances: Mapping[str, Sequence[Glanced]], goal: str):
+def _compared(primary: str, results: dict[str, bool], glances: Mapping[str, Sequence[Glanced]], goal: Goal):
     """Controls with their comparison, and the effect that they show together."""
     controls, comparisons = [], []
     for name, looked in glances.items():

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from patchproof.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, prediction_interval
+from patchproof.goal import Goal
 
 LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
@@ -34,7 +35,7 @@ class Verdict:
 
 
 def judge(
-    recognized: int, judged: int, promise_rate: float, promise_n: int, goal: str, without_markers: int
+    recognized: int, judged: int, promise_rate: float, promise_n: int, goal: Goal, without_markers: int
 ) -> Verdict:
     """The verdict on `recognized` of `judged` photos; `without_markers` more are readable and show no marker."""
     if judged == 0:
@@ -47,13 +48,10 @@ def judge(
         return Verdict("cannot_tell", (low, high), reason)
     if judged < LEAST_JUDGED:
         return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
-    if goal == "deceive":
-        broken, sure = recognized > high, high / judged <= promise_rate + SLACK + 1e-9
-    else:
-        broken, sure = recognized < low, low / judged >= promise_rate - SLACK - 1e-9
-    if broken:
+    worst = low if goal.sign > 0 else high
+    if goal.sign * (recognized - worst) < 0:
         return Verdict("broken", (low, high), f"{seen}.")
-    if sure:
+    if goal.sign * (worst / judged - promise_rate) >= -SLACK - 1e-9:
         return Verdict("kept", (low, high), f"{seen}.")
     return Verdict("cannot_tell", (low, high), f"{seen}, which is too wide to tell: take more photographs.")
 
@@ -69,20 +67,19 @@ class Comparison:
     shown: bool
 
 
-def compare(patch: Mapping[str, bool], control: Mapping[str, bool], goal: str) -> Comparison | None:
+def compare(patch: Mapping[str, bool], control: Mapping[str, bool], goal: Goal) -> Comparison | None:
     """Whether the patch changes recognition in the goal's direction; results by file name, equal names are pairs."""
     if not patch or not control:
         return None
-    sign = -1 if goal == "deceive" else 1
     names = sorted(patch.keys() & control.keys())
     if len(names) >= LEAST_PAIRS:
         a, b = [patch[name] for name in names], [control[name] for name in names]
         difference, interval = paired_difference(a, b)
         p_value = mcnemar_p(a, b)
-        shown = p_value < 1 - CONFIDENCE and sign * difference > 0
+        shown = p_value < 1 - CONFIDENCE and goal.sign * difference > 0
         return Comparison(difference, interval, len(names), p_value, shown)
     difference, interval = independent_difference(sum(patch.values()), len(patch), sum(control.values()), len(control))
-    shown = interval[1] < 0 if goal == "deceive" else interval[0] > 0
+    shown = min(goal.sign * end for end in interval) > 0
     return Comparison(difference, interval, 0, None, shown)
 
 

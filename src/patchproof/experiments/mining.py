@@ -72,7 +72,7 @@ def run(settings: MiningSettings, base: Path, cell: Cell) -> dict[str, Any]:
     mined = problem_of(cell, base, steps=steps_of_mined)
     both = axes(plain.scene.settings, settings.map)
     hits, confidence = map_of(plain, both, plain.scene.draw("select", settings.map.n, seed + _CHOOSING))
-    worst = worst_cells(hits, confidence, plain.scene.settings.target.goal == "assist")
+    worst = worst_cells(hits, confidence, plain.scene.settings.target.goal)
     things = {"clean": None, "plain": _trained(plain), "mined": _trained(mined, settings.mine)}
     drawn = plain.scene.draw("evaluate", settings.n * len(worst) + settings.n_all, seed + _MEASURING)
     return {

@@ -106,7 +106,7 @@ def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
 def _mapped(problem: Problem, settings: MapSettings, seed: int) -> dict[str, Any]:
     both = axes(problem.scene.settings, settings)
     hits, confidence = map_of(problem, both, problem.scene.draw("select", settings.n, seed))
-    worst = worst_cells(hits, confidence, problem.scene.settings.target.goal == "assist")
+    worst = worst_cells(hits, confidence, problem.scene.settings.target.goal)
     fresh = problem.scene.draw("evaluate", settings.n * len(worst), seed + _MEASURING)
     there = judge(problem, {"clean": None}, in_cells(fresh, both, worst))["clean"]
     anywhere = judge(problem, {"clean": None}, fresh)["clean"]
@@ -131,7 +131,7 @@ def occluded(problem: Problem, settings: OcclusionSettings, seed: int) -> tuple[
     corners = np.linspace(0, side - square, settings.positions).round().astype(int)
     boxes = [(x, y, x + square, y + square) for y in corners for x in corners]
     hits, confidence = _under(problem, problem.scene.draw("select", settings.n, seed), [None, *boxes])
-    sign = 1 if problem.scene.settings.target.goal == "assist" else -1
+    sign = problem.scene.settings.target.goal.sign
     order = np.lexsort((sign * confidence[1:].mean(1), sign * hits[1:].mean(1)))
     worst = boxes[order[0]]
     fresh = problem.scene.draw("evaluate", settings.n, seed + _MEASURING)

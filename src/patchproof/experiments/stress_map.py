@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
+from patchproof.goal import Goal
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, Conditions
@@ -186,10 +187,9 @@ def map_of(problem: Problem, both: tuple[Axis, Axis], drawn: Conditions) -> tupl
     return np.reshape(hits, shape), np.reshape(confidence, shape)
 
 
-def worst_cells(hits: np.ndarray, confidence: np.ndarray, wants_hits: bool = True) -> list[tuple[int, int]]:
+def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assist) -> list[tuple[int, int]]:
     """The worst tenth of a map's cells, at least one: by rate, among equals by mean confidence, then in their order."""
-    sign = 1 if wants_hits else -1
-    rate, sure = sign * hits.mean(2).ravel(), sign * confidence.mean(2).ravel()
+    rate, sure = goal.sign * hits.mean(2).ravel(), goal.sign * confidence.mean(2).ravel()
     order = np.lexsort((np.arange(rate.size), sure, rate))[: math.ceil(WORST_SHARE * rate.size)]
     return [(int(i), int(j)) for i, j in zip(*np.unravel_index(order, hits.shape[:2]), strict=True)]
 

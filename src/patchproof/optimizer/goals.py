@@ -14,15 +14,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from patchproof.goal import Goal
 
-def target_loss(logits: Tensor, indices: Sequence[int], goal: str) -> Tensor:
+
+def target_loss(logits: Tensor, indices: Sequence[int], goal: Goal) -> Tensor:
     """N losses: -log p of the accepted labels (`assist`) or of all others (`deceive`), in float64 so that none
     saturates.
     """
     log_p = torch.log_softmax(logits.double(), 1)
     wanted = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
     wanted[list(indices)] = True
-    return -torch.logsumexp(log_p[:, wanted if goal == "assist" else ~wanted], 1)
+    return -torch.logsumexp(log_p[:, wanted if goal.sign > 0 else ~wanted], 1)
 
 
 def total_variation(design_srgb: Tensor) -> Tensor:

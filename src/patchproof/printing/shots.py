@@ -36,10 +36,10 @@ class ShotPlan:
 
 def plan_shots(promise: Promise) -> ShotPlan:
     """The counts for a promise; the control that is hardest to beat decides."""
-    deceive = promise.target.goal == "deceive"
-    best = (min if deceive else max)(promise.controls, key=lambda name: promise.controls[name].rate)
+    sign = promise.target.goal.sign
+    best = max(promise.controls, key=lambda name: sign * promise.controls[name].rate)
     rates = (promise.rate, promise.controls[best].rate)
-    better, worse = rates[::-1] if deceive else rates
+    better, worse = rates[::sign]
     return ShotPlan(
         verdict=fewest(lambda n: _can_tell(promise, n)),
         control=best,

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from patchproof.goal import Goal
 from patchproof.output import make_folder, write_whole
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.photo_table import photos_csv
@@ -90,7 +91,7 @@ def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str
 
 def _words(verdict: str, promise: Mapping | None) -> tuple[str, str]:
     headline, plain = _WORDS[verdict]
-    if verdict == "broken" and promise["target"]["goal"] == "deceive":
+    if verdict == "broken" and Goal(promise["target"]["goal"]).sign < 0:
         plain = _BROKEN_DECEIVE
     return headline, plain
 

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, model_validator
 
+from patchproof.goal import Goal
 from patchproof.strict import Finite, Positive, Refused, Share, Strict, validated
 
 Point = tuple[Finite, Finite]
@@ -86,7 +87,7 @@ class Target(Strict):
 
     label: str
     indices: tuple[Annotated[int, Field(ge=0)], ...]
-    goal: str
+    goal: Goal
 
 
 class ModelClaim(Strict):

@@ -88,7 +88,7 @@ class _Hall:
 
     @property
     def sign(self) -> float:
-        return -1.0 if self.manifest.promise.target.goal == "deceive" else 1.0
+        return self.manifest.promise.target.goal.sign
 
     def module_px(self, conditions) -> float:
         """A marker's module in the middle one of the views, in pixels of a photograph of the scene's own size."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.goal import Goal
 from patchproof.report.tables import Drawing, Estimate, Table, Value, rate
 from patchproof.validation.envelope.axes import AXES
 from patchproof.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
@@ -168,7 +169,7 @@ def _map_rows(one: Result) -> list[tuple[Value, ...]]:
 
 def _draw_page(figure, sweeps: Sequence[Result], maps: Sequence[Result]) -> None:
     found = (sweeps or maps)[0].found
-    goal = "not seen as" if found["goal"] == "deceive" else "seen as"
+    goal = "seen as" if Goal(found["goal"]).sign > 0 else "not seen as"
     figure.suptitle(f"Operating envelope of sheet {found['sheet']}: {goal} {found['label']} by {found['model']}")
     parts = figure.subfigures(1, 2, width_ratios=(1.15, 1)) if sweeps and maps else [figure, figure]
     if sweeps:

@@ -123,7 +123,7 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
     shown = max(n // 4, photos) if "jpeg" in points[0] else n
     seen = recognized(world, points, drawn[:shown])
     said = measured(world, points, drawn[:photos])
-    works = ~seen if world.scene.settings.target.goal == "deceive" else seen
+    works = seen if world.scene.settings.target.goal.sign > 0 else ~seen
     found = {
         "goal": world.scene.settings.target.goal,
         "label": str(world.scene.settings.target.label),
