@@ -15,7 +15,7 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.scene import flat
 from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import _digest, load_photo_scene, see
-from patchproof.settings import SceneSettings
+from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.piece import lay_out_piece, sheet_id
@@ -150,7 +150,7 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert all("unreadable" in warning for warning in scene.warnings)
     # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
     digest = _digest(scene.base / scene.settings.object.photos)
-    known = scene.settings.model_dump(mode="json") | {"blank": world.manifest.sheet_id, "photos": digest}
+    known = identifying(scene.settings) | {"blank": world.manifest.sheet_id, "photos": digest}
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 
