@@ -51,8 +51,8 @@ def test_one_stop_doubles_the_light_and_what_is_too_much_is_clipped():
 def test_white_balance_keeps_green_and_moves_red_and_blue():
     drawn = conditions(4, white_balance=0.1)
     seen = linear_from_srgb(develop(torch.full((4, 3, 2, 2), 0.2), drawn, 0.1))[:, :, 0, 0] / 0.2
-    np.testing.assert_allclose(seen.numpy(), drawn.white_balance, rtol=1e-4)
-    assert np.abs(drawn.white_balance[:, [0, 2]] - 1).max() > 0.02
+    np.testing.assert_allclose(seen.numpy(), drawn.sensor.white_balance, rtol=1e-4)
+    assert np.abs(drawn.sensor.white_balance[:, [0, 2]] - 1).max() > 0.02
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.5])
@@ -140,10 +140,10 @@ def test_only_what_treats_pixels_alone_and_alike_is_pointwise():
 def test_terms_that_are_off_change_no_bit():
     linear = torch.rand(3, 3, 16, 16)
     drawn = conditions(3, exposure_ev=[-0.5, 0.5], blur_px=[0, 2], noise=[0, 0.02])
-    spread = blurred(linear, torch.as_tensor(drawn.blur_px).float())
+    spread = blurred(linear, torch.as_tensor(drawn.sensor.blur_px).float())
     assert vignetted(linear, torch.zeros(3)) is linear and moved(linear, torch.zeros(3), [0.0] * 3) is linear
     exposed = noisy(
-        spread * gains(drawn, linear)[:, :, None, None], torch.as_tensor(drawn.noise).float(), drawn.noise_seed
+        spread * gains(drawn, linear)[:, :, None, None], torch.as_tensor(drawn.sensor.noise).float(), drawn.sensor.noise_seed
     )
     assert torch.equal(develop(linear, drawn, 1.0, jpeg=False), encoded(exposed))
 

@@ -26,23 +26,23 @@ STREAMS = ("train", "select", "promise", "reprint", "evaluate")
 
 def rows(stream, n=256, seed=0, start=0):
     drawn = draw(SETTINGS, stream, n, seed, start)
-    return np.stack([drawn.azimuth_deg, drawn.distance_mm, drawn.exposure_ev, drawn.jpeg, drawn.background[:, 2]], 1)
+    return np.stack([drawn.pose.azimuth_deg, drawn.pose.distance_mm, drawn.sensor.exposure_ev, drawn.sensor.jpeg, drawn.pose.background[:, 2]], 1)
 
 
 def test_every_value_lies_in_its_range():
     drawn, view = draw(SETTINGS, "promise", 2000, 0), SETTINGS.view
     for values, (low, high) in (
-        (drawn.azimuth_deg, view.azimuth_deg),
-        (drawn.elevation_deg, view.elevation_deg),
-        (drawn.distance_mm, view.distance_mm),
-        (drawn.ambient, SETTINGS.light.ambient),
-        (drawn.blur_px, SETTINGS.camera.blur_px),
-        (drawn.jpeg, SETTINGS.camera.jpeg),
+        (drawn.pose.azimuth_deg, view.azimuth_deg),
+        (drawn.pose.elevation_deg, view.elevation_deg),
+        (drawn.pose.distance_mm, view.distance_mm),
+        (drawn.light.ambient, SETTINGS.light.ambient),
+        (drawn.sensor.blur_px, SETTINGS.camera.blur_px),
+        (drawn.sensor.jpeg, SETTINGS.camera.jpeg),
     ):
         assert low <= values.min() and values.max() <= high
         assert values.min() < low + 0.02 * (high - low) + 1 and values.max() > high - 0.02 * (high - low) - 1
-    assert np.abs(drawn.look_at_offset).max() <= view.look_at_jitter
-    assert (drawn.white_balance[:, 1] == 1).all()
+    assert np.abs(drawn.pose.look_at_offset).max() <= view.look_at_jitter
+    assert (drawn.sensor.white_balance[:, 1] == 1).all()
 
 
 @pytest.mark.parametrize("stream", STREAMS)
@@ -109,13 +109,13 @@ def test_terms_that_are_on_leave_the_other_draws_as_they_were():
 
 def test_paper_misregistration_and_scale_fill_their_ranges_and_are_off_by_default():
     drawn, off = draw(EVERYTHING, "promise", 2000, 0), draw(SETTINGS, "promise", 50, 0)
-    length = np.linalg.norm(drawn.misregistration_mm, axis=2)
+    length = np.linalg.norm(drawn.print.misregistration_mm, axis=2)
     np.testing.assert_allclose(length[:, 0], length[:, 1])  # both planes as far, each in its own direction
-    assert 0.95 <= drawn.printed_scale.min() < 0.951 and 0.999 < drawn.printed_scale.max() <= 1
+    assert 0.95 <= drawn.pose.printed_scale.min() < 0.951 and 0.999 < drawn.pose.printed_scale.max() <= 1
     assert 0 <= length.min() < 0.001 and 0.299 < length.max() < 0.3001
-    red, blue = np.arctan2(drawn.misregistration_mm[..., 1], drawn.misregistration_mm[..., 0]).T
-    assert abs(np.corrcoef(red, blue)[0, 1]) < 0.07 and np.abs(drawn.misregistration_mm.mean(0)).max() < 0.01
-    assert not off.misregistration_mm.any() and (off.paper == 1).all() and (off.printed_scale == 1).all()
+    red, blue = np.arctan2(drawn.print.misregistration_mm[..., 1], drawn.print.misregistration_mm[..., 0]).T
+    assert abs(np.corrcoef(red, blue)[0, 1]) < 0.07 and np.abs(drawn.print.misregistration_mm.mean(0)).max() < 0.01
+    assert not off.print.misregistration_mm.any() and (off.print.paper == 1).all() and (off.pose.printed_scale == 1).all()
 
 
 def test_tinted_paper_has_the_lab_color_it_is_asked_for():
@@ -134,7 +134,7 @@ def test_coefficients_of_uneven_light_are_independent_standard_normals():
 def test_no_two_columns_move_together():
     drawn = draw(EVERYTHING, "train", 1024, 0)
     columns = [getattr(drawn, name) for name in (*ADDED, "azimuth_deg", "distance_mm", "ambient", "blur_px")]
-    columns = np.corrcoef([*columns, *drawn.sh2_coefficients.T])
+    columns = np.corrcoef([*columns, *drawn.light.sh2_coefficients.T])
     assert np.abs(columns - np.eye(len(columns))).max() < 0.1
 
 

@@ -51,15 +51,15 @@ def drawn(world):
 
 def test_a_value_replaces_one_condition_and_leaves_the_others(drawn):
     changed = with_value(drawn, "jpeg", 12.0)
-    assert changed.jpeg.tolist() == [12] * 4 and changed.jpeg.dtype == drawn.jpeg.dtype
-    assert replace(changed, jpeg=drawn.jpeg) is not None and np.array_equal(changed.blur_px, drawn.blur_px)
+    assert changed.sensor.jpeg.tolist() == [12] * 4 and changed.sensor.jpeg.dtype == drawn.sensor.jpeg.dtype
+    assert replace(changed, jpeg=drawn.sensor.jpeg) is not None and np.array_equal(changed.sensor.blur_px, drawn.sensor.blur_px)
     assert with_value(drawn, "blur_px", np.arange(4)).blur_px.tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 88.0])
 def test_tilt_is_the_angle_from_the_patch_s_axis_and_keeps_its_direction(world, drawn, tilt_deg):
     moved, frame = conditions_at(world.scene, drawn, {"tilt": tilt_deg}), world.scene.frame
-    before = geometry.orbit(drawn.azimuth_deg, drawn.elevation_deg, frame.normal, frame.up)
+    before = geometry.orbit(drawn.pose.azimuth_deg, drawn.pose.elevation_deg, frame.normal, frame.up)
     after = geometry.orbit(moved.azimuth_deg, moved.elevation_deg, frame.normal, frame.up)
     assert np.degrees(np.arccos((after @ frame.normal).clip(-1, 1))) == pytest.approx(np.full(4, tilt_deg), abs=1e-5)
     if tilt_deg:

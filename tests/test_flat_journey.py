@@ -145,7 +145,7 @@ def as_taken(scene, n: int):
     """Conditions that show photograph 0, 1, ... with the piece in it and nothing changed."""
     drawn, none, one = scene.draw("promise", n), np.zeros(n), np.ones((n, 3))
     low, high = scene.settings.view.zoom
-    background = drawn.background.copy()
+    background = drawn.pose.background.copy()
     background[:, 0], background[:, 1] = (np.arange(n) + 0.5) / n, np.log(1 / low) / np.log(high / low)
     still = {"background": background, "roll_deg": none, "look_at_offset": np.zeros((n, 3)), "jpeg": none + 95}
     camera = {"exposure_ev": none, "white_balance": one, "blur_px": none, "noise": none}
@@ -218,9 +218,9 @@ def test_fresh_photographs_of_the_print_are_judged(photos, tmp_path):
     """From nearly the photographed places, some of them darker: all are measured, none is out of range. The very
     photographs of the blank are the control.
     """
-    near = replace(photos.conditions, azimuth_deg=photos.conditions.azimuth_deg + 1.5)
-    near = replace(near, exposure_ev=near.exposure_ev - 0.3 * (np.arange(PHOTOS) % 2))
-    near = replace(near, distance_mm=near.distance_mm * 1.03)
+    near = replace(photos.conditions, azimuth_deg=photos.conditions.pose.azimuth_deg + 1.5)
+    near = replace(near, exposure_ev=near.sensor.exposure_ev - 0.3 * (np.arange(PHOTOS) % 2))
+    near = replace(near, distance_mm=near.pose.distance_mm * 1.03)
     shoot(photos.world, photos.folder / "SHEET.pdf", near, tmp_path / "fresh")
     sheet, controls = photos.folder / "SHEET.json", photos.folder / "photos"
     arguments = ("--sheet", sheet, "--out", tmp_path / "report", "--controls", controls)

@@ -71,7 +71,7 @@ def test_terms_that_are_off_do_not_exist_and_change_nothing():
         light,
         uneven=nothing[:, None] * off.uneven,
         lamp=replace(off.lamp, irradiance=nothing),
-        gloss=replace(off.gloss, share=nothing),
+        gloss=replace(off.light.gloss, share=nothing),
     )
     normal, view = directions(40).float(), torch.arange(40) % 4
     position = torch.rand(40, 3) * 100

@@ -111,7 +111,7 @@ def scene(world):
 def still(scene, n: int):
     """Conditions that show photograph 0, 1, ... as it is."""
     drawn = scene.draw("promise", n)
-    background = drawn.background.copy()
+    background = drawn.pose.background.copy()
     background[:, 0] = (np.arange(n) + 0.5) / len(scene.photos)
     low, high = scene.settings.view.zoom
     background[:, 1] = np.log(1 / low) / np.log(high / low)  # zoom 1
@@ -192,7 +192,7 @@ def test_picture_and_homography_move_alike(scene, size_px):
         dotted.append(replace(photo, picture=flat.Picture(np.round(picture).astype(np.uint8))))
     scene = replace(scene, photos=tuple(dotted))
     conditions = scene.draw("evaluate", 12)
-    assert np.ptp(scene.piece_blur_px(conditions)) > 0.1 and np.ptp(conditions.roll_deg) > 4
+    assert np.ptp(scene.piece_blur_px(conditions)) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
     pictures = scene.pictures(conditions, size_px)
     for picture, where in zip(pictures, scene.piece_homographies(conditions, size_px), strict=True):
         weight = picture[..., 0].astype(float)
@@ -204,7 +204,7 @@ def test_picture_and_homography_move_alike(scene, size_px):
 def test_zoom_takes_the_blur_along(scene):
     conditions = still(scene, 2)
     low = scene.settings.view.zoom[0]
-    background = conditions.background.copy()
+    background = conditions.pose.background.copy()
     background[:, 1] = 0
     small = replace(conditions, background=background)
     assert scene.piece_blur_px(small) == pytest.approx(scene.piece_blur_px(conditions) * low)

@@ -23,7 +23,7 @@ from patchproof.plan.samples import sample_plan
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.scene.flat import Picture
 from patchproof.scene.paper_light import PaperLight
-from patchproof.scene.photo_scene import PhotoScene, Seen
+from patchproof.scene.photo_scene import BasePhoto, PhotoScene
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import lay_out_piece
@@ -171,10 +171,10 @@ def test_even_light_in_place_of_the_sun_or_a_lamp_is_as_strong_on_the_patch(tmp_
     setup = Setup(problem.stage, None, scene.draw("select", 8))
     terms = {term.name: term for term in scene_terms(problem, problem.subject.start(), None)}
     before, without = setup.conditions, terms["directional light"].change(setup).conditions
-    assert not without.directional.any() and scene.white_light(without) == pytest.approx(scene.white_light(before))
-    assert without.ambient * without.sh2 == pytest.approx(before.ambient * before.sh2)
+    assert not without.light.directional.any() and scene.white_light(without) == pytest.approx(scene.white_light(before))
+    assert without.light.ambient * without.light.sh2 == pytest.approx(before.light.ambient * before.light.sh2)
     dark = terms["lamp"].change(setup).conditions
-    assert not dark.point.any() and (dark.ambient >= before.ambient).all()
+    assert not dark.light.point.any() and (dark.light.ambient >= before.light.ambient).all()
     assert terms["directional light"].change(replace(setup, conditions=without)) is None  # it is off already
 
 
@@ -224,7 +224,7 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
     piece = lay_out_piece((60, 60), 12, "A" * 10, "design")
     light = PaperLight(np.array([[0.5, -0.2, 0, 0, 0, 0]] * 3), 0.0, noise)
     where = np.array([[1.0, 0, 50], [0, 1, 25], [0, 0, 1]])
-    photos = [Seen(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)]
+    photos = [BasePhoto(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)]
     return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos), ())
 
 

@@ -107,7 +107,7 @@ def test_the_fit_finds_what_is_hard_and_ignores_what_does_not_vary(tmp_path):
     """Losses that rise with darkness and away from one azimuth, with noise: the expected order, by rank correlation."""
     problem = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]}, light={"ambient": [0.1, 0.9]})
     drawn = problem.scene.draw("train", 400)
-    truth = 2 * (1 - drawn.ambient) - np.cos(np.radians(drawn.azimuth_deg - 40))
+    truth = 2 * (1 - drawn.light.ambient) - np.cos(np.radians(drawn.pose.azimuth_deg - 40))
     noisy = truth + np.random.default_rng(0).normal(0, 0.5, 400)
     expected = expected_losses(drawn[:128], noisy[:128], drawn[128:])
     assert spearmanr(expected, truth[128:]).statistic > 0.9
@@ -120,9 +120,9 @@ def test_views_from_behind_a_patch_are_not_mined(tmp_path):
     """The object fails there, too, but the patch cannot be seen; where too few are not, nothing is mined."""
     around = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]})
     mined, drawn = training_conditions(around, 16), around.scene.draw("train", 12)
-    changed = mined.azimuth_deg != drawn.azimuth_deg
+    changed = mined.pose.azimuth_deg != drawn.pose.azimuth_deg
     assert changed.any() and (np.abs(around.scene.piece_azimuth_deg(mined))[changed] < 90).all()
-    np.testing.assert_array_equal(training_conditions(around, 1).azimuth_deg, drawn.azimuth_deg)  # too few to fit
+    np.testing.assert_array_equal(training_conditions(around, 1).azimuth_deg, drawn.pose.azimuth_deg)  # too few to fit
 
 
 def test_the_worst_of_every_eight_by_hand():
@@ -165,8 +165,8 @@ def test_a_cell_moves_pose_and_light_as_far_as_they_lay_in_their_ranges(tmp_path
     assert both[0].edges == pytest.approx((-60, -20, 20, 60)) and both[1].edges == pytest.approx((0, 0.3, 0.6))
     drawn = problem.scene.draw("select", 32)
     there = in_cell(drawn, both, (2, 0))
-    np.testing.assert_allclose(there.azimuth_deg, 20 + (drawn.azimuth_deg + 60) / 3)
-    np.testing.assert_allclose(there.ambient, drawn.ambient / 2)
+    np.testing.assert_allclose(there.pose.azimuth_deg, 20 + (drawn.pose.azimuth_deg + 60) / 3)
+    np.testing.assert_allclose(there.light.ambient, drawn.light.ambient / 2)
     others = [field.name for field in fields(drawn) if field.name not in ("azimuth_deg", "ambient")]
     np.testing.assert_array_equal(rows_of(there, others), rows_of(drawn, others))
 

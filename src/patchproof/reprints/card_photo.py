@@ -10,7 +10,6 @@ Left out on purpose: the card's side wall, gloss, and raised digits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import cv2
@@ -23,6 +22,7 @@ from patchproof.channel.camera import develop
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.run import Run
 from patchproof.output import new_folder
+from patchproof.scene.conditions import fields_of
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import page_pixels
@@ -68,7 +68,7 @@ def photograph_cards(
             pose, card_from_face = _pose(rng, scene, manifest, scale), _laid(rng, manifest, scale)
             light = float(scene.white_light(one)[0])
             picture = _picture(scene, pose, page, scale, _card_print(rng), card_from_face, one, light)
-            reprint.save_photo(picture, scene, int(one.jpeg[0]), folder / name)
+            reprint.save_photo(picture, scene, int(one.sensor.jpeg[0]), folder / name)
             truth[name] = _truth(scene, manifest, pose, scale, one)
             on_photo(i + 1, n)
         reprint.write_json(folder / "truth.json", truth)
@@ -140,7 +140,7 @@ def _picture(scene, pose, page, scale, card, card_from_face, conditions, light) 
     pictures = torch.from_numpy(np.ascontiguousarray(linear.transpose(2, 0, 1) * np.float32(light)))[None]
     if camera is not None:
         pictures = lens.distorted(pictures, camera, photo_px)
-    return develop(pictures, conditions, 1.0, jpeg=False)[0].permute(1, 2, 0)
+    return develop(pictures, conditions.sensor, 1.0, jpeg=False)[0].permute(1, 2, 0)
 
 
 def _from_dots(corner_mm: float) -> np.ndarray:
@@ -176,7 +176,7 @@ def _truth(scene: MeshScene, manifest: Manifest, pose, scale, conditions) -> dic
     for marker in manifest.markers:
         seen = geometry.apply_homography(homography, np.array(marker.corners_mm))
         corners[str(marker.id)] = (lens.distort_points(seen, camera, photo_px) if bends else seen).tolist()
-    drawn = {field.name: np.asarray(getattr(conditions, field.name)[0]).tolist() for field in fields(conditions)}
+    drawn = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
     return {
         "homography_px_from_mm": None if bends else geometry.normalized(homography).tolist(),
         "marker_corners_px": corners,
