@@ -13,6 +13,7 @@ from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.scene import flat
+from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import _digest, load_photo_scene, see
 from patchproof.settings import SceneSettings
@@ -115,7 +116,7 @@ def still(scene, n: int):
     background[:, 0] = (np.arange(n) + 0.5) / len(scene.photos)
     low, high = scene.settings.view.zoom
     background[:, 1] = np.log(1 / low) / np.log(high / low)  # zoom 1
-    return replace(drawn, background=background, roll_deg=np.zeros(n), look_at_offset=np.zeros((n, 3)))
+    return with_values(drawn, background=background, roll_deg=np.zeros(n), look_at_offset=np.zeros((n, 3)))
 
 
 def test_geometry_light_blur_and_noise_are_recovered(world, scene):
@@ -206,7 +207,7 @@ def test_zoom_takes_the_blur_along(scene):
     low = scene.settings.view.zoom[0]
     background = conditions.pose.background.copy()
     background[:, 1] = 0
-    small = replace(conditions, background=background)
+    small = with_values(conditions, background=background)
     assert scene.piece_blur_px(small) == pytest.approx(scene.piece_blur_px(conditions) * low)
 
 
