@@ -252,7 +252,7 @@ def test_textures_have_no_markers_and_no_printer(tmp_path):
     assert not terms & {"printer's colors", "print variation", "gloss"} and "directional light" in terms
     found = resolution_plan(problem)
     assert found.design_px is None and found.texels == sum(int(mask.sum()) for mask in scene.canvas.mask)
-    mean_mm = float(np.mean(scene.draw("select", 1024, 0).distance_mm))
+    mean_mm = float(np.mean(scene.draw("select", 1024, 0).pose.distance_mm))
     focal_px = 48 / math.tan(math.radians(25))
     assert found.px_per_mm_network[0] < focal_px / mean_mm < found.px_per_mm_network[1]
 

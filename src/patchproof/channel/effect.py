@@ -54,59 +54,58 @@ Facing = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Setting:
-    """A key "table.name" of the scene's settings, and the ends of the range that its value stands for."""
+    """A key "table.name" of the scene's settings whose value stands for a range."""
 
     key: str
-    ends: Callable[[Any], tuple[float, float]] = lambda value: value
-
-    def range(self, settings: SceneSettings) -> tuple[float, float]:
-        """(low, high)."""
-        table, name = self.key.split(".")
-        return self.ends(getattr(getattr(settings, table), name))
+    ends: Callable[[Any], tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One thing that views differ by. `columns` are the numbers it takes and their ranges; they fill the fields of the
-    same names, or are `made` into `fields`. `first` is where they stand in the draws that the oldest effects share.
+    """One thing that views differ by. `columns` are the numbers it takes, each with its range or the setting's key that
+    has it; they fill the fields of the same names, or are `made` into the fields `into`. `first` is where they stand in
+    the draws that the oldest effects share.
 
     `switch` is False of what no picture can be without. `instead` makes the light that stands in for a light left out.
     """
 
     name: str
-    columns: Mapping[str, Setting | tuple[float, float]]
+    columns: Mapping[str, str | Setting | tuple[float, float]]
     first: int | None = None
-    fields: tuple[str, ...] = ()
-    made: Callable[..., tuple[np.ndarray, ...]] | None = None
+    into: tuple[str, ...] = ()
+    made: Callable[..., tuple[np.ndarray, ...]] = lambda *columns: columns
     switch: bool = True
     instead: Callable[[Any, Facing], Rows] | None = None
     slows: bool = False  # whether a step takes longer with it
     whole: bool = False  # whether it takes whole photographs to be seen as it is
     only_paper: bool = False  # whether nothing but paper shows it
 
-    def __post_init__(self):
-        if self.made is None:
-            object.__setattr__(self, "fields", self.fields or tuple(self.columns))
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields it fills; the first is its strength."""
+        return self.into or tuple(self.columns)
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The settings it reads; the first turns it on and off."""
-        return tuple(source.key for source in self.columns.values() if isinstance(source, Setting))
+        sources = (source.key if isinstance(source, Setting) else source for source in self.columns.values())
+        return tuple(source for source in sources if isinstance(source, str))
 
     def range(self, settings: SceneSettings, column: str) -> tuple[float, float]:
         """The (low, high) of one of its columns."""
         source = self.columns[column]
-        return source.range(settings) if isinstance(source, Setting) else source
+        if isinstance(source, tuple):
+            return source
+        key, ends = (source.key, source.ends) if isinstance(source, Setting) else (source, tuple)
+        table, name = key.split(".")
+        low, high = ends(getattr(getattr(settings, table), name))
+        return low, high
 
     def sample(self, settings: SceneSettings, unit: np.ndarray, number: np.ndarray) -> dict[str, np.ndarray]:
         """Its fields for N views with numbers N×columns in [0, 1); without columns, the views' own `number` N."""
-        values = []
-        for name, column in zip(self.columns, unit.T, strict=True):
-            low, high = self.range(settings, name)
-            values.append(low + (high - low) * column)
-        if self.made is not None:
-            values = self.made(*values)
-        return dict(zip(self.fields, values or [number], strict=True))
+        ends = (self.range(settings, name) for name in self.columns)
+        columns = [low + (high - low) * column for (low, high), column in zip(ends, unit.T, strict=True)]
+        return dict(zip(self.fields, self.made(*columns) if columns else (number,), strict=True))
 
     def off(self, record: Rows, facing: Facing) -> Rows | None:
         """The record without the effect; None where it is off in all views."""

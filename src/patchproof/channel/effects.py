@@ -19,8 +19,7 @@ from patchproof.channel.effect import Effect, Facing, Rows, Setting, off
 from patchproof.color import tinted_white
 
 # The sun and lamps stand within these angles of the patch's side: from behind, nothing on the patch could be seen.
-LIGHT_AZIMUTH_DEG = (-90.0, 90.0)
-LIGHT_ELEVATION_DEG = (10.0, 80.0)
+_AZIMUTH_DEG, _ELEVATION_DEG = (-90.0, 90.0), (10.0, 80.0)
 _UNIT = (0.0, 1.0)
 # Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
 _NORMAL_MARGIN = 1e-3
@@ -90,16 +89,12 @@ RECORDS: dict[str, type[Rows]] = {"pose": Pose, "light": Light, "print": Print, 
 RECORD_OF = {part.name: record for record, kind in RECORDS.items() for part in fields(kind)}
 
 
-def _either_way(size: float) -> tuple[float, float]:
-    return -size, size
-
-
-def _gains(red: np.ndarray, blue: np.ndarray) -> tuple[np.ndarray, ...]:
-    return (np.exp(np.stack([red, np.zeros_like(red), blue], 1)),)
-
-
-def _stacked(*columns: np.ndarray) -> tuple[np.ndarray, ...]:
+def _stacked(*columns: np.ndarray) -> tuple[np.ndarray]:
     return (np.stack(columns, 1),)
+
+
+def _view(azimuth, elevation, distance, roll, *offset: np.ndarray) -> tuple[np.ndarray, ...]:
+    return azimuth, elevation, distance, roll, np.stack(offset, 1)
 
 
 def _uneven(sh2: np.ndarray, *coefficients: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -108,14 +103,22 @@ def _uneven(sh2: np.ndarray, *coefficients: np.ndarray) -> tuple[np.ndarray, ...
     return sh2, ndtri(_NORMAL_MARGIN + (1 - 2 * _NORMAL_MARGIN) * np.stack(coefficients, 1))
 
 
-def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> tuple[np.ndarray, ...]:
+def _white(light: np.ndarray, b: np.ndarray) -> tuple[np.ndarray]:
+    return (tinted_white(light, b),)
+
+
+def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> tuple[np.ndarray]:
     """Both planes as far, each in its own direction."""
     angles = np.stack(turns, 1) * 2 * np.pi
     return (length_mm[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1),)
 
 
-def _view(azimuth, elevation, distance, roll, *offset: np.ndarray) -> tuple[np.ndarray, ...]:
-    return azimuth, elevation, distance, roll, np.stack(offset, 1)
+def _gains(red: np.ndarray, blue: np.ndarray) -> tuple[np.ndarray]:
+    return (np.exp(np.stack([red, np.zeros_like(red), blue], 1)),)
+
+
+def _whole(quality: np.ndarray) -> tuple[np.ndarray]:
+    return (np.round(quality).astype(np.int64),)
 
 
 def _even_for_sun(light: Light, facing: Facing) -> Light:
@@ -141,111 +144,48 @@ def _sun_alone(light: Light, facing: Facing) -> Light:
     return replace(light, ambient=np.zeros_like(light.ambient), directional=sun)
 
 
-_JITTER = Setting("view.look_at_jitter", _either_way)
-_BALANCE = Setting("camera.white_balance", lambda share: _either_way(np.log1p(share)))
+def _units(*names: str) -> dict[str, tuple[float, float]]:
+    return dict.fromkeys(names, _UNIT)
+
+
+_VIEW = {name: f"view.{name}" for name in ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg")}
+_JITTER = Setting("view.look_at_jitter", lambda share: (-share, share))
+_BALANCE = Setting("camera.white_balance", lambda share: (-np.log1p(share), np.log1p(share)))
+_SUN = {"light_azimuth_deg": _AZIMUTH_DEG, "light_elevation_deg": _ELEVATION_DEG}
+_LAMP = {"point_azimuth_deg": _AZIMUTH_DEG, "point_elevation_deg": _ELEVATION_DEG}
+_LAMP_MM = {"point_distance_mm": "light.point_distance_mm"}
+_SHIFT = {"length": "printer.misregistration_mm"} | _units("red", "blue")
+_SH2 = {"sh2": "light.sh2"} | _units(*(f"coefficient {i}" for i in range(8)))
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect(
-        "viewpoint",
-        {name: Setting(f"view.{name}") for name in ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg")}
-        | dict.fromkeys(("right", "up", "near"), _JITTER),
-        0,
-        ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset"),
-        _view,
-        switch=False,
-    ),
-    Effect(
-        "background",
-        dict.fromkeys(("picture", "crop size", "crop x", "crop y", "mirrored"), _UNIT),
-        11,
-        ("background",),
-        _stacked,
-        switch=False,
-    ),
-    Effect(
-        "directional light",
-        {
-            "directional": Setting("light.directional"),
-            "light_azimuth_deg": LIGHT_AZIMUTH_DEG,
-            "light_elevation_deg": LIGHT_ELEVATION_DEG,
-        },
-        8,
-        instead=_even_for_sun,
-    ),
-    Effect("ambient light", {"ambient": Setting("light.ambient")}, 7, instead=_sun_alone),
-    Effect(
-        "lamp",
-        {
-            "point": Setting("light.point"),
-            "point_azimuth_deg": LIGHT_AZIMUTH_DEG,
-            "point_elevation_deg": LIGHT_ELEVATION_DEG,
-            "point_distance_mm": Setting("light.point_distance_mm"),
-        },
-        25,
-        instead=_even_for_lamp,
-        slows=True,
-    ),
-    Effect(
-        "uneven ambient",
-        {"sh2": Setting("light.sh2")} | {f"coefficient {i}": _UNIT for i in range(8)},
-        29,
-        ("sh2", "sh2_coefficients"),
-        _uneven,
-        slows=True,
-    ),
-    Effect(
-        "gloss",
-        {"gloss": Setting("light.gloss"), "shininess": Setting("light.shininess")},
-        38,
-        slows=True,
-        only_paper=True,
-    ),
-    Effect("dot gain", {"dot_gain": Setting("printer.dot_gain")}, 22),
-    Effect("ink density", {"density": Setting("printer.density")}, 23),
-    Effect("printed black", {"black": Setting("printer.black")}, 24),
-    Effect(
-        "paper white",
-        {"white": Setting("printer.paper_white"), "b": Setting("printer.paper_b")},
-        43,
-        ("paper",),
-        lambda white, b: (tinted_white(white, b),),
-    ),
-    Effect(
-        "misregistration",
-        {"length": Setting("printer.misregistration_mm"), "red": _UNIT, "blue": _UNIT},
-        45,
-        ("misregistration_mm",),
-        _shifts,
-        slows=True,
-    ),
-    Effect("print scale", {"printed_scale": Setting("printer.scale")}, 48),
-    Effect("exposure", {"exposure_ev": Setting("camera.exposure_ev")}, 16),
+    Effect("viewpoint", _VIEW | dict.fromkeys("xyz", _JITTER), 0, (*_VIEW, "look_at_offset"), _view, switch=False),
+    Effect("background", _units("picture", "size", "x", "y", "mirrored"), 11, ("background",), _stacked, switch=False),
+    Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
+    Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
+    Effect("lamp", {"point": "light.point"} | _LAMP | _LAMP_MM, 25, instead=_even_for_lamp, slows=True),
+    Effect("uneven ambient", _SH2, 29, ("sh2", "sh2_coefficients"), _uneven, slows=True),
+    Effect("gloss", {"gloss": "light.gloss", "shininess": "light.shininess"}, 38, slows=True, only_paper=True),
+    Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
+    Effect("ink density", {"density": "printer.density"}, 23),
+    Effect("printed black", {"black": "printer.black"}, 24),
+    Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), _white),
+    Effect("misregistration", _SHIFT, 45, ("misregistration_mm",), _shifts, slows=True),
+    Effect("print scale", {"printed_scale": "printer.scale"}, 48),
+    Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16),
     Effect("white balance", {"red": _BALANCE, "blue": _BALANCE}, 17, ("white_balance",), _gains),
-    Effect("vignetting", {"vignetting": Setting("camera.vignetting")}, 42, slows=True),
-    Effect(
-        "motion blur",
-        {"motion_px": Setting("camera.motion_px"), "motion_deg": (0.0, 180.0)},
-        40,
-        slows=True,
-        whole=True,
-    ),
-    Effect("blur", {"blur_px": Setting("camera.blur_px")}, 19, slows=True, whole=True),
-    Effect("noise", {"noise": Setting("camera.noise")}, 20, slows=True, whole=True),
+    Effect("vignetting", {"vignetting": "camera.vignetting"}, 42, slows=True),
+    Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, slows=True, whole=True),
+    Effect("blur", {"blur_px": "camera.blur_px"}, 19, slows=True, whole=True),
+    Effect("noise", {"noise": "camera.noise"}, 20, slows=True, whole=True),
     Effect("grain", {}, 25, ("noise_seed",), switch=False),
-    Effect(
-        "JPEG",
-        {"jpeg": Setting("camera.jpeg")},
-        21,
-        ("jpeg",),
-        lambda quality: (np.round(quality).astype(np.int64),),
-        slows=True,
-        whole=True,
-    ),
+    Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, ("jpeg",), _whole, slows=True, whole=True),
 )
 EFFECT = {effect.name: effect for effect in EFFECTS}
+
+
+def _place(effect: Effect) -> tuple[float, int]:
+    return np.inf if effect.first is None else effect.first, len(effect.columns)
+
+
 # Fields in the order in which files have them: as they were drawn when all effects shared one sequence.
-FIELDS = tuple(
-    name
-    for effect in sorted(EFFECTS, key=lambda e: (np.inf if e.first is None else e.first, len(e.columns)))
-    for name in effect.fields
-)
+FIELDS = tuple(name for effect in sorted(EFFECTS, key=_place) for name in effect.fields)
