@@ -301,7 +301,9 @@ def test_promises_of_other_seeds_spread_as_their_interval_says(tmp_path):
     """
     scene, n = scene_with(tmp_path), 64
     drawn = [scene.draw("promise", n, seed) for seed in range(100)]
-    seen = np.array([(c.azimuth_deg < 10) | (c.white_balance[:, 0] > c.white_balance[:, 2]) for c in drawn])
+    seen = np.array(
+        [(c.pose.azimuth_deg < 10) | (c.sensor.white_balance[:, 0] > c.sensor.white_balance[:, 2]) for c in drawn]
+    )
     for recognized, holds in ((seen, True), (seen[:, :8].repeat(8, 1), False)):
         counts, rate = recognized.sum(1), recognized.mean()
         inside = sum(low <= rate <= high for low, high in (wilson(int(count), n) for count in counts))

@@ -177,7 +177,7 @@ def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
     written(tmp_path, "carton")
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
     views = three_views(problem, 4)
-    assert sorted(set(views.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
+    assert sorted(set(views.pose.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
     assert len(set(views.directional)) == 12 and len(set(views.distance_mm)) == 1
     still = from_sides(problem, np.array([0.0, 90.0]))
     assert not still.directional.any() and not still.noise.any() and (still.ambient == 1).all()

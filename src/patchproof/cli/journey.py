@@ -66,7 +66,8 @@ def plan(
 ) -> None:
     """What is modeled, what is not, and why."""
     from patchproof.output import check_file, write_whole
-    from patchproof.plan.plan import plan_lines, plan_scene
+    from patchproof.plan.lines import plan_lines
+    from patchproof.plan.plan import plan_scene
 
     if out is not None:
         check_file(out, overwrite)

@@ -98,7 +98,7 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "recognized": seen["recognized"],
         "confidence": seen["confidence"],
         "recognized_in_images": flat["recognized"],
-        "azimuth_deg": conditions.azimuth_deg.tolist(),
+        "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": scene.settings.view.azimuth_deg,
         "passes": {name: passes(one) for name, one in (("3d", problem), ("2d", twin))},
         "share": twin.scene.settings.view.patch_share,

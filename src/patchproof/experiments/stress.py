@@ -12,7 +12,6 @@ for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,7 +43,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table, difference, rate
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, fields_of, with_values
 from patchproof.strict import Share, Strict
 from patchproof.study.study import Cell, Result, Study
 
@@ -190,13 +189,14 @@ def worst_case(
     for number in range(settings.rounds):
         drawn = scene.draw("select", settings.tries, seed, settings.draws + number * settings.tries)
         if best is not None:  # between two points of a box all lies within it
-            nearer = {name: best[name] + 0.5**number * (getattr(drawn, name) - best[name]) for name in names}
-            drawn = replace(drawn, **nearer)
+            fields = fields_of(drawn)
+            nearer = {name: best[name] + 0.5**number * (fields[name] - best[name]) for name in names}
+            drawn = with_values(drawn, **nearer)
         losses = clean_losses(problem, each_before_all(drawn, rest, names))
         losses = losses.reshape(settings.tries, settings.draws).mean(1)
         if losses.max() > best_loss:
             best_loss, row = float(losses.max()), int(losses.argmax())
-            best = {name: getattr(drawn, name)[row : row + 1] for name in names}
+            best = {name: fields_of(drawn)[name][row : row + 1] for name in names}
         course.append(best_loss)
     fresh = scene.draw("evaluate", settings.n, seed + _MEASURING)
     there = judge(problem, {"clean": None}, _with(fresh, best))["clean"]
@@ -213,14 +213,14 @@ def worst_case(
 
 def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
     """Fields of one figure whose range is more than a value; a lamp's only where there are lamps."""
-    lamps = drawn.point.max() > 0
-    figures = {name: getattr(drawn, name) for name in names if lamps or not name.startswith("point")}
+    lamps, fields = drawn.light.point.max() > 0, fields_of(drawn)
+    figures = {name: fields[name] for name in names if lamps or not name.startswith("point")}
     return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
 
 
 def _with(conditions: Conditions, values: Mapping[str, np.ndarray]) -> Conditions:
     """`conditions` with the same one row of some fields everywhere."""
-    return replace(conditions, **{name: one.repeat(len(conditions), 0) for name, one in values.items()})
+    return with_values(conditions, **values)
 
 
 # -------------------------------------------------------------------------------------------- tables and figures

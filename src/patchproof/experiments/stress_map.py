@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,10 +18,11 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
+from patchproof.channel.effects import EFFECTS
 from patchproof.goal import Goal
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
-from patchproof.scene.conditions import LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, Conditions
+from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, Strict, expand, read_toml, validated
@@ -120,16 +121,9 @@ def problem_of(cell: Cell, base: Path, **optimize: int) -> Problem:
 
 def axes(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:
     """The map's axes, pose and light, over the scene's ranges; refused where a range is a single value."""
-    ranges = {
-        "light_azimuth_deg": LIGHT_AZIMUTH_DEG,
-        "light_elevation_deg": LIGHT_ELEVATION_DEG,
-        "exposure_ev": settings.camera.exposure_ev,
-        "ambient": settings.light.ambient,
-        "directional": settings.light.directional,
-    }
 
     def axis(name: str, count: int) -> Axis:
-        low, high = ranges[name] if name in ranges else getattr(settings.view, name)
+        low, high = next(effect.range(settings, name) for effect in EFFECTS if name in effect.columns)
         if low == high:
             do = "widen it, or choose another axis"
             raise Refused(f"a range of {name} that a map can be cut from", f"[{low:g}, {high:g}]", do)
@@ -140,20 +134,19 @@ def axes(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:
 
 def in_cell(conditions: Conditions, both: tuple[Axis, Axis], cell: tuple[int, int]) -> Conditions:
     """`conditions` with pose and light moved into a cell (its numbers), each as far in as it lay in its range."""
-    changed = {}
+    changed, fields = {}, fields_of(conditions)
     for axis, number in zip(both, cell, strict=True):
         first, last, low, high = axis.edges[0], axis.edges[-1], axis.edges[number], axis.edges[number + 1]
-        share = (getattr(conditions, axis.name) - first) / (last - first)
+        share = (fields[axis.name] - first) / (last - first)
         changed[axis.name] = low + (high - low) * share
-    return replace(conditions, **changed)
+    return with_values(conditions, **changed)
 
 
 def in_cells(conditions: Conditions, both: tuple[Axis, Axis], cells: Sequence[tuple[int, int]]) -> Conditions:
     """`conditions` moved into cells, an equal share of the rows into each, in order; no draw serves two cells."""
     n = len(conditions) // len(cells)
-    parts = [in_cell(conditions[i * n : (i + 1) * n], both, cell) for i, cell in enumerate(cells)]
-    names = vars(parts[0])
-    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    parts = [fields_of(in_cell(conditions[i * n : (i + 1) * n], both, cell)) for i, cell in enumerate(cells)]
+    return of_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def judge(problem: Problem, things: Mapping[str, Shown], conditions: Conditions) -> dict[str, Said]:

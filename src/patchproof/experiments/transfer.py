@@ -81,7 +81,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if isinstance(problem.scene, MeshScene):
         views = three_views(problem, settings.lights)
         found["views"] = said(judged(problem, things, views))["hits"]
-        found["azimuths"] = views.azimuth_deg[:: settings.lights].tolist()
+        found["azimuths"] = views.pose.azimuth_deg[:: settings.lights].tolist()
     return found | files
 
 

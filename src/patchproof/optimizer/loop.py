@@ -23,7 +23,7 @@ from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
-from patchproof.render.views import Seen
+from patchproof.render.views import Views
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
@@ -106,7 +106,7 @@ def best_design(problem: Problem, conditions: Conditions | None = None) -> np.nd
     return problem.subject.pixels(state.best)
 
 
-def _step(problem: Problem, state: State, seen: Seen) -> Step:
+def _step(problem: Problem, state: State, seen: Views) -> Step:
     design = state.design.clone().requires_grad_()
     pictures = expose(seen, problem.subject.shown(design))
     losses, confidences, rates = _score(problem, pictures)
@@ -153,7 +153,7 @@ def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
     return torch.stack(losses).mean(), confidence / count, rate / count
 
 
-def _selection(problem: Problem) -> list[Seen]:
+def _selection(problem: Problem) -> list[Views]:
     """The selection views, seen once and shaded anew for each design."""
     conditions = problem.scene.draw("select", SELECT_VIEWS)
     shown = problem.subject.shown(start(problem).design)
@@ -162,7 +162,7 @@ def _selection(problem: Problem) -> list[Seen]:
         return [problem.see(shown, part, problem.training_px) for part in parts]
 
 
-def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
+def _select(problem: Problem, selection: list[Views], step: Step) -> Step:
     """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
     state = step.state
     printed = from_pixels(as_pixels(state.design), problem.device)

@@ -20,7 +20,7 @@ from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import Seen, see
+from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
 from patchproof.strict import Refused
@@ -51,7 +51,7 @@ class Problem:
         """The side at which views are rendered for figures that people will read."""
         return self._view_px(FIGURE_PX)
 
-    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Seen:
+    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
         piece = shown if isinstance(shown, PiecePicture) else None
         return see(self.stage, piece, conditions, (side_px, side_px))

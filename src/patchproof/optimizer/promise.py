@@ -147,7 +147,7 @@ def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionCl
                 blur_px=_rounded(blur),
                 recognized=bool(seen),
             )
-            for blur, seen in zip(conditions.blur_px, recognized, strict=True)
+            for blur, seen in zip(conditions.sensor.blur_px, recognized, strict=True)
         )
     x, y, width, height = scene.piece.design_rect_mm
     middle = np.array([x + width / 2, y + height / 2])
@@ -163,7 +163,7 @@ def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionCl
                 tilt_deg=_rounded(tilt) if faces else None,
                 azimuth_deg=_rounded(azimuths[i]) if faces else None,
                 contrast=_rounded(contrast[i]) if faces else None,
-                blur_px=_rounded(conditions.blur_px[i]),
+                blur_px=_rounded(conditions.sensor.blur_px[i]),
                 recognized=bool(recognized[i]),
             )
         )
@@ -172,7 +172,7 @@ def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionCl
 
 def _contrasts(problem: Problem, conditions: Conditions) -> np.ndarray:
     """Paper white minus printed black in the photograph's linear light."""
-    exposed = problem.scene.white_light(conditions) * conditions.paper[:, 1] * 2**conditions.exposure_ev
+    exposed = problem.scene.white_light(conditions) * conditions.print.paper[:, 1] * 2**conditions.sensor.exposure_ev
     black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
     return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
 

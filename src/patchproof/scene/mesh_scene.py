@@ -15,6 +15,7 @@ import numpy as np
 
 from patchproof import geometry
 from patchproof.channel import lens
+from patchproof.channel.effects import Pose
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
@@ -57,19 +58,26 @@ class MeshScene:
         return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
 
     @property
+    def length_mm(self) -> float:
+        """The object's longest extent."""
+        if self.settings.object.length_mm is None:
+            raise ValueError("a mesh has a length")
+        return self.settings.object.length_mm
+
+    @property
     def middle_mm(self) -> np.ndarray:
         """The middle of the piece in the world; without one, of the side it would face."""
         return self.frame.origin_mm if self.placement is None else self.placement.center_mm
 
     def camera_from_world(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 poses of the drawn cameras."""
-        return camera_poses(self.settings, self.mesh, self.frame, self.middle_mm, conditions)
+        return camera_poses(self.settings, self.mesh, self.frame, self.middle_mm, conditions.pose)
 
     def camera_from_print(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as large as it was
         printed: all about the piece's middle is scaled, which keeps a card in its plane.
         """
-        scales = [geometry.scaled_about(self.middle_mm, scale) for scale in conditions.printed_scale]
+        scales = [geometry.scaled_about(self.middle_mm, scale) for scale in conditions.pose.printed_scale]
         return self.camera_from_world(conditions) @ np.stack(scales)
 
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
@@ -91,9 +99,9 @@ class MeshScene:
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
         """N: the light on white paper at the piece's middle, without lamps."""
-        frame = self.frame
-        toward = geometry.orbit(conditions.light_azimuth_deg, conditions.light_elevation_deg, frame.normal, frame.up)
-        return conditions.ambient + conditions.directional * np.clip(toward @ self.placement.normal, 0, None)
+        frame, light = self.frame, conditions.light
+        toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)
+        return light.ambient + light.directional * np.clip(toward @ self.placement.normal, 0, None)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
         """Pixels per millimetre of the piece in the closest view."""
@@ -155,20 +163,20 @@ def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) ->
     return MeshScene(settings, Path(), seed, mesh, frame, None, None, backgrounds, "", 0.0, mesh.warnings)
 
 
-def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, conditions: Conditions) -> np.ndarray:
+def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, pose: Pose) -> np.ndarray:
     """`camera_from_world` N×4×4: on an orbit about what the camera looks at, azimuth 0 facing the patch's side."""
     center = np.zeros(3) if settings.view.look_at == "object" else np.asarray(patch_mm)
-    targets = center + conditions.look_at_offset * settings.object.length_mm
-    directions = geometry.orbit(conditions.azimuth_deg, conditions.elevation_deg, frame.normal, frame.up)
-    eyes = targets + conditions.distance_mm[:, None] * directions
+    targets = center + pose.look_at_offset * settings.object.length_mm
+    directions = geometry.orbit(pose.azimuth_deg, pose.elevation_deg, frame.normal, frame.up)
+    eyes = targets + pose.distance_mm[:, None] * directions
     _refuse_inside(mesh, eyes)
-    return geometry.look_at(eyes, targets, conditions.roll_deg, frame.up)
+    return geometry.look_at(eyes, targets, pose.roll_deg, frame.up)
 
 
 def _smallest_scales(settings: SceneSettings, mesh: Mesh, frame: Frame, card: Placement, camera) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
     conditions = draw(settings, "select", _VIEWS_TRIED, 0)
-    poses = camera_poses(settings, mesh, frame, card.center_mm, conditions)
+    poses = camera_poses(settings, mesh, frame, card.center_mm, conditions.pose)
     photo_px = settings.camera.photo_px
     matrix = (
         geometry.intrinsics(settings.view.fov_deg, photo_px) if camera is None else lens.matrix_px(camera, photo_px)

@@ -74,9 +74,9 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     taken = {
         "tilt_deg": tilt_deg,
         "module_px": px_per_mm * hall.module_mm,
-        "blur_px": float(conditions.blur_px[0]),
-        "noise": float(conditions.noise[0]),
-        "jpeg": int(conditions.jpeg[0]),
+        "blur_px": float(conditions.sensor.blur_px[0]),
+        "noise": float(conditions.sensor.noise[0]),
+        "jpeg": int(conditions.sensor.jpeg[0]),
         "hidden": share,
     }
     return taken | hall.found(srgb, focal_px, truth)
@@ -121,7 +121,7 @@ class _Hall:
             picture = picture + cover[..., None] * (rng.uniform(0.05, 0.8, 3).astype(np.float32) - picture)
         buffer = io.BytesIO()
         pixels = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=int(conditions.jpeg[0]))
+        Image.fromarray(pixels).save(buffer, "JPEG", quality=int(conditions.sensor.jpeg[0]))
         return np.asarray(Image.open(buffer).convert("RGB")), self.scene.matrix_px(photo_px)[0, 0], share
 
     def found(self, srgb, focal_px, truth) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from pydantic import Field
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import local_scale
 from patchproof.report.tables import Table, rate
-from patchproof.scene.conditions import with_value
+from patchproof.scene.conditions import with_values
 from patchproof.strict import Strict
 from patchproof.study.study import Cell, Result, Study
 
@@ -229,12 +229,13 @@ def _trouble(kind: str, rng: np.random.Generator, conditions, hall: _Hall):
         return name, printer, conditions
     if kind == "blur":  # up to what still shows the cells of markers apart
         modules = rng.uniform(0.35, 0.55)
-        return f"{modules:.2f} modules", None, with_value(conditions, "blur_px", modules * hall.module_px(conditions))
+        return f"{modules:.2f} modules", None, with_values(conditions, blur_px=modules * hall.module_px(conditions))
     if kind == "cast":
         gains = np.exp(rng.uniform(-1.8, 0.2, 3))
-        return f"gains {gains.round(2)}", None, replace(conditions, white_balance=conditions.white_balance * gains)
+        cast = with_values(conditions, white_balance=conditions.sensor.white_balance * gains)
+        return f"gains {gains.round(2)}", None, cast
     stops = rng.uniform(2.0, 5.5)
-    return f"{stops:.1f} stops", None, replace(conditions, exposure_ev=conditions.exposure_ev - stops)
+    return f"{stops:.1f} stops", None, with_values(conditions, exposure_ev=conditions.sensor.exposure_ev - stops)
 
 
 def _wrong_printer(rng: np.random.Generator, hall: _Hall):
