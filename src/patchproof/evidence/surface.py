@@ -8,6 +8,7 @@ the design's page; each of its pages is another, by which scans and photographs 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,6 +18,9 @@ from patchproof.geometry import rect_corners
 from patchproof.photo.detect import cells_of
 from patchproof.photo.label import Label, label_of
 from patchproof.sheets.manifest import Manifest
+
+if TYPE_CHECKING:
+    from patchproof.channel.printer import Printer
 
 _LARGEST_PX = 512  # of the design as it is compared; photographs never resolve more
 _LARGEST_PIECE_PX = 1024  # of the piece as it is put back
@@ -51,9 +55,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Promised:
-    """Linear light as the printer model has it: design H×W×3 (None on pages without), swatches N×3, marker ink (3,)."""
+    """Linear light as the printer model has it: design H×W×3, swatches N×3, marker ink (3,)."""
 
-    design: np.ndarray | None
+    design: np.ndarray
     swatches: np.ndarray
     ink: np.ndarray
 
@@ -109,8 +113,8 @@ def _surface(manifest, corners, piece, rect, swatch_rects=(), colors=(), pages=(
     )
 
 
-def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
-    """How design, swatches and ink should look; `printer.apply` maps sRGB tensors N×3×H×W to media-relative sRGB."""
+def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:
+    """How design, swatches and ink should look; None on pages without a design."""
     import torch
 
     def printed(srgb: np.ndarray) -> np.ndarray:
@@ -118,12 +122,10 @@ def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
         with torch.inference_mode():
             return linear_from_srgb(printer.apply(tensor)[0].numpy().transpose(1, 2, 0).astype(float))
 
-    colors = np.concatenate([surface.swatches_srgb, [[0.0, 0.0, 0.0]]])[None]
-    swatches = printed(colors)[0]
-    design = None
-    if manifest.design:
-        design = reduced(printed(manifest.design.pixels() / 255.0).astype(np.float32))
-    return Promised(design, swatches[:-1], swatches[-1])
+    if manifest.design is None:
+        return None
+    swatches = printed(np.concatenate([surface.swatches_srgb, [[0.0, 0.0, 0.0]]])[None])[0]
+    return Promised(reduced(printed(manifest.design.pixels() / 255.0)), swatches[:-1], swatches[-1])
 
 
 def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, ink: np.ndarray) -> np.ndarray:
@@ -154,7 +156,8 @@ def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, in
 
 
 def reduced(linear: np.ndarray) -> np.ndarray:
-    """A design's light H×W×3 at the size at which it is compared."""
+    """A design's light H×W×3 at the size at which it is compared, float32."""
+    linear = linear.astype(np.float32)
     shrink = _LARGEST_PX / max(linear.shape[:2])
     if shrink >= 1:
         return linear

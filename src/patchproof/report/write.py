@@ -33,17 +33,17 @@ _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimetre"
 
 
 def write_report(
-    report: Mapping[str, Any], manifest: Mapping[str, Any], out_dir: str | Path, notes: Mapping[str, Any] | None = None
+    report: Mapping[str, Any], manifest: Mapping[str, Any], out_dir: str | Path, ledger: Mapping[str, Any] | None = None
 ) -> Path:
     """Write report.json, report.csv and report.html into `out_dir`; returns the page's path.
 
     `report` and `manifest` are `model_dump()`s. Pictures are those of `images.save_pictures` in `out_dir`/pictures:
-    `photo`, `seen`, `fitted`, `promised` and `delta_e00`. `notes` may hold `ledger` (see `plots.ledger_plot`).
+    `photo`, `seen`, `fitted`, `promised` and `delta_e00`. `ledger` is that of `plots.ledger_plot`.
     """
     out = Path(out_dir)
     make_folder(out)
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
-    page = render(report, manifest, pictures, notes or {})
+    page = render(report, manifest, pictures, ledger)
     texts = {
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "report.csv": photos_csv(report["photos"]),
@@ -54,7 +54,9 @@ def write_report(
     return out / "report.html"
 
 
-def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], notes: Mapping) -> str:
+def render(
+    report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], ledger: Mapping | None
+) -> str:
     """The page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     import jinja2
 
@@ -77,8 +79,8 @@ def render(report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str
         effect=_EFFECTS[report["summary"]["effect"]],
         bars=_bars(report["summary"], promise, report["controls"]),
         controls=report["controls"],
-        ledger=notes.get("ledger"),
-        waterfall=ledger_plot(notes["ledger"]) if notes.get("ledger") else "",
+        ledger=ledger,
+        waterfall=ledger_plot(ledger) if ledger else "",
         plots=_plots(report, promise, primary),
         sized=any(photo["scale_x"] is not None for photo in report["photos"]),
         cards=[_card(photo, encoded.get(photo["file"], {})) for photo in report["photos"]],
