@@ -63,7 +63,9 @@ def ledger_of(
     """The ledger of photographs whose own target confidence is `confidence` by file; None where nothing can be said."""
     if not shots or manifest.promise is None or manifest.design is None:
         return None
-    claims = [(c.contrast, c.blur_px) for c in manifest.promise.conditions if c.contrast is not None and c.blur_px is not None]
+    claims = [
+        (c.contrast, c.blur_px) for c in manifest.promise.conditions if c.contrast is not None and c.blur_px is not None
+    ]
     if not claims:
         return None
     undo = [light_fit(shot, promised) for shot in shots]

@@ -92,7 +92,7 @@ def matched_rate(
 
 
 def _figures(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
-    """What is known of the figures that conditions have, pixels as a photograph of that shorter side would show them."""
+    """The known ones of the figures that conditions have, pixels as a photograph of that shorter side shows them."""
     geometry, azimuth_deg = entry.geometry, entry.pose and entry.pose.azimuth_deg
     if geometry is None:
         return {}
