@@ -209,7 +209,7 @@ def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
 
 
 def test_two_processes_give_the_same_bytes_as_one(folder):
-    assert verified(folder, jobs=2).report.dump() == verified(folder).report.dump()
+    assert verified(folder, jobs=2).report.model_dump_json() == verified(folder).report.model_dump_json()
 
 
 def test_controls_decide_the_effect(folder, tmp_path):

@@ -53,7 +53,7 @@ def appearance(
     fit = color_fit(swatches, promised, light)
     flat = partial(rectify, px_from_mm=px_from_mm, rect_mm=surface.rect_mm, px_per_mm=_cells_per_mm(surface, geometry))
     seen = fit.apply(flat(linear).astype(float))
-    clipped = flat((part >= CLIPPED_CODE).any(-1)[..., None].astype(np.float32)).reshape(seen.shape[:2]) > 0.05
+    clipped = flat((part >= CLIPPED_CODE).any(-1, keepdims=True).astype(np.float32)).reshape(seen.shape[:2]) > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     expected = _coarse(promised.design, seen.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
     delta = ciede2000(lab_from_linear(expected), lab_from_linear(seen))

@@ -64,7 +64,7 @@ def settings_key(manifest: Manifest, options: Options) -> str:
         "versions": (patchproof.__version__, cv2.__version__, np.__version__),
         "manifest": manifest.model_dump(mode="json"),
         "models": [(model.name, model.sha256, model.input_px) for model in options.models],
-        "printer": options.printer and _printer_sha256(options.printer),
+        "printer": _printer_sha256(options.printer),
         "scan_dpi": options.scan_dpi,
         "camera": options.camera and options.camera.model_dump(mode="json"),
     }

@@ -41,11 +41,10 @@ MOST_SCALE_ERROR = 0.01
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
-_ADVICE = {
-    "blurred": "hold still, tap to focus on the patch, or use more light",
-    "too_small": "come closer or use the camera's full resolution",
-    "tilted": "look at the patch less from the side",
-}
+_COME_CLOSER = "come closer or use the camera's full resolution"
+_FEW = "show more of the frame: its markers fix where the patch lies"
+_FEW_AGREE = "too few markers agree to tell flat paper from bent: show all of the frame"
+_BENT = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
 
 
 @dataclass(frozen=True)
@@ -218,30 +217,26 @@ def _pose(view: View, fit: PageFit, flat: bool, surface: Surface) -> Pose | None
 
 def _trouble(geometry: Geometry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
     """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
-    side_mm = min(surface.rect_mm[2:])
-    module_px = float(np.median([b.module_px for b in found.markers.values()]))
-    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
-    uncertain = geometry.corner_uncertainty_mm > most_uncertain
-    if geometry.tilt_deg > MOST_TILT_DEG:
-        return CannotJudge("tilted", geometry.tilt_deg, MOST_TILT_DEG, _ADVICE["tilted"])
-    if geometry.blur_px > MOST_BLUR * module_px:
-        return CannotJudge("blurred", geometry.blur_px, MOST_BLUR * module_px, _ADVICE["blurred"])
-    if side_mm * geometry.px_per_mm < SMALLEST_DESIGN_PX:
-        return CannotJudge("too_small", side_mm * geometry.px_per_mm, SMALLEST_DESIGN_PX, _ADVICE["too_small"])
-    agreeing = len(fit.inlier_ids)
+    tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
+    side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
+    most_blur = MOST_BLUR * float(np.median([b.module_px for b in found.markers.values()]))
+    side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
+    agreeing, markers = len(fit.inlier_ids), len(found.markers)
     least = min(LEAST_MARKERS, len(surface.piece_ids) or 1)
-    if agreeing < least:
-        advice = "too few markers agree to tell flat paper from bent: show all of the frame"
-        return CannotJudge("too_few_markers", agreeing, least, advice)
-    if geometry.residual_mm > MOST_RESIDUAL * side_mm or agreeing < 0.5 * len(found.markers):
-        advice = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
-        return CannotJudge("curled", geometry.residual_mm, MOST_RESIDUAL * side_mm, advice)
-    if uncertain and len(found.markers) < 3:
-        return CannotJudge(
-            "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"
-        )
-    if uncertain:
-        return CannotJudge("too_small", geometry.corner_uncertainty_mm, most_uncertain, _ADVICE["too_small"])
+    bent = residual > most_residual or agreeing < 0.5 * markers
+    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
+    uncertain = uncertainty > most_uncertain
+    for wrong, code, figure, limit, advice in (
+        (tilt > MOST_TILT_DEG, "tilted", tilt, MOST_TILT_DEG, "look at the patch less from the side"),
+        (blur > most_blur, "blurred", blur, most_blur, "hold still, tap to focus on the patch, or use more light"),
+        (side_px < SMALLEST_DESIGN_PX, "too_small", side_px, SMALLEST_DESIGN_PX, _COME_CLOSER),
+        (agreeing < least, "too_few_markers", agreeing, least, _FEW_AGREE),
+        (bent, "curled", residual, most_residual, _BENT),
+        (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW),
+        (uncertain, "too_small", uncertainty, most_uncertain, _COME_CLOSER),
+    ):
+        if wrong:
+            return CannotJudge(code, figure, limit, advice)
     return None
 
 

@@ -6,7 +6,6 @@ except in page checks.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -148,7 +147,7 @@ class PhotoEntry(Strict):
     def _side_by_side(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         parts = plain(self)
         figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
-        return {key: () if key == "swatches" and self.color is None else figures.get(key) for key in KEYS}
+        return {key: [] if key == "swatches" and self.color is None else figures.get(key) for key in KEYS}
 
 
 class ModelRate(Strict):
@@ -227,10 +226,6 @@ class Report(Strict):
     summary: Summary
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
-
-    def dump(self) -> str:
-        """Its JSON text: the same report gives the same bytes."""
-        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True)

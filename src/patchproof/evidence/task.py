@@ -27,14 +27,14 @@ LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some 
 class Options:
     """What a verification's figures depend on besides photographs and manifest.
 
-    `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
+    `printer` is the appearance model that the promise was made with.
     `camera` replaces the EXIF focal length and takes out the lens. `ruler_mm` are the printed rulers (x, y) as somebody
     measured them. `controls` is a folder of photographs of controls. `ledger_photos` of the photographs at most, spread
     evenly, go into the gap ledger (0: no ledger).
     """
 
     models: Sequence[Classifier]
-    printer: Printer | None = None
+    printer: Printer
     camera: Camera | None = None
     scan_dpi: float | None = None
     ruler_mm: tuple[float, float] | None = None
@@ -56,14 +56,8 @@ class Task:
 
 def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
     """What all photographs of a verification are measured against."""
-    surface, printer, promised = surface_of(manifest), options.printer, None
-    if manifest.design:
-        if printer is None:
-            from patchproof.channel.printer import load_printer
-
-            printer = load_printer(manifest.settings.get("printer", {}).get("profile", "coated"))
-        promised = promised_of(manifest, surface, printer)
-    conditions = manifest.promise.conditions if manifest.promise else ()
-    ranges = promised_ranges(conditions, promised_side_px(manifest))
+    surface = surface_of(manifest)
+    promised = promised_of(manifest, surface, options.printer)
+    ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
     return Task(surface, promised, ranges, sizes, options.scan_dpi, options.camera)

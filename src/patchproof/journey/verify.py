@@ -57,10 +57,9 @@ def verify_photos(
     out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
     _check_out(out, resume, overwrite)
     networks = [load_classifier(name, base) for name in _names(manifest, models)]
-    printer = manifest.settings.get("printer")
     options = Options(
         models=networks,
-        printer=None if printer is None else load_printer(printer["profile"], base),
+        printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=None if camera is None else load_camera(camera),
         scan_dpi=scan_dpi,
         ruler_mm=ruler_mm,
