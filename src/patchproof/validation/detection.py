@@ -133,16 +133,18 @@ class _Hall:
 
         view = view_of(Photo(srgb, focal_px, Path("photo.jpg")), None)
         entry = measure(view, "photo.jpg", self.surface, None, promised_ranges(())).entry
-        said = {"status": entry.status, "code": entry.code, "markers": entry.markers_found, "light": entry.contrast}
-        if entry.homography_px_from_mm is None:
-            return said | {"error_mm": None, "error_px": None, "uncertainty_mm": entry.corner_uncertainty_mm}
-        homography, corners = np.array(entry.homography_px_from_mm), rect_corners(self.surface.rect_mm)
+        geometry = entry.geometry
+        said = {"status": entry.status, "code": entry.code, "markers": entry.markers_found}
+        said |= {"light": geometry and geometry.contrast, "error_mm": None, "error_px": None}
+        said |= {"uncertainty_mm": geometry and geometry.corner_uncertainty_mm}
+        if geometry is None or geometry.homography_px_from_mm is None:
+            return said
+        homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(self.surface.rect_mm)
         off_px = apply_homography(homography, corners) - apply_homography(truth, corners)
         off_mm = apply_homography(np.linalg.inv(homography), apply_homography(truth, corners)) - corners
         return said | {
             "error_mm": float(np.linalg.norm(off_mm, axis=1).max()),
             "error_px": np.linalg.norm(off_px, axis=1).tolist(),
-            "uncertainty_mm": entry.corner_uncertainty_mm,
         }
 
 

@@ -148,11 +148,12 @@ class _Hall:
         """What `verify` makes of the photographs, each of which lost so much."""
         from patchproof.evidence.ledger import LEAST_PHOTOS, usable
         from patchproof.evidence.run import gather_evidence
+        from patchproof.evidence.task import Options
 
         with TemporaryDirectory() as folder:
             for i, photo in enumerate(photos):
                 (Path(folder) / f"{i:03d}.jpg").write_bytes(photo)
-            evidence = gather_evidence(folder, self.manifest, models=[self.model])
+            evidence = gather_evidence(folder, self.manifest, Options([self.model], self.printer))
         report, ledger = evidence.report, evidence.ledger
         used = np.array([usable(entry.status, entry.code) for entry in report.photos])
         codes = [entry.code or "fine" for entry in report.photos]
@@ -201,7 +202,7 @@ def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
         set_stage(scene),
         manifest,
         model,
-        target_indices(model, manifest),
+        target_indices(model, manifest.promise, manifest.settings),
         pixels,
         size,
         load_printer(scene.settings.printer.profile, scene.base),

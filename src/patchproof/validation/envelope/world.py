@@ -281,10 +281,10 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     view = View(photo, matrix_px, calibrated=False)
     entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
-    if entry.status == "measured" and entry.homography_px_from_mm is not None:
+    if entry.status == "measured" and entry.geometry and entry.geometry.homography_px_from_mm is not None:
         corners = geometry.rect_corners(world.surface.rect_mm)
         true_px = _seen_at(scene, conditions, corners - world.manifest.cut_mm[:2], whole_px) - origin_px
-        back = geometry.apply_homography(np.linalg.inv(np.array(entry.homography_px_from_mm)), true_px)
+        back = geometry.apply_homography(np.linalg.inv(np.array(entry.geometry.homography_px_from_mm)), true_px)
         error_mm = float(np.linalg.norm(back - corners, axis=1).max())
     return Measurement(entry.status, entry.code, error_mm)
 
