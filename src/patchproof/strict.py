@@ -13,6 +13,7 @@ import math
 import os
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -136,8 +137,12 @@ def _absolute(path: str, base: Path) -> Path:
     return path_ if (path_ := Path(path)).is_absolute() else base / path_
 
 
-def within(pair: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """A range as it is, when it lies in [low, high]."""
+def within(low: float, high: float) -> AfterValidator:
+    """The check that a range lies in [low, high]."""
+    return AfterValidator(partial(_inside, low, high))
+
+
+def _inside(low: float, high: float, pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] < low or pair[1] > high:
         raise ValueError(f"must lie within [{low:g}, {high:g}]")
     return pair
