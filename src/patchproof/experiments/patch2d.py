@@ -75,9 +75,9 @@ class Patch2dSettings(Strict):
     scale: PositiveRange = (0.8, 1.25)  # random, times shown_px
     roll_deg: Range = (-22.5, 22.5)  # as in Brown et al.'s published program
     erasing: Share = 0.5  # chance of Random Erasing in training
-    printer: PrinterSettings = PrinterSettings()  # as in a scene
-    camera: CameraSettings = CameraSettings()  # as in a scene
-    optimize: OptimizeSettings = OptimizeSettings()  # as in a scene
+    printer: PrinterSettings = PrinterSettings()
+    camera: CameraSettings = CameraSettings()
+    optimize: OptimizeSettings = OptimizeSettings()
 
     @model_validator(mode="after")
     def _has_images(self):

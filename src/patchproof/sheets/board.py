@@ -42,8 +42,8 @@ class BoardTemplate(Strict):
 
     page_mm: tuple[Positive, Positive]  # width, height of the paper
     margin_mm: NotNegative  # nothing is printed nearer to the edge
-    board: BoardGrid  # one per page
-    ruler: Rulers  # both at once
+    board: BoardGrid
+    ruler: Rulers
     qr: QrCode  # names sheet and board
     text: tuple[TextLine, ...] = ()  # also {columns}, {rows}, {square}, {marker} and {dictionary} are filled in
 

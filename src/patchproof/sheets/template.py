@@ -23,7 +23,7 @@ Count = Annotated[int, Field(ge=1)]
 class PieceZone(Strict):
     """Where on the page the piece may lie."""
 
-    zone_mm: Rect  # it lies in the middle of this
+    zone_mm: Rect  # [x, y, width, height]; the piece lies in its middle
 
 
 class ChartGrid(Strict):
@@ -32,7 +32,7 @@ class ChartGrid(Strict):
     corner_mm: Point  # its top-left corner
     columns: Annotated[int, Field(ge=4)]  # swatches side by side
     rows: Annotated[int, Field(ge=2)]  # swatches one above the other
-    swatch_mm: Annotated[Positive, Field(ge=4)]  # below this a phone's photograph of a whole page has too few pixels
+    swatch_mm: Annotated[Positive, Field(ge=4)]  # side; below 4 a phone's photograph of a whole page has too few pixels
     gap_mm: NotNegative  # between swatches
 
 
@@ -68,7 +68,8 @@ class BlankPiece(Strict):
 class TilePages(Strict):
     """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
 
-    zone_mm: Rect  # a tile's part of the piece at its largest; what is printed of it starts at the corner
+    # [x, y, width, height]: a tile's part of the piece at its largest; what is printed of it starts at the corner.
+    zone_mm: Rect
     overlap_mm: Annotated[Positive, Field(ge=8)]  # the flap that the next tile is glued on; it holds a marker
     marker_mm: Annotated[Positive, Field(ge=5)]  # for scans and photographs of single pages
 
@@ -90,7 +91,7 @@ class Template(Strict):
     margin_mm: NotNegative  # nothing is printed nearer to the edge; home printers need 3 to 6
     piece: PieceZone | None = None  # none on a page that is a chart alone
     chart: ChartGrid  # at least 48 swatches
-    ruler: Rulers  # both at once
+    ruler: Rulers
     qr: QrCode  # names sheet and design
     marker: PageMarkers  # beside those of the piece
     blank: BlankPiece | None = None  # on a page that is made without a run
