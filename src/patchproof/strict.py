@@ -15,10 +15,13 @@ import re
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 from typing_extensions import Self
+
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 class Refused(ValueError):
@@ -79,8 +82,7 @@ class Strict(BaseModel):
         tables = {name: getattr(self, name) for name in type(self).model_fields}
         for name, value in values.items():
             table = tables.get(name)
-            nested = isinstance(table, Strict) and isinstance(value, dict)
-            tables[name] = table.changed(**value) if nested else value
+            tables[name] = table.changed(**value) if isinstance(table, Strict) and isinstance(value, dict) else value
         return validated(type(self), tables, type(self).__name__)
 
 
@@ -99,7 +101,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
 
 
-def validated(model: type[BaseModel], data: Any, where: str):
+def validated(model: type[_Model], data: Any, where: str) -> _Model:
     """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
     try:
         return model.model_validate(data)
@@ -148,7 +150,7 @@ def _inside(low: float, high: float, pair: tuple[float, float]) -> tuple[float, 
     return pair
 
 
-def _explain(model: type[BaseModel], error: dict, where: str) -> Refused:
+def _explain(model: type[BaseModel], error: ErrorDetails, where: str) -> Refused:
     key = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
         hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))

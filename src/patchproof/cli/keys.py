@@ -38,17 +38,17 @@ _WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
 
 def documents() -> dict[str, tuple[str, type[Strict]]]:
     """By name what a file of settings is for, and its settings."""
-    from patchproof.study.study import STUDIES
+    from patchproof.study.study import STUDIES, load_study
 
-    files: dict[str, tuple[str, type[Strict]]] = {
+    known: dict[str, tuple[str, type[Strict]]] = {
         "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
         "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
         "board": ("A page template with a board that calibrates cameras.", BoardTemplate),
     }
-    for name, module in STUDIES.items():
-        study = import_module(module).STUDY
-        files[name] = f"`patchproof study {name} --config FILE.toml`: {study.about}", study.settings
-    return files
+    for name in STUDIES:
+        study = load_study(name)
+        known[name] = f"`patchproof study {name} --config FILE.toml`: {study.about}", study.settings
+    return known
 
 
 def keys_page(name: str | None = None) -> str:
@@ -102,7 +102,7 @@ def _comments(module: str) -> dict[str, dict[str, str]]:
 def _document(name: str, about: str, settings: type[Strict], where: dict[type[Strict], str]) -> str:
     """One file's tables; those in `where` are told there."""
     lines = [f"## {name}", "", about, ""]
-    for path, model in _tables(settings):
+    for path, model in tables(settings):
         if path:
             lines += [f"### {name}: `{path}`", ""]
         if model in where:
@@ -114,13 +114,13 @@ def _document(name: str, about: str, settings: type[Strict], where: dict[type[St
     return "\n".join(lines)
 
 
-def _tables(model: type[Strict], path: str = "") -> Iterator[tuple[str, type[Strict]]]:
+def tables(model: type[Strict], path: str = "") -> Iterator[tuple[str, type[Strict]]]:
     """The settings and the tables in them, each with its place as TOML writes it."""
     yield path, model
     for key, hint in get_type_hints(model).items():
         for inner, many in _models_in(hint):
             place = f"{path.strip('[]')}.{key}".strip(".")
-            yield from _tables(inner, f"[[{place}]]" if many else f"[{place}]")
+            yield from tables(inner, f"[[{place}]]" if many else f"[{place}]")
 
 
 def _models_in(hint: Any, many: bool = False) -> Iterator[tuple[type[Strict], bool]]:
@@ -178,7 +178,7 @@ def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
     if origin is dict:
         return f"table{plural} of {_kind(inner[1], plural='s')}"
     if origin is tuple and inner[-1] is Ellipsis:
-        least = _limits(checks).get("min_length", 0)
+        least = int(_limits(checks).get("min_length", 0))
         some = {0: "", 1: ", not empty"}.get(least, f", {least} or more")
         return f"list of {_kind(inner[0], plural='s')}{some}"
     if origin is tuple and AfterValidator(ordered) in checks:
