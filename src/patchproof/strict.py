@@ -21,8 +21,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 from typing_extensions import Self
 
-_Model = TypeVar("_Model", bound=BaseModel)
-
 
 class Refused(ValueError):
     """What the tool will not do, in one sentence that says expected, got, do."""
@@ -67,6 +65,7 @@ Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
 NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Model = TypeVar("Model", bound=BaseModel)
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
@@ -101,7 +100,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
 
 
-def validated(model: type[_Model], data: Any, where: str) -> _Model:
+def validated(model: type[Model], data: Any, where: str) -> Model:
     """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
     try:
         return model.model_validate(data)
