@@ -27,7 +27,7 @@ class PieceZone(Strict):
 
 
 class ChartGrid(Strict):
-    """The colour chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
+    """The color chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
 
     corner_mm: Point  # its top-left corner
     columns: Annotated[int, Field(ge=4)]  # swatches side by side
