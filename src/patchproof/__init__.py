@@ -1,4 +1,4 @@
-"""patchproof: optimise a patch on a 3D object, print it at true size, photograph it, judge the photographs.
+"""patchproof: optimize a patch on a 3D object, print it at true size, photograph it, judge the photographs.
 
 The public names tell the story in order: scene → optimize → sheet → photographs → verify. They are imported when first
 used, so that `import patchproof` and `patchproof --help` stay quick.

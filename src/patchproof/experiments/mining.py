@@ -50,14 +50,12 @@ _THINGS = ("clean", "plain", "mined")
 
 
 class MiningSettings(ScenesSettings):
-    """`mine` conditions are tried before mined training; `n` draws per worst cell and `n_all` over the whole ranges
-    measure.
-    """
+    """How much is tried, and how much measures."""
 
-    map: MapSettings = MapSettings(n=16)
-    mine: Count = 240
-    n: Count = 60
-    n_all: Count = 200
+    map: MapSettings = MapSettings(n=16)  # what finds the worst cells
+    mine: Count = 240  # conditions that are tried before mined training
+    n: Count = 60  # draws per worst cell that measure
+    n_all: Count = 200  # draws over the whole ranges that measure
 
 
 def cells(settings: MiningSettings, base: Path) -> list[Cell]:

@@ -65,16 +65,16 @@ class Patch2dSettings(Strict):
     images: str | None = None  # a folder of images
     labels: str | None = None  # CSV: file name, label
     renders: tuple[str, ...] = ()  # scenes with meshes: each is one more class, its target's
-    renders_each: Annotated[int, Field(ge=2)] = 64
+    renders_each: Annotated[int, Field(ge=2)] = 64  # images of each of them
     targets: tuple[str | int, ...] = ()  # without any, every class
-    models: Annotated[tuple[str, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)
+    models: Annotated[tuple[str, ...], Field(min_length=1)]  # each trains and tests its own patches
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
     conditions: Annotated[int, Field(ge=1)] = 200  # per class and cell
-    made_px: Annotated[int, Field(ge=8, le=512)] = 60
-    shown_px: Positive = 30.0
+    made_px: Annotated[int, Field(ge=8, le=512)] = 60  # side of the patch as it is optimized
+    shown_px: Positive = 30.0  # its side in the network's input
     scale: PositiveRange = (0.8, 1.25)  # random, times shown_px
     roll_deg: Range = (-22.5, 22.5)  # as in Brown et al.'s published program
-    erasing: Share = 0.5
+    erasing: Share = 0.5  # chance of Random Erasing in training
     printer: PrinterSettings = PrinterSettings()
     camera: CameraSettings = CameraSettings()
     optimize: OptimizeSettings = OptimizeSettings()

@@ -54,16 +54,15 @@ _SIZES = (0.05, 0.95)  # quantiles of the design's size over the 3D views that b
 class Patch3dSettings(Strict):
     """Scenes × models × seeds; how patches are trained stands in each scene's [optimize]."""
 
-    scenes: Annotated[tuple[str, ...], Field(min_length=1)]
+    scenes: Annotated[tuple[str, ...], Field(min_length=1)]  # scene files
     models: tuple[str, ...] = ()  # in place of the scenes' own
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0, 1, 2)
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0, 1, 2)  # of the optimizer
     conditions: Annotated[int, Field(ge=1)] = 200  # of the evaluate stream, per cell
     renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; from 20 on, half of them are held out
     roll_deg: Range = (-22.5, 22.5)  # of the 2D patch, as in Brown et al.'s published program
     erasing: Share = 0.5  # chance of Random Erasing in 2D training
-    views: dict[str, Range] = Field(
-        default_factory=dict
-    )  # azimuths by name; without any, thirds of each scene's own range
+    # Azimuths in degrees by name; without any, thirds of each scene's own range.
+    views: dict[str, Range] = Field(default_factory=dict)
 
 
 def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:

@@ -57,9 +57,10 @@ _SHEET_PX, _TURN_VIEWS, _SIDES = 160, 8, 3
 
 
 class RobustSettings(TrainedSettings):
-    """`classes` are labels, as in a scene's target, which they replace."""
+    """As in all studies of trained designs, for every class."""
 
-    classes: Annotated[tuple[str | int, ...], Field(min_length=1)]
+    classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
+    # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "grey"}}}, min_length=1)
 
 

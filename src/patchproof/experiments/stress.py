@@ -52,30 +52,28 @@ _MEASURING = 3_000_001  # added to a seed: the evaluate stream's draws that meas
 
 
 class OcclusionSettings(Strict):
-    """A black square whose side is `share` of the picture's, at `positions`² places from edge to edge, on `n` draws."""
+    """A black square in many places of the picture."""
 
-    share: Annotated[Share, Field(gt=0)] = 0.3
-    positions: Annotated[int, Field(ge=2)] = 7
-    n: Count = 32
+    share: Annotated[Share, Field(gt=0)] = 0.3  # its side, as a share of the picture's
+    positions: Annotated[int, Field(ge=2)] = 7  # places from edge to edge, across and down
+    n: Count = 32  # draws at each place
 
 
 class SearchSettings(Strict):
-    """`tries` poses (or lights) in each of `rounds`, each with the same `draws` of everything else; the reach round the
-    best halves from round to round. `n` draws measure what was found.
-    """
+    """A search from coarse to fine."""
 
-    tries: Count = 48
-    rounds: Count = 4
-    draws: Count = 4
-    n: Count = 64
+    tries: Count = 48  # poses (or lights) in each round
+    rounds: Count = 4  # the reach round the best halves from one to the next
+    draws: Count = 4  # of everything else, the same for all tries
+    n: Count = 64  # draws that measure what was found
 
 
 class StressSettings(ScenesSettings):
     """What is tried."""
 
-    maps: tuple[MapSettings, ...] = (MapSettings(),)
-    occlusion: OcclusionSettings = OcclusionSettings()
-    search: SearchSettings = SearchSettings()
+    maps: tuple[MapSettings, ...] = (MapSettings(),)  # of pose × light
+    occlusion: OcclusionSettings = OcclusionSettings()  # what is hidden
+    search: SearchSettings = SearchSettings()  # for the worst pose and the worst light
 
 
 def cells(settings: StressSettings, base: Path) -> list[Cell]:

@@ -37,23 +37,21 @@ CHUNK = 16
 
 
 class MapSettings(Strict):
-    """A map's axes, each cut into equal cells of the scene's own range, and how many draws each cell gets."""
+    """A map of pose × light."""
 
-    pose: PoseAxis = "azimuth_deg"
-    light: LightAxis = "light_azimuth_deg"
-    pose_cells: Count = 10
-    light_cells: Count = 6
-    n: Count = 32
+    pose: PoseAxis = "azimuth_deg"  # the axis across
+    light: LightAxis = "light_azimuth_deg"  # the axis upwards
+    pose_cells: Count = 10  # cells of equal width across the scene's own range
+    light_cells: Count = 6  # likewise
+    n: Count = 32  # draws in each cell
 
 
 class ScenesSettings(Strict):
-    """Scene files, relative to the config's folder, and networks in place of each scene's own; one cell for each pair
-    and seed.
-    """
+    """Every scene with every network and seed; paths are relative to the config's folder."""
 
-    scenes: Annotated[tuple[str, ...], Field(min_length=1)]
-    networks: tuple[str, ...] = ()
-    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)
+    scenes: Annotated[tuple[str, ...], Field(min_length=1)]  # scene files
+    networks: tuple[str, ...] = ()  # in place of each scene's own
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)] = (0,)  # of the optimizer and the draws
 
     @model_validator(mode="after")
     def _have_different_names(self):

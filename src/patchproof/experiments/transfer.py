@@ -47,10 +47,10 @@ _SHEET_PX = 224
 
 
 class TransferSettings(TrainedSettings):
-    """`ensembles` are trained on all networks but one, each in turn, and on all; `lights` per fixed view."""
+    """As in all studies of trained designs."""
 
-    ensembles: bool = True
-    lights: Annotated[int, Field(ge=1)] = 20
+    ensembles: bool = True  # also trained on all networks but one, each in turn, and on all
+    lights: Annotated[int, Field(ge=1)] = 20  # lights in each of three fixed views
 
 
 def cells(settings: TransferSettings, base: Path) -> list[Cell]:

@@ -59,17 +59,18 @@ Epsilon = Annotated[float | None, BeforeValidator(_epsilon)]
 class HardenSettings(Strict):
     """Every method with every ε, for each network alone or for all of them together."""
 
-    images: str
+    images: str  # a folder of images
     labels: str  # CSV: file name, label
-    models: Annotated[tuple[str, ...], Field(min_length=1)]
+    models: Annotated[tuple[str, ...], Field(min_length=1)]  # hardened for, each alone
     together: bool = False  # against the mean of the networks' losses
     judges: tuple[str, ...] = ()  # networks that only judge
-    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("pgd",)
+    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("pgd",)  # how to step
+    # Largest change of a value in [0, 1]: 0.03, "8/255", or "none".
     epsilons: Annotated[tuple[Epsilon, ...], Field(min_length=1)] = (8 / 255, 0.1, None)
-    steps: Annotated[int, Field(ge=1)] = 100
-    step_size: Positive | None = None
-    attacks: tuple[Attack, ...] = ("fgsm", "pgd")
-    attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)
+    steps: Annotated[int, Field(ge=1)] = 100  # of hardening
+    step_size: Positive | None = None  # in place of the method's own
+    attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # that are to be withstood
+    attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
 
 
 def harden_images(

@@ -38,16 +38,15 @@ ORIGINAL = "original"  # the row of the object as it came
 
 
 class TrainedSettings(Strict):
-    """What varies; paths are relative to the config's folder. `if_installed` names networks to leave out where they
-    cannot be loaded, such as `timm:` ones.
-    """
+    """What varies; paths are relative to the config's folder."""
 
-    scenes: Annotated[tuple[str, ...], Field(min_length=1)]
-    networks: Annotated[tuple[str, ...], Field(min_length=1)]
-    if_installed: tuple[str, ...] = ()
+    scenes: Annotated[tuple[str, ...], Field(min_length=1)]  # scene files
+    networks: Annotated[tuple[str, ...], Field(min_length=1)]  # to train on and to test
+    if_installed: tuple[str, ...] = ()  # networks that are left out where they cannot be loaded, such as `timm:` ones
+    # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)
-    n: Annotated[int, Field(ge=2)] = 400
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
+    n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
 
 
 def networks_of(settings: TrainedSettings, base: Path) -> tuple[str, ...]:

@@ -61,14 +61,14 @@ Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class AblationSettings(Strict):
-    """Every scene with every network and seed; `n` conditions and `photos` path-traced photographs for each design."""
+    """Every scene with every network and seed."""
 
-    scenes: Names
-    networks: Names
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)
-    effects: Names = EFFECTS
-    n: Annotated[int, Field(ge=10)] = 400
-    photos: Annotated[int, Field(ge=0, le=1000)] = 40
+    scenes: Names  # scene files
+    networks: Names  # each trains and judges its own designs
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
+    effects: Names = EFFECTS  # left out one by one; "a + b" leaves out both at once
+    n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design
+    photos: Annotated[int, Field(ge=0, le=1000)] = 40  # path-traced photographs of each design
 
 
 @dataclass(frozen=True, eq=False)

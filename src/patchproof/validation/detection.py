@@ -49,12 +49,12 @@ _COLORS = {"measured": "#2a9d6f", "judged": "#e0a030", "rejected": "#d1495b"}
 
 
 class DetectionSettings(Strict):
-    """A scene of one object with a patch, how many photographs of it, and how many of them are partly hidden."""
+    """What is photographed, and how often."""
 
-    scene: str
-    photos: Annotated[int, Field(ge=1, le=100_000)] = 200
-    hidden: Share = 0.4
-    seed: int = 0
+    scene: str  # a scene file of one object with a patch
+    photos: Annotated[int, Field(ge=1, le=100_000)] = 200  # how many are taken
+    hidden: Share = 0.4  # share of them in which something hides a part of the sheet
+    seed: int = 0  # of everything that is drawn
 
 
 def cells(settings: DetectionSettings, base: Path) -> list[Cell]:

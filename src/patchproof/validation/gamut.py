@@ -59,11 +59,12 @@ WAYS = (
 
 
 class GamutSettings(Strict):
-    """Scene files beside the config; their `printer.profile` is the printer that is known while optimizing."""
+    """Every scene with every seed; paths are relative to the config's folder."""
 
+    # Scene files; their `printer.profile` is the printer that is known while optimizing.
     scenes: Annotated[tuple[str, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[int, ...], Field(min_length=1)] = (0, 1)
-    views: Annotated[int, Field(ge=2)] = VIEWS
+    seeds: Annotated[tuple[int, ...], Field(min_length=1)] = (0, 1)  # of the optimizer
+    views: Annotated[int, Field(ge=2)] = VIEWS  # unseen conditions that measure
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,13 @@ _FADED = 0.2  # of the density that dyes may keep
 
 
 class LedgerSettings(Strict):
-    """Folders of finished runs, trials over all of them, photographs in each, and their size in pixels (by default
-    the scene's own: smaller is quicker).
-    """
+    """Whose designs are photographed, and how often."""
 
-    runs: Annotated[tuple[str, ...], Field(min_length=1)]
-    trials: Annotated[int, Field(ge=1, le=10_000)] = 60
-    photos: Annotated[int, Field(ge=5, le=100)] = 12
-    photo_px: tuple[int, int] | None = None
-    seed: int = 0
+    runs: Annotated[tuple[str, ...], Field(min_length=1)]  # folders of finished runs
+    trials: Annotated[int, Field(ge=1, le=10_000)] = 60  # over all runs
+    photos: Annotated[int, Field(ge=5, le=100)] = 12  # in each trial
+    photo_px: tuple[int, int] | None = None  # their width, height; by default the scene's own, smaller is quicker
+    seed: int = 0  # of everything that is drawn
 
 
 def cells(settings: LedgerSettings, base: Path) -> list[Cell]:

@@ -36,12 +36,12 @@ _LOW, _HIGH = 1e-3, 1 - 1e-3  # rates whose odds are taken
 class PromisesSettings(Strict):
     """Every scene with every network, printer and seed; paths are relative to the config's folder."""
 
-    scenes: Names
-    networks: Names
-    printers: Names = ("coated",)
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)
-    photos: Annotated[int, Field(ge=10, le=1000)] = 40
-    path_traced: bool = True
+    scenes: Names  # scene files
+    networks: Names  # each trains and judges its own designs
+    printers: Names = ("coated",)  # that print the designs, and are known while optimizing
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
+    photos: Annotated[int, Field(ge=10, le=1000)] = 40  # of each print
+    path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
 
 
 def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
