@@ -67,7 +67,34 @@ _HOME = {
     "verify": "journey.verify:verify_photos",
 }
 
-__all__ = list(_HOME)
+__all__ = [
+    "Classifier",
+    "Conditions",
+    "Goal",
+    "Manifest",
+    "Printer",
+    "Promise",
+    "Refused",
+    "Report",
+    "Run",
+    "Scene",
+    "SceneSettings",
+    "Stage",
+    "classifier_of",
+    "evaluate",
+    "load_classifier",
+    "load_manifest",
+    "load_printer",
+    "load_run",
+    "load_scene",
+    "make_scene",
+    "optimize",
+    "photograph",
+    "reprint",
+    "set_stage",
+    "sheet",
+    "verify",
+]
 __version__ = "0.1.0"
 
 

@@ -32,8 +32,8 @@ def make_scene(
     base: str | Path = ".",
     seed: int | None = None,
 ) -> Scene:
-    """The scene of settings made in Python, whose paths are relative to `base`; `mesh` is the object where settings name
-    it `python:` and a word.
+    """The scene of settings made in Python, whose paths are relative to `base`; `mesh` is the object where the settings
+    name it `python:` and a word.
     """
     return build_scene(settings, Path(base), seed, given_glb=None if mesh is None else glb_of(mesh))
 
