@@ -124,7 +124,7 @@ def expand(text: str, base: Path) -> str:
     prefix, colon, rest = text.partition(":")
     if colon and prefix == "file":
         return f"file:{_absolute(rest, base)}"
-    if (colon and (prefix in {"primitive", "torchvision", "timm", "module"})) or text == "builtin":
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text == "builtin":
         return text
     return str(_absolute(text, base))
 

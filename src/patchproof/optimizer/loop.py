@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
@@ -142,11 +141,10 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
 
 def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
     """Mean loss over classifiers and pictures; mean confidence and rate of the same."""
-    goal = problem.scene.settings.target.goal
     losses, confidence, rate = [], 0.0, 0.0
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
         logits = classifier.logits(pictures)
-        losses.append(target_loss(logits, indices, goal).mean())
+        losses.append(problem.loss(logits, indices).mean())
         confidence += float(classifier.confidence(logits.detach(), indices).mean())
         rate += float(classifier.recognized(logits.detach(), indices).double().mean())
     count = len(losses)

@@ -18,6 +18,7 @@ import csv
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class ImageScene:
     images: tuple[flat.Picture, ...]
     warnings: tuple[str, ...]
     unreadable_share: float = 0.0
+    given_glb: ClassVar[bytes | None] = None
 
     @property
     def photo_px(self) -> tuple[int, int]:

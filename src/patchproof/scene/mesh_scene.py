@@ -7,6 +7,7 @@ piece lies, and the camera of every drawn view. Where the object's own texture i
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +53,7 @@ class MeshScene:
     warnings: tuple[str, ...]
     canvas: Canvas | None = None  # what of the object's own texture may change
     camera: lens.Camera | None = field(default=None)  # a calibrated one
+    given_glb: bytes | None = None  # the mesh, where it was given in Python
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
@@ -114,15 +116,18 @@ class MeshScene:
         return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
 
 
-def load_mesh_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> MeshScene:
+def load_mesh_scene(
+    settings: SceneSettings, base: Path, seed: int, identity: str | None = None, given_glb: bytes | None = None
+) -> MeshScene:
     """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
     settings_object, camera = settings.object, settings.camera
-    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up)
-    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings), seed)
+    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
+    own = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
+    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings) | own, seed)
     backgrounds = load_backgrounds(settings.background, base)
     calibrated = None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px)
     ground = {"settings": settings, "base": base, "seed": seed, "frame": frame, "backgrounds": backgrounds}
-    ground |= {"sheet_id": identity, "camera": calibrated}
+    ground |= {"sheet_id": identity, "camera": calibrated, "given_glb": given_glb}
     if settings.patch.kind != "patch":
         canvas = texture_canvas(mesh, settings.patch, base)
         notes = (*mesh.warnings, *canvas.warnings)

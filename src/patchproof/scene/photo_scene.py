@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -70,6 +71,7 @@ class PhotoScene:
     photos: tuple[BasePhoto, ...]
     warnings: tuple[str, ...]
     unreadable_share: float = 0.0
+    given_glb: ClassVar[bytes | None] = None
 
     @property
     def photo_px(self) -> tuple[int, int]:
