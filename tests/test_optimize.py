@@ -21,6 +21,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, judged, promise_from, try_out
 from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
+from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
@@ -179,7 +180,7 @@ def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
     scene = scene_with(tmp_path, view__azimuth_deg=[-90, 90], optimize__steps=2)
     problem = set_problem(scene)
     behind = scene.draw("train", 4)
-    behind = replace(behind, azimuth_deg=np.full(4, 180.0))
+    behind = with_values(behind, azimuth_deg=180.0)
     shown = problem.subject.shown(start(problem).design.requires_grad_())
     seen = problem.see(shown, behind, problem.training_px)
     assert len(seen.piece.pixel) == 0
