@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -102,9 +102,8 @@ def without(problem: Problem, effect: str) -> Problem:
         if not isinstance(subject, Patch):
             raise Refused("a printed patch", "a texture", f'leave "{PRINTER}" out')
         subject = replace(subject, printer=identity_printer())
-    parts = {"scene": problem.scene, "stage": problem.stage, "printer": problem.printer, "subject": subject}
-    changes = tuple(terms[name].change for name in on if name != PRINTER)
-    return Without(**parts, classifiers=problem.classifiers, indices=problem.indices, changes=changes)
+    parts = {field.name: getattr(problem, field.name) for field in fields(Problem)} | {"subject": subject}
+    return Without(**parts, changes=tuple(terms[name].change for name in on if name != PRINTER))
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
