@@ -316,7 +316,7 @@ def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, flo
     _, shows, priors = bench_printer.drawn_printer(seed)
     manifest, colors = chart_manifest(swatches), bench_printer.held_out_colors()
     shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    truth, errors = bench_printer.shown_by(shows, shot, None, None, colors), []
+    truth, errors = bench_printer.shown_by(shows, shot, colors), []
     for known in (None, camera):
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)

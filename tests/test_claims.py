@@ -5,7 +5,6 @@ import pytest
 from scipy.stats import binom, multinomial
 
 from patchproof.claims import (
-    deviation,
     independent_difference,
     mcnemar_p,
     mean,
@@ -13,6 +12,7 @@ from patchproof.claims import (
     paired_difference,
     paired_means,
     prediction_interval,
+    standard_deviation,
     wilson,
 )
 
@@ -149,6 +149,6 @@ def test_paired_intervals_leave_out_what_settings_share():
 
 def test_a_deviation_of_known_values_has_its_textbook_interval():
     # χ² with 9 degrees of freedom: 2.700 and 19.023
-    spread = deviation([3.0, -3.0] + [0.0] * 8)
+    spread = standard_deviation([3.0, -3.0] + [0.0] * 8)
     assert spread.value == pytest.approx(2**0.5)
     assert (spread.low, spread.high) == pytest.approx(((18 / 19.023) ** 0.5, (18 / 2.700) ** 0.5), rel=1e-3)

@@ -19,8 +19,6 @@ from patchproof.bench.chart import Chart, Check, OnStage, Point
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.ladder import Map, choose, difference, distinct, rungs
-from patchproof.channel.lens import Camera
-from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.claims import mean, median, rate, student_mean
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.report.tables import Table
@@ -53,20 +51,20 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     """The ladder's chart for each size of a printer's chart."""
     count, trials = 6 if quick else 36, []  # three minutes of one core; a multiple of the six kinds of printer
     for i in range(count):
-        trials += [trial(i, swatches) for swatches in SWATCHES]
+        trials += [try_printer(i, swatches) for swatches in SWATCHES]
         on_stage("printers", i + 1, count)
     for swatches in SWATCHES:
-        yield ladder_chart([one for one in trials if one.swatches == swatches])
+        yield ladder_chart([trial for trial in trials if trial.swatches == swatches])
 
 
 def ladder_chart(trials: list[Trial]) -> Chart:
     """Every rung on charts of one size."""
-    names, swatches = [one.chosen for one in trials], trials[0].swatches
+    names, swatches = [trial.chosen for trial in trials], trials[0].swatches
     usual = max(sorted(set(names)), key=names.count)
     points = []
     for name in trials[0].errors:
-        cost = median([one.seconds[name] / one.seconds["white_black"] for one in trials])
-        points.append(Point(name, cost, student_mean([one.errors[name] for one in trials]), name == usual))
+        cost = median([trial.seconds[name] / trial.seconds["white_black"] for trial in trials])
+        points.append(Point(name, cost, student_mean([trial.errors[name] for trial in trials]), name == usual))
     return Chart(
         name=f"{swatches}_swatches",
         title=f"Models of a printer from a chart of {swatches} swatches",
@@ -82,11 +80,11 @@ def ladder_chart(trials: list[Trial]) -> Chart:
 
 
 def _checks(swatches: int, trials: list[Trial]) -> list[Check]:
-    behind = np.array([one.behind for one in trials])
+    behind = np.array([trial.behind for trial in trials])
     if swatches not in TARGETS:
-        fitted = np.mean([one.chosen not in ("identity", "white_black", "prior") for one in trials])
+        fitted = np.mean([trial.chosen not in ("identity", "white_black", "prior") for trial in trials])
         return [Check(f"{swatches} swatches: share of choices with anything fitted", float(fitted), 0.0)]
-    chosen = float(np.mean([one.errors[one.chosen] for one in trials]))
+    chosen = float(np.mean([trial.errors[trial.chosen] for trial in trials]))
     return [
         Check(f"{swatches} swatches: mean ΔE00 of the chosen rung", chosen, TARGETS[swatches]),
         Check(
@@ -99,10 +97,10 @@ def _checks(swatches: int, trials: list[Trial]) -> list[Check]:
 def _choices(trials: list[Trial]) -> Table:
     """By driver: the chosen rung's error, how often it is near the best, what was chosen."""
     rows = []
-    for driver in (*dict.fromkeys(one.driver for one in trials), "all"):
-        some = [one for one in trials if driver in (one.driver, "all")]
-        errors, names = [one.errors[one.chosen] for one in some], [one.chosen for one in some]
-        near = rate([one.behind <= NEAR for one in some])
+    for driver in (*dict.fromkeys(trial.driver for trial in trials), "all"):
+        some = [trial for trial in trials if driver in (trial.driver, "all")]
+        errors, names = [trial.errors[trial.chosen] for trial in some], [trial.chosen for trial in some]
+        near = rate([trial.behind <= NEAR for trial in some])
         picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
         rows.append((driver, mean(errors), max(errors), near, picked))
     head = ("printer", "ΔE00 of the chosen", "worst", f"within {NEAR} of the best", "chosen")
@@ -111,17 +109,17 @@ def _choices(trials: list[Trial]) -> Table:
     )
 
 
-def trial(seed: int, swatches: int, camera: Camera | None = None, known: Camera | None = None) -> Trial:
-    """One printer's chart photographed by `camera` and read as if by `known`, every rung on it."""
+def try_printer(seed: int, swatches: int) -> Trial:
+    """One printer's chart photographed and read, every rung on it."""
     driver, shows, priors = drawn_printer(seed)
     manifest = chart_manifest(swatches)
-    shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    light = read_chart(shot.photo, manifest, known).light
+    shot = photograph_page(printed_page(manifest, shows), seed)
+    light = read_chart(shot.photo, manifest).light
     usable = np.isfinite(light).all(1)
     sent, seen = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
     ladder = rungs(priors)
     choice = choose(ladder, sent, seen)
-    truth, errors = shown_by(shows, shot, camera, known, held_out_colors()), {}
+    truth, errors = shown_by(shows, shot, held_out_colors()), {}
     for rung in (rung for rung in ladder if rung.name not in choice.left_out):
         seen_by = relative(rung.fit(*distinct(sent, seen)), held_out_colors())
         errors[rung.name] = float(difference(seen_by, truth).mean())
@@ -145,12 +143,11 @@ def drawn_printer(seed: int) -> tuple[str, Shows, dict]:
     return "the other profile", lambda colors: linear_from_srgb(own(colors)), priors
 
 
-def shown_by(shows: Shows, shot: Shot, camera: Camera | None, known: Camera | None, colors: np.ndarray) -> np.ndarray:
-    """sRGB N×3 of colors on the true print under even light, through the camera and read with what is known of it."""
+def shown_by(shows: Shows, shot: Shot, colors: np.ndarray) -> np.ndarray:
+    """sRGB N×3 that a camera shows of colors on the true print under even light, which clips at its exposure."""
     white = np.ones((1, 3))
-    light = shows(np.vstack([colors, white])) / shows(white) * shot.paper
-    read = light_of_codes(codes_of_light(light, camera), known)
-    return srgb_from_linear(read[:-1] / read[-1])
+    light = np.clip(shows(np.vstack([colors, white])) / shows(white) * shot.paper, 0, 1)
+    return srgb_from_linear(light[:-1] / light[-1])
 
 
 def held_out_colors() -> np.ndarray:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from patchproof.bench.chart import Chart, OnStage, Point
 from patchproof.bench.world import demo_problem, set_world, with_optimize
-from patchproof.claims import Estimate, deviation, paired_means, student_mean
+from patchproof.claims import Estimate, paired_means, standard_deviation, student_mean
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, steps
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -150,7 +150,7 @@ def draws_chart(quick: bool, on_stage: OnStage) -> Chart:
     square = student_mean((alone - alone.mean()) ** 2)  # losses are far from normal: no χ² interval
     spread, low, high = (math.sqrt(max(x, 0)) for x in (square.value, square.low, square.high))
     by_chance = [Estimate(spread / n**0.5, low / n**0.5, high / n**0.5, single) for n in counts]
-    by_sobol = [deviation(np.stack(sobol)[:, :n].mean(1)) for n in counts]
+    by_sobol = [standard_deviation(np.stack(sobol)[:, :n].mean(1)) for n in counts]
     pairs = list(zip(counts, by_sobol, by_chance, strict=True))
     worth = tuple((n, n * (chance.value / sobol.value) ** 2) for n, sobol, chance in pairs)
     return Chart(
