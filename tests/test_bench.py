@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -65,6 +66,11 @@ def test_calls_are_timed_in_turn_after_a_warm_up():
     order = []
     seconds = measure.timed({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
     assert order == ["a", "b"] * 3 and [len(values) for values in seconds.values()] == [2, 2]
+
+
+def test_waiting_is_not_counted_as_work():
+    answer, milliseconds = measure.clocked(lambda: time.sleep(0.05) or 7)
+    assert answer == 7 and 0 <= milliseconds < 25
 
 
 def test_psnr_of_a_tenth_is_twenty():

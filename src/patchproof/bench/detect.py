@@ -6,13 +6,14 @@ design's corners.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from patchproof.bench.chart import Chart, Check, OnStage, Point, span
+from patchproof.bench.measure import clocked
 from patchproof.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
 from patchproof.claims import median
 from patchproof.geometry import apply_homography, rect_corners
@@ -34,9 +35,11 @@ Shot = tuple[np.ndarray, Sheet]  # a photograph, and where its millimetres truly
 
 @dataclass(frozen=True)
 class Trial:
-    """Seconds per photograph, all errors of the design's corners in px (infinite without a fit), share of markers."""
+    """Milliseconds per photograph, all errors of the design's corners in px (infinite without a fit), and the share of
+    markers that was found.
+    """
 
-    seconds: np.ndarray
+    milliseconds: list[float]
     errors_px: np.ndarray
     share: float
 
@@ -54,7 +57,7 @@ def _levels_chart(shots: list[Shot], size_px: tuple[int, int]) -> Chart:
     for coarsest_px in COARSEST:
         for name, find in (("fitted", find_fitted), ("OpenCV's", find_plain)):
             trial, setting = tried(shots, find, coarsest_px), f"{coarsest_px} px, {name}"
-            cost, error = median(1000 * trial.seconds), median(trial.errors_px)
+            cost, error = median(trial.milliseconds), median(trial.errors_px)
             points.append(Point(setting, cost, error, coarsest_px == COARSEST_PX and find is find_fitted))
             shares.append((setting, trial.share))
     default = next(point for point in points if point.default)
@@ -97,14 +100,13 @@ def find_plain(srgb: np.ndarray, coarsest_px: int) -> Corners:
 
 def tried(shots: list[Shot], find: Find, coarsest_px: int) -> Trial:
     """A way to find corners on all photographs."""
-    seconds, errors, markers = [], [], 0
+    milliseconds, errors, markers = [], [], 0
     for photo, sheet in shots:
-        begin = time.process_time()  # of the processor: other work on the machine does not count
-        corners = find(photo, coarsest_px)
-        seconds.append(time.process_time() - begin)
+        corners, taken = clocked(partial(find, photo, coarsest_px))
+        milliseconds.append(taken)
         markers += len(corners)
         errors.append(_errors(corners, sheet))
-    return Trial(np.array(seconds), np.concatenate(errors), markers / (len(shots) * len(corners_mm())))
+    return Trial(milliseconds, np.concatenate(errors), markers / (len(shots) * len(corners_mm())))
 
 
 def _errors(corners: Corners, sheet: Sheet) -> np.ndarray:

@@ -21,6 +21,7 @@ from torch import Tensor
 from patchproof.claims import Estimate, median
 
 Name = TypeVar("Name", bound=Hashable)
+Answer = TypeVar("Answer")
 
 
 def machine() -> dict[str, Any]:
@@ -53,6 +54,12 @@ def timed(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name,
             call()
             seconds[name].append(time.perf_counter() - begin)
     return {name: np.array(values[1:]) for name, values in seconds.items()}
+
+
+def clocked(call: Callable[[], Answer]) -> tuple[Answer, float]:
+    """What a call returns, and its milliseconds of the processor: other work on the machine does not count."""
+    begin = time.process_time()
+    return call(), 1000 * (time.process_time() - begin)
 
 
 def ratio(seconds: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:

@@ -5,13 +5,13 @@ In: photographs of paper. Out: two charts. Errors are in millimetres of the pape
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
 from patchproof.bench.chart import Chart, OnStage, Point
+from patchproof.bench.measure import clocked
 from patchproof.bench.paper import (
     DESIGN_MM,
     LENS,
@@ -65,9 +65,9 @@ def markers_chart(count: int, on_stage: OnStage) -> Chart:
         photo = photographed(sheet, rng)
         for n, ids in MARKERS.items():
             places = {i: corners_mm()[i] for i in ids}
-            begin = time.perf_counter()
-            corners = find_sheet(photo, frozenset(ids), places, DICTIONARY).corners_px
-            milliseconds[n].append(1000 * (time.perf_counter() - begin))
+            result, taken = clocked(partial(find_sheet, photo, frozenset(ids), places, DICTIONARY))
+            corners = result.corners_px
+            milliseconds[n].append(taken)
             for way, covered in ways.items():
                 seen = {i: px for i, px in corners.items() if i not in covered}
                 errors[way, n].append(error_mm(plane(seen), sheet) if seen else np.inf)
@@ -162,9 +162,8 @@ def models_chart(count: int, on_stage: OnStage) -> Chart:
             sheet, wrong = drawn_sheet(kind, seed)[0], COVERED + seed % len(corners_mm())
             corners = {i: px + np.array([wrong_px * (i == wrong), 0]) for i, px in corners_found(kind, seed).items()}
             for name, model in MODELS.items():
-                begin = time.perf_counter()
-                fitted = model(corners)
-                milliseconds[name].append(1000 * (time.perf_counter() - begin))
+                fitted, taken = clocked(partial(model, corners))
+                milliseconds[name].append(taken)
                 errors[name].append(error_mm(fitted, sheet))
         series[label] = [
             Point(name, median(milliseconds[name]), median(errors[name]), name == DEFAULT_MODEL) for name in MODELS
