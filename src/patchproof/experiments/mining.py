@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from patchproof.claims import difference, rate
 from patchproof.experiments.hard_views import training_conditions
 from patchproof.experiments.heat import heat_map
 from patchproof.experiments.stress_map import (
@@ -38,7 +39,7 @@ from patchproof.optimizer.loop import SELECT_VIEWS, best_design, selections
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown
-from patchproof.report.tables import Drawing, Table, difference, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused

@@ -27,6 +27,7 @@ import torch
 from pydantic import Field, model_validator
 
 from patchproof.channel.printer import load_printer
+from patchproof.claims import Estimate, difference, rate
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -37,7 +38,7 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.render.stage import set_stage
-from patchproof.report.tables import Drawing, Estimate, Table, difference, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import SPLIT_FROM, ImageScene, largest_share, load_image_scene
 from patchproof.settings import (
     BackgroundSettings,

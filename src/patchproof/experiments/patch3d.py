@@ -27,6 +27,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from patchproof.claims import Estimate, difference, rate
 from patchproof.experiments.image_classes import write_labels, write_renders
 from patchproof.geometry import local_scale
 from patchproof.optimizer.loop import best_design
@@ -35,7 +36,7 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.render.stage import set_stage
-from patchproof.report.tables import Drawing, Estimate, Table, difference, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import largest_share, load_image_scene
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import build_scene

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from patchproof.claims import difference, rate
 from patchproof.experiments.hard_views import LIGHT, POSE, clean_losses, each_before_all
 from patchproof.experiments.heat import heat_map, picture_strip, position_map, said
 from patchproof.experiments.stress_map import (
@@ -42,7 +43,7 @@ from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.report.images import png
-from patchproof.report.tables import Drawing, Table, difference, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.scene.conditions import Conditions, fields_of, with_values
 from patchproof.strict import Share, Strict
 from patchproof.study.study import Cell, Result, Study

@@ -19,10 +19,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchproof.claims import Estimate, rate
 from patchproof.experiments.turntable import contact_sheet, pictures, sides, three_views
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import judged, shown_with_controls
-from patchproof.report.tables import Drawing, Estimate, Table, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.study import Cell, Result, Study, short_name
 from patchproof.study.trained import (

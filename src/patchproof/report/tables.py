@@ -1,4 +1,4 @@
-"""Tables and figures of studies: what a study hands over to be written, and how a figure reads.
+"""Tables and figures of studies and benchmarks: what is handed over to be written, and how a figure reads.
 
 In: rows of plain values and `Estimate`s, drawings for matplotlib. Out: CSV text with numbers in full, cells of a page
 as people read them, PNG bytes. The same input gives the same bytes.
@@ -9,26 +9,14 @@ from __future__ import annotations
 import csv
 import io
 import math
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from patchproof.claims import paired_difference, wilson
+from patchproof.claims import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A figure with its 95 % interval and the number of trials behind it; in a CSV four columns."""
-
-    value: float
-    low: float
-    high: float
-    n: int
-
 
 Value = str | int | float | bool | None | Estimate
 
@@ -55,32 +43,6 @@ class Drawing:
     about: str = ""
 
 
-def rate(hits: list[bool]) -> Estimate | None:
-    """The share of hits with Wilson's interval; None of nothing."""
-    if not hits:
-        return None
-    return Estimate(sum(hits) / len(hits), *wilson(sum(hits), len(hits)), len(hits))
-
-
-def difference(a: list[bool], b: list[bool]) -> Estimate | None:
-    """Rate of `a` minus rate of `b` on the same conditions with Newcombe's paired interval; None of nothing."""
-    if not a:
-        return None
-    value, (low, high) = paired_difference(a, b)
-    return Estimate(value, low, high, len(a))
-
-
-def mean(values: list[float]) -> Estimate | None:
-    """The mean with Student's interval; None of fewer than two values."""
-    from scipy.stats import t as student
-
-    if len(values) < 2:
-        return None
-    value, error = statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(values))
-    half = float(student.ppf(0.975, len(values) - 1)) * error
-    return Estimate(value, value - half, value + half, len(values))
-
-
 def csv_text(table: Table) -> str:
     """The table with numbers in full; an `Estimate`'s column becomes four (value, _low, _high, _n)."""
     wide = [any(isinstance(row[i], Estimate) for row in table.rows) for i in range(len(table.head))]
@@ -92,7 +54,7 @@ def csv_text(table: Table) -> str:
     )
     for row in table.rows:
         writer.writerow(
-            one for value, is_wide in zip(row, wide, strict=True) for one in (_four(value) if is_wide else (value,))
+            part for value, is_wide in zip(row, wide, strict=True) for part in (_four(value) if is_wide else (value,))
         )
     return buffer.getvalue()
 

@@ -22,10 +22,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchproof.claims import Estimate, difference, mean, rate
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import Outcomes
 from patchproof.optimizer.texture import Texture
-from patchproof.report.tables import Estimate, difference, mean, rate
 from patchproof.scene.export import write_glb
 from patchproof.scene.scene import Scene, build_scene
 from patchproof.settings import SceneSettings

@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.claims import LEAST_CLUSTERS, clustered_mean
+from patchproof.claims import LEAST_CLUSTERS, Estimate, clustered_mean
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose
-from patchproof.report.tables import Estimate
 from patchproof.scene.conditions import Conditions
 from patchproof.study.study import Result
 

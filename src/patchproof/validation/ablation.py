@@ -23,6 +23,7 @@ import torch
 from pydantic import Field
 
 from patchproof.channel.printer import identity_printer
+from patchproof.claims import Estimate, mean
 from patchproof.classifier.network import recognized
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
@@ -34,7 +35,7 @@ from patchproof.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Views, see
-from patchproof.report.tables import Drawing, Estimate, Table, mean
+from patchproof.report.tables import Drawing, Table
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import SceneSettings

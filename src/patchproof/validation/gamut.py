@@ -24,12 +24,13 @@ import torch
 from pydantic import Field
 
 from patchproof.channel.printer import IN_GAMUT, Printer, identity_printer, load_printer, vary
+from patchproof.claims import Estimate, difference, rate
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import expose
-from patchproof.report.tables import Drawing, Estimate, Table, difference, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.scene.scene import Scene, build_scene, load_scene
 from patchproof.strict import Refused, Strict, shipped
 from patchproof.study.study import Cell, Result, Study

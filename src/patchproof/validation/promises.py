@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.claims import prediction_interval
-from patchproof.report.tables import Drawing, Table, mean, rate
+from patchproof.claims import mean, prediction_interval, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.settings import SceneSettings
 from patchproof.strict import Strict, expand, read_toml, validated
 from patchproof.study.study import Cell, Result, Study, short_name

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.claims import Estimate, rate
 from patchproof.goal import Goal
-from patchproof.report.tables import Drawing, Estimate, Table, Value, rate
+from patchproof.report.tables import Drawing, Table, Value
 from patchproof.validation.envelope.axes import AXES
 from patchproof.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 
