@@ -62,7 +62,9 @@ def test_the_same_template_gives_the_same_bytes_and_another_one_another_id(blank
 
 
 def test_a_template_for_designs_is_refused(tmp_path):
-    with pytest.raises(Refused, match=r"Expected a template with a \[blank\] table.*got a4: use blank_a4"):
+    with pytest.raises(
+        Refused, match=r"Expected a template with a \[blank\] table.*got a4: use one of: blank_a4, blank_letter"
+    ):
         blank_sheet("a4", tmp_path / "b.pdf")
     with pytest.raises(Refused, match="marker_mm"):
         blank_sheet(other(tmp_path, "marker_mm = 19.0", "marker_mm = 4.0"), tmp_path / "b.pdf")

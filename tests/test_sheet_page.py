@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from patchproof.sheets.page import Box, largest_piece_mm, lay_out_page, prove_apart, qr_rects_mm
+from patchproof.sheets.layout import Box, prove_apart
+from patchproof.sheets.page import largest_piece_mm, lay_out_page, qr_rects_mm
 from patchproof.sheets.piece import KINDS, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import TextLine, load_template
 from patchproof.strict import Refused, shipped
@@ -113,7 +114,7 @@ def test_unknown_word_in_a_text_is_refused():
     template = load_template("a4")
     line = TextLine(at_mm=(50, 14), size_mm=2, text="{sheet}")
     with pytest.raises(Refused, match=r"\{sheet\}: use one of: sheet_id"):
-        page_of(template.model_copy(update={"text": (line,)}), (110, 110))
+        page_of(template.changed(text=(line,)), (110, 110))
 
 
 def test_qr_code_fills_its_square():

@@ -19,8 +19,9 @@ from patchproof.photo.label import label_of, read_label
 from patchproof.photo.read import Photo
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.chart_page import chart_sheet
+from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.page import Box, largest_piece_mm, prove_apart
+from patchproof.sheets.page import largest_piece_mm
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
@@ -196,7 +197,7 @@ def test_a_scan_of_the_first_page_is_a_page_check(tiled):
 
 def test_seams_are_even_and_spare_the_markers():
     template, piece = load_template("a4_tiles"), lay_out_piece((600, 600), 30, ID, "design")
-    tiles = plan_tiles(template, piece)
+    tiles = plan_tiles(template.tiles, piece)
     area = sum(t.part_mm[2] * t.part_mm[3] for t in tiles)
     assert area == pytest.approx(piece.size_mm[0] * piece.size_mm[1], rel=1e-6)
     for axis in (0, 1):
@@ -246,7 +247,7 @@ def test_two_times_is_the_same_bytes(tmp_path):
 
 def test_what_cannot_be_printed_is_refused_in_one_sentence(tmp_path):
     path = tmp_path / "s.pdf"
-    with pytest.raises(Refused, match=r"a piece of at most .* such as a4_tiles"):
+    with pytest.raises(Refused, match=r"a piece of at most .* one with tiles \(.*a4_tiles"):
         write(path, "letter", (300, 300))
     with pytest.raises(Refused, match="at most 30 tiles, for which there are marker ids"):
         write(path, "a4_tiles", (2000, 2000), 30)

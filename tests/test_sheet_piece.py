@@ -157,7 +157,7 @@ def test_marker_rects_cover_opencv_s_own_picture():
 
 def test_black_runs():
     dark = np.array([[0, 1, 1, 0, 1], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]], bool)
-    assert black_runs(dark) == [(0, 1, 3), (0, 4, 5), (2, 0, 5)]
+    assert black_runs(dark, (10, 20), 2) == [(12, 20, 4, 2), (18, 20, 2, 2), (10, 24, 10, 2)]
 
 
 @pytest.mark.parametrize("design_px", [(64, 64), (113, 71), (300, 300)])

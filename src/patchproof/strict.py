@@ -67,6 +67,7 @@ NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ord
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 Model = TypeVar("Model", bound=BaseModel)
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+Model = TypeVar("Model", bound=BaseModel)
 
 Model = TypeVar("Model", bound=BaseModel)
 

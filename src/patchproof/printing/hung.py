@@ -45,7 +45,7 @@ def hang(scene: MeshScene, template: Template) -> Hung:
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
     if template.tiles is not None:
-        for tile in plan_tiles(template, scene.piece):
+        for tile in plan_tiles(template.tiles, scene.piece):
             corners = flat(placement.world(rect_corners(tile.part_mm)))
             seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
             names.append((tuple(corners.mean(0)), tile.name))

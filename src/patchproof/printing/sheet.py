@@ -24,9 +24,9 @@ from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.chart_page import chart_sheet
 from patchproof.sheets.manifest import Manifest, Promise
-from patchproof.sheets.page import size_text
 from patchproof.sheets.piece import MODULES, control_design, lay_out_piece
 from patchproof.sheets.plan_page import PlanPage, edges_mm
+from patchproof.sheets.rects import size_text
 from patchproof.sheets.several import OneDesign, write_several
 from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet

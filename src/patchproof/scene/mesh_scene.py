@@ -155,7 +155,7 @@ def _hang(
     marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
     piece = lay_out_piece(design_mm, marker_mm, identity, "design")
     if template.tiles is not None:
-        plan_tiles(template, piece)  # refuses what no sheet could be made of, before hours of optimizing
+        plan_tiles(template.tiles, piece)  # refuses what no sheet could be made of, before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
     placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
     return piece, placement, unreadable, _unreadable_warning(unreadable, marker_mm)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import frame_mm, lay_out_piece, sheet_id
-from patchproof.sheets.template import load_template
+from patchproof.sheets.template import load_template, template_names
 from patchproof.sheets.write import write_sheet
 from patchproof.strict import Refused
 
@@ -24,7 +24,7 @@ def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
         raise Refused(
             "a template with a [blank] table for a page without a design",
             f"{template}",
-            "use blank_a4, or name the run whose design belongs on the page",
+            f"use one of: {', '.join(template_names('blank'))}, or name the run whose design belongs on the page",
         )
     identity = sheet_id({"template": page.model_dump(mode="json")}, 0)
     return write_sheet(

@@ -2,55 +2,33 @@
 
 In: a template with a [board] table. Out: BOARD.pdf and BOARD.json, made without a run. Black squares alternate with
 white ones that hold the markers 0, 1, 2... of the project's dictionary: the pattern that OpenCV's CharucoBoard draws
-since 4.6, so that any tool that knows such boards reads this one. The manifest's markers are exact, and
-`board_geometry` reads the rest of the pattern back. The sheet id is a hash of the template.
+since 4.6, so that any tool that knows such boards reads this one. The manifest's markers are exact, and `load_board`
+reads the rest of the pattern back. The sheet id is a hash of the template.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
-from patchproof.sheets import page as parts
-from patchproof.sheets.manifest import Manifest, Marker, Point, dump_manifest, load_manifest
-from patchproof.sheets.pdf import page_pdf
+from patchproof.sheets.layout import Box, PageLayout
+from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.page import furnished
+from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import DICTIONARY, MODULES, marker_at, sheet_id
-from patchproof.sheets.swatches import RectMm
-from patchproof.sheets.template import QrCode, Rulers, TextLine, template_names
-from patchproof.sheets.write import qr_text, replace_both
-from patchproof.strict import NotNegative, Positive, Refused, Strict, nearest, read_toml, shipped, validated
+from patchproof.sheets.rects import RectMm
+from patchproof.sheets.template import BoardGrid, BoardTemplate, template_data, template_names
+from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets
+from patchproof.strict import Refused, validated
 
 KIND = "board"
 
 
-class BoardGrid(Strict):
-    """The pattern; its first square, top-left, is black."""
-
-    corner_mm: Point  # its top-left corner
-    columns: Annotated[int, Field(ge=4, le=40)]  # squares side by side
-    rows: Annotated[int, Field(ge=4, le=40)]  # squares one above the other
-    square_mm: Annotated[Positive, Field(ge=8)]  # side of a square
-    marker_mm: Annotated[Positive, Field(ge=6)]  # side of a marker, at least a module less than the square
-
-
-class BoardTemplate(Strict):
-    """A whole template file of a board page."""
-
-    page_mm: tuple[Positive, Positive]  # width, height of the paper
-    margin_mm: NotNegative  # nothing is printed nearer to the edge
-    board: BoardGrid
-    ruler: Rulers
-    qr: QrCode  # names sheet and board
-    text: tuple[TextLine, ...] = ()  # also {columns}, {rows}, {square}, {marker} and {dictionary} are filled in
-
-
 @dataclass(frozen=True)
 class Board:
-    """A printed board: what OpenCV's CharucoBoard needs to know, in millimetres as intended."""
+    """A printed board: what OpenCV's CharucoBoard needs to know, in millimeters as intended."""
 
     sheet_id: str
     dictionary: str
@@ -64,55 +42,40 @@ class Board:
 
 def is_board(template: str | Path) -> bool:
     """Whether a template (a shipped one's name, or a TOML file) is one of a board."""
-    return "board" in read_toml(_path(template))
+    return KIND in template_data(template)[1]
 
 
 def board_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     """Write the board's page and its manifest beside it."""
-    pdf_path = Path(pdf_path)
-    if pdf_path.suffix.lower() != ".pdf":
-        raise Refused("a file name that ends in .pdf", f'"{pdf_path}"', "name the sheet BOARD.pdf")
-    path = _path(template)
-    page = validated(BoardTemplate, read_toml(path), str(path))
-    identity = sheet_id({"template": page.model_dump(mode="json")}, 0)
-    layout = _lay_out(page, identity)
-    grid = page.board
-    manifest = Manifest(
-        sheet_id=identity,
-        kind=KIND,
-        page_mm=page.page_mm,
-        design=None,
-        markers=tuple(Marker(dictionary=DICTIONARY, id=m.id, corners_mm=m.corners_mm, page=1) for m in layout.markers),
-        chart=(),
-        cut_mm=_rect(grid),
-        ruler_mm=(page.ruler.length_mm, page.ruler.length_mm),
-        promise=None,
-        settings={KIND: grid.model_dump(mode="json")},
-    )
-    text = dump_manifest(manifest)
-    pdf = page_pdf(layout, None, f"patchproof sheet {identity} {KIND}", text)
-    replace_both({pdf_path: pdf, pdf_path.with_suffix(".json"): text.encode()})
+    pdf_path = pdf_name(pdf_path)
+    board, identity = _load(template)
+    page = _lay_out(board, identity)
+    settings = {KIND: board.board.model_dump(mode="json")}
+    manifest = page_manifest(page, board, _rect(board.board), identity, KIND, settings)
+    save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
 
 def load_board(name_or_file: str | Path) -> Board:
     """The board of a template's name or file, or of the manifest of a printed one (BOARD.json)."""
-    if Path(name_or_file).suffix.lower() == ".json":
-        return board_geometry(load_manifest(name_or_file))
-    path = _path(name_or_file)
-    if not is_board(name_or_file):
-        raise Refused("a template with a [board] table", f"{name_or_file}", "use charuco_a4")
-    page = validated(BoardTemplate, read_toml(path), str(path))
-    length = page.ruler.length_mm
-    return _board(page.board, sheet_id({"template": page.model_dump(mode="json")}, 0), (length, length))
-
-
-def board_geometry(manifest: Manifest) -> Board:
-    """The board that a manifest describes."""
+    if Path(name_or_file).suffix.lower() != ".json":
+        template, identity = _load(name_or_file)
+        return _board(template.board, identity, (template.ruler.length_mm, template.ruler.length_mm))
+    manifest = load_manifest(name_or_file)
     if manifest.kind != KIND:
         raise Refused("the manifest of a board", f'one of kind "{manifest.kind}"', "name the JSON beside BOARD.pdf")
     grid = validated(BoardGrid, manifest.settings.get(KIND), "the board's manifest")
     return _board(grid, manifest.sheet_id, manifest.ruler_mm)
+
+
+def _load(template: str | Path) -> tuple[BoardTemplate, str]:
+    """The template and the sheet id that it gives."""
+    path, data = template_data(template)
+    if KIND not in data:
+        do = f"use one of: {', '.join(template_names(KIND))}"
+        raise Refused("a template with a [board] table", f"{template}", do)
+    page = validated(BoardTemplate, data, str(path))
+    return page, sheet_id({"template": page.model_dump(mode="json")}, 0)
 
 
 def _board(grid: BoardGrid, identity: str, ruler_mm: tuple[float, float]) -> Board:
@@ -120,9 +83,8 @@ def _board(grid: BoardGrid, identity: str, ruler_mm: tuple[float, float]) -> Boa
     return Board(identity, DICTIONARY, ids, grid.columns, grid.rows, grid.square_mm, grid.marker_mm, ruler_mm)
 
 
-def _lay_out(page: BoardTemplate, identity: str) -> parts.PageLayout:
-    """Everything in its place, proved apart and within the margins."""
-    grid, ruler = page.board, page.ruler
+def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
+    grid = template.board
     inset = (grid.square_mm - grid.marker_mm) / 2
     if inset < grid.marker_mm / MODULES - 1e-6:
         most = grid.square_mm * MODULES / (MODULES + 2)
@@ -135,7 +97,6 @@ def _lay_out(page: BoardTemplate, identity: str) -> parts.PageLayout:
     corners = [(x + column * grid.square_mm + inset, y + row * grid.square_mm + inset) for row, column in _white(grid)]
     if len(corners) > 1000:
         raise Refused("at most 1000 markers on a board", f"{len(corners)}", "make the board's squares fewer")
-    qr = parts.qr_rects_mm(qr_text(identity, KIND, None), page.qr.corner_mm, page.qr.size_mm)
     words = {
         "sheet_id": identity,
         "dictionary": DICTIONARY,
@@ -144,27 +105,13 @@ def _lay_out(page: BoardTemplate, identity: str) -> parts.PageLayout:
         "square": f"{grid.square_mm:g}",
         "marker": f"{grid.marker_mm:g}",
     }
-    starts = ((ruler.x_start_mm, False), (ruler.y_start_mm, True))
-    lines = [parts._filled(line, words) for line in page.text]
-    layout = parts.PageLayout(
-        page_mm=page.page_mm,
-        cuts_mm=(),
-        designs_mm=(),
+    page = PageLayout(
+        page_mm=template.page_mm,
         markers=tuple(marker_at(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),
-        swatches=(),
-        qr_mm=qr,
-        ticks=tuple(tick for start, down in starts for tick in parts._ruler_ticks(ruler, start, down)),
-        texts=tuple(lines + [digit for start, down in starts for digit in parts._ruler_digits(ruler, start, down)]),
-        boxes=(
-            parts.Box("board", _rect(grid)),
-            parts.Box("QR code", parts._qr_box(page, qr)),
-            *(parts._ruler_box(f"{'y' if down else 'x'} ruler", ruler, start, down) for start, down in starts),
-            *(parts.text_box(line) for line in lines),
-        ),
+        boxes=(Box("board", _rect(grid)),),
         squares_mm=_black(grid),
     )
-    parts.prove_apart(layout.boxes, page.page_mm, page.margin_mm)
-    return layout
+    return furnished(template, page, qr_text(identity, KIND, None), words)
 
 
 def _white(grid: BoardGrid) -> list[tuple[int, int]]:
@@ -180,13 +127,3 @@ def _black(grid: BoardGrid) -> tuple[RectMm, ...]:
 
 def _rect(grid: BoardGrid) -> RectMm:
     return (*grid.corner_mm, grid.columns * grid.square_mm, grid.rows * grid.square_mm)
-
-
-def _path(template: str | Path) -> Path:
-    path = Path(template)
-    if path.suffix == ".toml":
-        return path
-    names = template_names()
-    if str(template) not in names:
-        raise Refused("a print template's name or a .toml file", f'"{template}"', nearest(str(template), names))
-    return shipped("print_templates", f"{template}.toml")

@@ -1,9 +1,9 @@
-"""The page's colour chart: which colours, and where each one lies.
+"""The page's color chart: which colors, and where each one lies.
 
-In: how many swatches and their grid. Out: (rectangle in page millimetres, sRGB) pairs. The colours are the 8 corners
+In: how many swatches and their grid. Out: (rectangle in page millimetres, sRGB) pairs. The colors are the 8 corners
 of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates from which the noise of reading is
 estimated, and a low-discrepancy filling of the cube. Their places are shuffled once and for all, so that a gradient
-of light across the page is not mistaken for a colour. All values are whole steps of 1/255, so that every printer
+of light across the page is not mistaken for a color. All values are whole steps of 1/255, so that every printer
 driver gets the same numbers.
 """
 
@@ -14,37 +14,32 @@ from itertools import product
 import numpy as np
 
 from patchproof.sheets.piece import hash_order
-from patchproof.sheets.swatches import Srgb, SwatchRect
+from patchproof.sheets.rects import Srgb, SwatchRect
 from patchproof.sheets.template import ChartGrid
 
 CORNERS: tuple[Srgb, ...] = tuple((float(r), float(g), float(b)) for r, g, b in product((0, 1), repeat=3))
-GRAYS: tuple[Srgb, ...] = tuple((v / 255,) * 3 for v in (36, 73, 109, 146, 182, 219))
-DUPLICATES: tuple[Srgb, ...] = ((0.0,) * 3, (1.0,) * 3, GRAYS[1], GRAYS[4], (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+GRAYS: tuple[Srgb, ...] = tuple((v / 255, v / 255, v / 255) for v in (36, 73, 109, 146, 182, 219))
+DUPLICATES: tuple[Srgb, ...] = (CORNERS[0], CORNERS[7], GRAYS[1], GRAYS[4], (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 # (columns, rows): the one of 200 orders that keeps duplicates far apart (4 to 7 cells) and correlations of a channel
 # with x or y low (below 0.1 on 12 × 6, at most 0.15). Other grids take the first.
 ORDERS = {(12, 6): 184, (8, 12): 19, (16, 6): 81, (12, 4): 80, (6, 8): 172}
 
 
 def chart_colors(count: int) -> list[Srgb]:
-    """`count` sRGB colours, the fixed ones first, then Sobol's sequence (unscrambled, without its first point)."""
+    """`count` sRGB colors, the fixed ones first, then Sobol's sequence (unscrambled, without its first point)."""
     from scipy.stats import qmc
 
     fixed = [*CORNERS, *GRAYS, *DUPLICATES]
     rest = max(count - len(fixed), 0)
     points = qmc.Sobol(3, scramble=False).random_base2(int(rest + 1).bit_length())[1 : rest + 1]
-    filling = [tuple(float(v) for v in np.rint(point * 255) / 255) for point in points]
+    filling = [(r, g, b) for r, g, b in (np.rint(points * 255) / 255).tolist()]
     return (fixed + filling)[:count]
-
-
-def chart_order(columns: int, rows: int) -> list[int]:
-    """Which of `chart_colors` lies in each cell, row by row."""
-    return hash_order(f"chart {ORDERS.get((columns, rows), 184)}", columns * rows)
 
 
 def chart_swatches(grid: ChartGrid) -> tuple[SwatchRect, ...]:
     """The chart's swatches row by row, in page millimetres."""
     colors = chart_colors(grid.columns * grid.rows)
-    order = chart_order(grid.columns, grid.rows)
+    order = hash_order(f"chart {ORDERS.get((grid.columns, grid.rows), 184)}", len(colors))
     pitch = grid.swatch_mm + grid.gap_mm
     (x, y), side = grid.corner_mm, grid.swatch_mm
     cells = product(range(grid.rows), range(grid.columns))

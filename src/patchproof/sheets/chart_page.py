@@ -1,4 +1,4 @@
-"""Chart pages: a colour chart alone, printed to learn what a printer does to colours.
+"""Chart pages: a color chart alone, printed to learn what a printer does to colors.
 
 In: a template without a place for a piece. Out: CHART.pdf and CHART.json. The sheet id is a hash of the template, so
 equal templates give equal pages, and two charts can be told apart. `cut_mm` is the chart's own rectangle: nothing is
@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from patchproof.sheets.manifest import Manifest, Swatch
+from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.page import lay_out_parts
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import marker_ids, sheet_id
 from patchproof.sheets.template import Template
-from patchproof.sheets.write import pdf_name, printed_marker, qr_text, save_sheets
+from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets
 
 KIND = "chart"
 
@@ -26,20 +26,10 @@ def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
     ids = marker_ids(identity, "blank", len(template.marker.corners_mm))  # a chart has an id of its own, so no kind
     grid = template.chart
     words = {"sheet_id": identity, "kind": KIND, "swatches": str(grid.columns * grid.rows)}
-    page = lay_out_parts(template, [], [], ids, qr_text(identity, KIND, None), words)
+    page = lay_out_parts(template, [], ids, qr_text(identity, KIND, None), words)
     pitch = grid.swatch_mm + grid.gap_mm
     width, height = (round(count * pitch - grid.gap_mm, 6) for count in (grid.columns, grid.rows))
-    manifest = Manifest(
-        sheet_id=identity,
-        kind=KIND,
-        page_mm=page.page_mm,
-        design=None,
-        markers=tuple(printed_marker(m) for m in page.markers),
-        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
-        cut_mm=(*grid.corner_mm, width, height),
-        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
-        promise=None,
-        settings={KIND: grid.model_dump(mode="json")},
-    )
+    cut_mm = (*grid.corner_mm, width, height)
+    manifest = page_manifest(page, template, cut_mm, identity, KIND, {KIND: grid.model_dump(mode="json")})
     save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest

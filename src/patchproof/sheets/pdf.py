@@ -2,8 +2,8 @@
 
 Each marker, and the QR code, is one path of black runs that touch, and a swatch one path of two halves: readers snap
 a lone rectangle to whole pixels but antialias a path of several, which keeps marker corners within hundredths of a
-millimetre. The design is embedded losslessly, pixel for pixel, without interpolation. All colours are sRGB and say
-so: the design's colour space is ICCBased, and the page's DefaultRGB gives vector colours the same one. PrintScaling
+millimeter. The design is embedded losslessly, pixel for pixel, without interpolation. All colors are sRGB and say
+so: the design's color space is ICCBased, and the page's DefaultRGB gives vector colors the same one. PrintScaling
 None asks viewers not to scale. Nothing depends on time, place or hash order: equal input gives equal bytes. PDF
 points (1/72 inch, y up) and their conversion exist here alone.
 """
@@ -18,15 +18,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.sheets.fonts import font_name
-from patchproof.sheets.page import CUT_LINE_MM, PageLayout
+from patchproof.sheets.layout import PageLayout
+from patchproof.sheets.page import CUT_LINE_MM
 from patchproof.sheets.piece import marker_rects_mm
-from patchproof.sheets.swatches import RectMm, Srgb
+from patchproof.sheets.rects import RectMm, Srgb
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
 POINTS_PER_MM = 72 / 25.4
 ATTACHMENT = "sheet.json"
+_ATTACHED = "geometry and promise of this sheet"
 
 
 def numbered(name: str, index: int) -> str:
@@ -42,12 +44,6 @@ class Printed:
     layout: PageLayout
     pictures: tuple[tuple[RectMm, np.ndarray], ...] = ()
     windowed: tuple[tuple[RectMm, np.ndarray], ...] = ()
-
-
-def page_pdf(layout: PageLayout, design: np.ndarray | None, title: str, manifest_json: str) -> bytes:
-    """One page: the layout, the uint8 H×W×3 design (None leaves white paper) and the manifest attached."""
-    pictures = () if design is None else tuple((rect, design) for rect in layout.designs_mm)
-    return pages_pdf([Printed(layout, pictures)], title, {ATTACHMENT: manifest_json})
 
 
 def pages_pdf(pages: Sequence[Printed], title: str, attachments: dict[str, str]) -> bytes:
@@ -77,11 +73,11 @@ def _drawn(pages: Sequence[Printed], title: str) -> bytes:
         canvas.setTitle(title)
         canvas.setViewerPreference("PrintScaling", "None")
         for page in pages:
-            size = tuple(side * POINTS_PER_MM for side in page.layout.page_mm)
-            canvas.setPageSize(size)
-            canvas.setTrimBox((0, 0, *size))
-            canvas.setBleedBox((0, 0, *size))
-            # from here on millimetres with y up
+            width, height = (side * POINTS_PER_MM for side in page.layout.page_mm)
+            canvas.setPageSize((width, height))
+            canvas.setTrimBox((0, 0, width, height))
+            canvas.setBleedBox((0, 0, width, height))
+            # from here on millimeters with y up
             canvas.scale(POINTS_PER_MM, POINTS_PER_MM)
             _draw(canvas, page)
             canvas.showPage()
@@ -156,7 +152,7 @@ def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
 
 
 def _finished(drawn: bytes, attachments: dict[str, str]) -> bytes:
-    """Colour spaces, attachments and plain metadata, which reportlab cannot write."""
+    """Color spaces, attachments and plain metadata, which reportlab cannot write."""
     import pikepdf
     from pikepdf import Array, Name
 
@@ -169,13 +165,12 @@ def _finished(drawn: bytes, attachments: dict[str, str]) -> bytes:
             for image in resources.get("/XObject", {}).values():
                 image.ColorSpace = space
         for name, text in attachments.items():
-            pdf.attachments[name] = pikepdf.AttachedFileSpec(
+            about = {"filename": name, "mime_type": "application/json", "description": _ATTACHED}
+            pdf.attachments[name] = pikepdf.AttachedFileSpec(  # its stub lacks the relationship
                 pdf,
                 text.encode(),
-                filename=name,
-                mime_type="application/json",
                 relationship=Name.Data,
-                description="geometry and promise of this sheet",
+                **about,  # type: ignore[reportCallIssue]
             )
         for key in ("/CreationDate", "/ModDate", "/Author", "/Subject", "/Keywords", "/Creator"):
             if key in pdf.docinfo:

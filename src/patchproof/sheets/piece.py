@@ -1,13 +1,13 @@
 """The piece that is cut out and put on the object: the design in the middle of a frame of markers and swatches.
 
-Millimetres from the top-left corner of the cut line, x right, y down. From the design outwards the frame is one
+Millimeters from the top-left corner of the cut line, x right, y down. From the design outwards the frame is one
 module of white (the markers' quiet zone), the markers (7 modules), one module of white, and 2 mm for the scissors.
 Markers sit in the four corners and, where a side is long enough, in its middle, so that a hidden corner costs
-nothing. Between them lie up to twelve swatches, so that colour is measured on the object too. Everything in the frame
+nothing. Between them lie up to twelve swatches, so that color is measured on the object too. Everything in the frame
 is an axis-aligned rectangle, hence `frame_image` can be exact: each pixel has the mean *light* of what covers it.
 
 Ids and the sheet's name come from SHA-256 alone: they stay the same on every machine and in every version. The sheet
-id is fixed before optimising and never taken from the design, because the frame is rendered with its marker ids.
+id is fixed before optimizing and never taken from the design, because the frame is rendered with its marker ids.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.geometry import rect_corners
-from patchproof.sheets.swatches import RectMm, SwatchRect, frame_swatches
+from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
+from patchproof.sheets.swatches import frame_swatches
 from patchproof.strict import Refused, nearest
 
 DICTIONARY = "DICT_5X5_1000"
@@ -39,7 +39,7 @@ class PieceMarker:
     """An ArUco marker: outer corners of its black square, clockwise from the code's top-left."""
 
     id: int
-    corners_mm: tuple[tuple[float, float], ...]
+    corners_mm: tuple[PointMm, PointMm, PointMm, PointMm]
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def marker_size_mm(needed_mm: float, design_mm: tuple[float, float], largest_pie
 def lay_out_piece(design_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str) -> Piece:
     """The piece round a design of that size.
 
-    A side as long as a marker gets one in its middle; swatches, four millimetres or larger, get what is left.
+    A side as long as a marker gets one in its middle; swatches, four millimeters or larger, get what is left.
     """
     module, frame = marker_mm / MODULES, frame_mm(marker_mm)
     (w, h), edge = design_mm, SCISSORS_MM + module
@@ -132,28 +132,39 @@ def lay_out_piece(design_mm: tuple[float, float], marker_mm: float, sheet_id: st
     return Piece(size, (frame, frame, w, h), markers, swatches, module)
 
 
-def marker_at(id_: int, corner_mm: tuple[float, float], size_mm: float) -> PieceMarker:
+def marker_at(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
     """A marker with its top-left corner there."""
-    corners = rect_corners((*corner_mm, size_mm, size_mm))
-    return PieceMarker(id_, tuple((float(x), float(y)) for x, y in corners))
+    (x, y), side = map(float, corner_mm), float(size_mm)
+    return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))
+
+
+def moved_marker(marker: PieceMarker, by: PointMm) -> PieceMarker:
+    """The marker elsewhere."""
+    a, b, c, d = ((round(x + by[0], 6), round(y + by[1], 6)) for x, y in marker.corners_mm)
+    return PieceMarker(marker.id, (a, b, c, d))
+
+
+def marker_rect(marker: PieceMarker) -> RectMm:
+    """The marker's black square."""
+    (x, y), (x1, _) = marker.corners_mm[:2]
+    return x, y, x1 - x, x1 - x
 
 
 def marker_rects_mm(marker: PieceMarker) -> list[RectMm]:
     """The marker's black as rectangles that touch but never overlap: one for each run of black modules in a row."""
-    (x, y), (x1, _) = marker.corners_mm[:2]
-    module = (x1 - x) / MODULES
-    return [
-        (x + start * module, y + row * module, (stop - start) * module, module)
-        for row, start, stop in black_runs(_marker_modules(marker.id))
-    ]
+    x, y, side, _ = marker_rect(marker)
+    return black_runs(_marker_modules(marker.id), (x, y), side / MODULES)
 
 
-def black_runs(dark: np.ndarray) -> list[tuple[int, int, int]]:
-    """(row, start, stop) of each run of True in a boolean image."""
+def black_runs(dark: np.ndarray, corner_mm: PointMm, module_mm: float) -> list[RectMm]:
+    """A rectangle for each run of True in a row of a boolean image, from the top down."""
     steps = np.diff(np.pad(dark.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(steps == 1)
-    stops = np.nonzero(steps == -1)[1]
-    return list(zip(rows.tolist(), starts.tolist(), stops.tolist(), strict=True))
+    lengths, (x, y) = np.nonzero(steps == -1)[1] - starts, corner_mm
+    return [
+        (x + start * module_mm, y + row * module_mm, length * module_mm, module_mm)
+        for row, start, length in zip(rows.tolist(), starts.tolist(), lengths.tolist(), strict=True)
+    ]
 
 
 def frame_image(piece: Piece, design_px: tuple[int, int]) -> FrameImage:
@@ -177,13 +188,14 @@ def frame_image(piece: Piece, design_px: tuple[int, int]) -> FrameImage:
     image = srgb_from_linear(np.clip(linear, 0, 1)).astype(np.float32)
     (x, y), (w, h) = origin.astype(int), design_px
     image[y : y + h, x : x + w] = 0.5
-    return FrameImage(image, (int(x), int(y), w, h), tuple(float(v) for v in cut))
+    x0, y0, x1, y1 = map(float, cut)
+    return FrameImage(image, (int(x), int(y), w, h), (x0, y0, x1, y1))
 
 
 def control_design(kind: str, design: np.ndarray, sheet_id: str) -> np.ndarray:
     """What a control sheet prints in place of a uint8 H×W×3 design, in as many pixels.
 
-    "mean": its mean colour, averaged in light; "grey": sRGB 128; "noise": random cells, 16 along the shorter side;
+    "mean": its mean color, averaged in light; "grey": sRGB 128; "noise": random cells, 16 along the shorter side;
     "shuffled": the design's own 16 × 16 cells in another order (pixels left over at the right and bottom stay);
     "blank": white paper; "design": the design.
     """

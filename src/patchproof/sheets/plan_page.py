@@ -1,6 +1,6 @@
 """The last page: where the piece goes on the object, and how to photograph it so that the photographs can tell.
 
-In: a `PlanPage`: a picture of the object with its millimetres, the piece's outline on it, and paragraphs. Out: the
+In: a `PlanPage`: a picture of the object with its millimeters, the piece's outline on it, and paragraphs. Out: the
 page. Dimension chains above and beside the picture run from edge to edge of the object's side. The picture is passed
 in; this module knows paper only.
 """
@@ -12,28 +12,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
-from patchproof.sheets.page import Box, Line, PageLayout, prove_apart, text_box
+from patchproof.sheets.layout import Box, Line, PageLayout, prove_apart, text_box
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.swatches import RectMm
+from patchproof.sheets.rects import PointMm, RectMm
 from patchproof.sheets.template import Template, TextLine
 from patchproof.strict import Refused
 
 PICTURE_SHARE = 0.42  # of the page's height at most
 ABOVE_MM, BESIDE_MM = 13.0, 22.0  # for the dimension chains
 HEADING_MM, TEXT_MM, LEADING = 3.2, 2.6, 1.45
-Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Hung:
-    """The piece on the object, seen straight from its side; millimetres x right, y down."""
+    """The piece on the object, seen straight from its side; millimeters x right, y down."""
 
     picture: np.ndarray  # uint8 H×W×3
     picture_mm: RectMm
     object_mm: RectMm  # the object's extent
-    outline_mm: tuple[Point, ...]  # the piece's cut line
-    seams_mm: tuple[tuple[Point, Point], ...] = ()
-    names_mm: tuple[tuple[Point, str], ...] = ()
+    outline_mm: tuple[PointMm, ...]  # the piece's cut line
+    seams_mm: tuple[tuple[PointMm, PointMm], ...] = ()
+    names_mm: tuple[tuple[PointMm, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,11 +65,6 @@ def lay_out_plan(plan: PlanPage, template: Template, sheet_id: str) -> Printed:
         top += 2.0
     layout = PageLayout(
         page_mm=template.page_mm,
-        cuts_mm=(),
-        designs_mm=(),
-        markers=(),
-        swatches=(),
-        qr_mm=(),
         ticks=tuple(lines),
         texts=(*texts, *labels),
         boxes=(*boxes, *(text_box(line) for line in texts)),
@@ -100,7 +94,7 @@ def _drawing(hung: Hung, room: RectMm):
         raise Refused("a picture of the object", f"one of {wide:g} × {high:g} mm", "leave the plan out")
     corner = (x + (w - BESIDE_MM - scale * wide) / 2, y + ABOVE_MM)
 
-    def at(point: Point) -> Point:
+    def at(point: PointMm) -> PointMm:
         return corner[0] + (point[0] - left) * scale, corner[1] + (point[1] - up) * scale
 
     closed = zip(hung.outline_mm, (*hung.outline_mm[1:], hung.outline_mm[0]), strict=True)

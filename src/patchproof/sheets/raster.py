@@ -1,8 +1,8 @@
-"""The way back: a sheet's PDF as pixels on an exact millimetre grid, and the manifest that it carries.
+"""The way back: a sheet's PDF as pixels on an exact millimeter grid, and the manifest that it carries.
 
 In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
 stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the part wanted is first made a page of
-its own whose size is a whole number of pixels; then pixel and millimetre differ by a scale alone.
+its own whose size is a whole number of pixels; then pixel and millimeter differ by a scale alone.
 Left out on purpose: threads. PDFium is not thread-safe; render in processes.
 """
 
@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,11 +26,9 @@ LARGEST_PX = 20_000  # along a side; more would be gigabytes
 
 def page_pixels(pdf_path: str | Path, page: int = 1, dpi: float = 150.0) -> np.ndarray:
     """A page (from 1) with pixel = mm × dpi / 25.4; the last row and column may pass the page's edge."""
-    pdf, opened = _open_page(pdf_path, page)
-    with pdf:
-        points = opened.get_size()
-        size_px = tuple(math.ceil(side / 72 * dpi - 1e-3) for side in points)
-        return _render(opened, (0.0, 0.0, size_px[0] * 72 / dpi, size_px[1] * 72 / dpi), size_px)
+    with _opened_page(pdf_path, page) as opened:
+        width, height = (math.ceil(side / 72 * dpi - 1e-3) for side in opened.get_size())
+        return _render(opened, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
 
 
 def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
@@ -35,32 +36,31 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
 
     The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
     """
-    size_px = tuple(max(round(side / 25.4 * dpi), 1) for side in manifest.cut_mm[2:])
+    width, height = (max(round(side / 25.4 * dpi), 1) for side in manifest.cut_mm[2:])
     if not manifest.tiles:
         page = manifest.design.page if manifest.design else 1
-        return _part_pixels(pdf_path, page, manifest.cut_mm, size_px)
-    pixels = np.full((size_px[1], size_px[0], 3), 255, np.uint8)
-    px_per_mm = np.array(size_px) / manifest.cut_mm[2:]
+        return _part_pixels(pdf_path, page, manifest.cut_mm, (width, height))
+    pixels = np.full((height, width, 3), 255, np.uint8)
+    px_per_mm = np.array([width, height]) / manifest.cut_mm[2:]
     for tile in manifest.tiles:
         start_mm = _piece_from_page(manifest, tile, tile.cut_mm[:2])
         # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
         first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
-        last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=size_px)
+        last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=[width, height])
         corner = np.array(tile.cut_mm[:2]) + first / px_per_mm - start_mm
-        size = last - first
-        rect = (*corner, *(size / px_per_mm))
-        pixels[first[1] : last[1], first[0] : last[0]] = _part_pixels(pdf_path, tile.page, rect, tuple(size.tolist()))
+        wide, high = (last - first).tolist()
+        rect = (*corner, wide / px_per_mm[0], high / px_per_mm[1])
+        pixels[first[1] : last[1], first[0] : last[0]] = _part_pixels(pdf_path, tile.page, rect, (wide, high))
     return pixels
 
 
 def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
-    pdf, page = _open_page(pdf_path, number)
-    with pdf:
+    with _opened_page(pdf_path, number) as page:
         return _render(page, tuple(float(v) * POINTS_PER_MM for v in rect_mm), size_px)
 
 
 def _piece_from_page(manifest: Manifest, tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
-    """A point of a tile's page in piece millimetres."""
+    """A point of a tile's page in piece millimeters."""
     (_, _, dx), (_, _, dy) = tile.page_from_design_mm
     frame = np.array(manifest.design.rect_mm[:2]) - manifest.cut_mm[:2] if manifest.design else np.zeros(2)
     return np.array(point_mm) - (dx, dy) + frame
@@ -82,7 +82,7 @@ def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Mani
     if not texts:
         raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again")
     manifests = [validated(Manifest, data, f"{name} of {pdf_path}") for name, data in zip(names, texts, strict=True)]
-    return next((one for one in manifests if one.sheet_id == sheet_id), manifests[0])
+    return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
 
 
 def _existing(pdf_path: str | Path) -> None:
@@ -90,8 +90,8 @@ def _existing(pdf_path: str | Path) -> None:
         raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
 
 
-def _open_page(pdf_path: str | Path, page: int):
-    """The document, to be closed by the caller, and one page of it."""
+@contextmanager
+def _opened_page(pdf_path: str | Path, page: int) -> Iterator[Any]:
     import pypdfium2
 
     _existing(pdf_path)
@@ -99,11 +99,10 @@ def _open_page(pdf_path: str | Path, page: int):
         pdf = pypdfium2.PdfDocument(str(pdf_path))
     except pypdfium2.PdfiumError as error:
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
-    if not 1 <= page <= len(pdf):
-        pages = len(pdf)
-        pdf.close()
-        raise Refused(f"a page from 1 to {pages} of {pdf_path}", f"{page}", "ask for another page")
-    return pdf, pdf[page - 1]
+    with pdf:
+        if not 1 <= page <= len(pdf):
+            raise Refused(f"a page from 1 to {len(pdf)} of {pdf_path}", f"{page}", "ask for another page")
+        yield pdf[page - 1]
 
 
 def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:

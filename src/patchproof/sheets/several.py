@@ -13,23 +13,25 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from patchproof.sheets.manifest import Manifest, Promise, Swatch, design_sha256
-from patchproof.sheets.page import PageLayout, lay_out_parts, moved, moved_marker, place_pieces, size_text
+from patchproof.sheets.layout import PageLayout
+from patchproof.sheets.manifest import Manifest, Promise, design_sha256
+from patchproof.sheets.page import lay_out_parts, place_pieces
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import Piece, hash_order, sheet_id
+from patchproof.sheets.piece import Piece, hash_order, moved_marker, sheet_id
+from patchproof.sheets.rects import PointMm, moved, size_text
 from patchproof.sheets.template import Template
 from patchproof.sheets.write import (
     check_pixels,
     manifest_paths,
+    page_manifest,
     pdf_name,
     printed_design,
-    printed_marker,
     save_sheets,
 )
 from patchproof.strict import Refused
@@ -52,20 +54,19 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[On
     pdf_path = pdf_name(pdf_path)
     if template.tiles is not None:
         raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")
-    same = [key for key, count in Counter((one.sheet_id, one.kind) for one in designs).items() if count > 1]
+    same = [key for key, count in Counter((d.sheet_id, d.kind) for d in designs).items() if count > 1]
     if len(designs) < 2:
         raise Refused("several designs", f"{len(designs)}", "use write_sheet for one")
     if same:
         raise Refused("designs of different runs", f"sheet {same[0][0]} twice", "use --copies for more of the same")
-    for one in designs:
-        check_pixels(one.design_srgb8)
-    pieces = [one.piece for one in designs]
-    places = place_pieces(template, pieces)
-    identity = sheet_id({"sheets": [[one.sheet_id, one.kind] for one in designs]}, 0)
+    for design in designs:
+        check_pixels(design.design_srgb8)
+    placed = place_pieces(template, [design.piece for design in designs])
+    identity = sheet_id({"sheets": [[design.sheet_id, design.kind] for design in designs]}, 0)
     code = _page_code(identity, designs)
-    page = lay_out_parts(template, pieces, places, _page_ids(designs, template), code, _words(identity, designs))
-    manifests = [_manifest(template, page, designs, places, i, code) for i in range(len(designs))]
-    pictures = tuple((rect, one.design_srgb8) for rect, one in zip(page.designs_mm, designs, strict=True))
+    page = lay_out_parts(template, placed, _page_ids(designs, template), code, _words(identity, designs))
+    manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
+    pictures = tuple((rect, design.design_srgb8) for rect, design in zip(page.designs_mm, designs, strict=True))
     paths = manifest_paths(pdf_path, len(designs))
     save_sheets(pdf_path, [Printed(page, pictures)], dict(zip(paths, manifests, strict=True)))
     return manifests
@@ -73,47 +74,44 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[On
 
 def _page_ids(designs: Sequence[OneDesign], template: Template) -> list[int]:
     """Ids for the page's own markers that no piece has."""
-    used = {marker.id for one in designs for marker in one.piece.markers}
-    order = hash_order(" ".join(one.sheet_id for one in designs), 1000)
+    used = {marker.id for design in designs for marker in design.piece.markers}
+    order = hash_order(" ".join(design.sheet_id for design in designs), 1000)
     return [i for i in order if i not in used][: len(template.marker.corners_mm)]
 
 
 def _page_code(identity: str, designs: Sequence[OneDesign]) -> str:
     """The page's id, and 16 digits of a SHA-256 over those of its designs."""
-    hashes = "".join(design_sha256(one.design_srgb8) for one in designs)
+    hashes = "".join(design_sha256(design.design_srgb8) for design in designs)
     return f"patchproof:{identity}:{hashlib.sha256(hashes.encode()).hexdigest()[:16]}"
 
 
 def _words(identity: str, designs: Sequence[OneDesign]) -> dict[str, str]:
-    sizes = sorted({size_text(one.piece.size_mm) for one in designs})
     return {
         "sheet_id": identity,
         "kind": f"{len(designs)} designs,",
-        "design": " and ".join(sorted({size_text(one.piece.design_rect_mm[2:]) for one in designs})),
-        "piece": " and ".join(sizes),
+        "design": " and ".join(sorted({size_text(design.piece.design_rect_mm[2:]) for design in designs})),
+        "piece": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
     }
 
 
 def _manifest(
-    template: Template, page: PageLayout, designs: Sequence[OneDesign], places, index: int, code: str
+    template: Template, page: PageLayout, design: OneDesign, corner: PointMm, index: int, code: str
 ) -> Manifest:
     """One design's: its own piece first, then everything else on the page whose id cannot be mistaken."""
-    one, corner = designs[index], places[index]
-    own = [moved_marker(marker, corner) for marker in one.piece.markers]
+    own = [moved_marker(marker, corner) for marker in design.piece.markers]
     counts = Counter(marker.id for marker in page.markers)
     others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in own]
-    frame = [(moved(rect, corner), srgb) for rect, srgb in one.piece.swatches]
-    chart = [*page.swatches[: template.chart.columns * template.chart.rows], *frame]
-    return Manifest(
-        sheet_id=one.sheet_id,
-        kind=one.kind,
-        page_mm=page.page_mm,
-        design=printed_design(one.design_srgb8, page.designs_mm[index]),
-        markers=tuple(printed_marker(marker) for marker in [*own, *others]),
-        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in chart),
-        cut_mm=page.cuts_mm[index],
-        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
-        page_code=code,
-        promise=one.promise,
-        settings=one.settings,
-    )
+    frame = [(moved(rect, corner), srgb) for rect, srgb in design.piece.swatches]
+    chart = page.swatches[: template.chart.columns * template.chart.rows]
+    mine = replace(page, markers=(*own, *others), swatches=(*chart, *frame))
+    printed = printed_design(design.design_srgb8, page.designs_mm[index])
+    return page_manifest(
+        mine,
+        template,
+        page.cuts_mm[index],
+        design.sheet_id,
+        design.kind,
+        design.settings,
+        printed,
+        design.promise,
+    ).changed(page_code=code)

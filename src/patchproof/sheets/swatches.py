@@ -1,6 +1,6 @@
 """The twelve swatches of a piece's frame: the corners of the RGB cube and four grays, between the markers.
 
-In: where the markers are. Out: (rectangle in piece millimetres, sRGB) pairs, squares of one size, none larger than a
+In: where the markers are. Out: (rectangle in piece millimeters, sRGB) pairs, squares of one size, none larger than a
 marker or nearer than a module to anything else. Where the twelve have no room at 4 mm each, fewer are laid out, the
 most telling first; `write.check_sheet` then says so.
 """
@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 
+from patchproof.sheets.rects import RectMm, Srgb, SwatchRect
+
 SMALLEST_SWATCH_MM = 4.0  # at the 1 px/mm of a distant photograph this leaves 2 × 2 clean pixels inside
 
-RectMm = tuple[float, float, float, float]
-Srgb = tuple[float, float, float]
-SwatchRect = tuple[RectMm, Srgb]
 # The last are given up first where there is no room: black and white can be read from markers and paper anyway.
 # Dealt out to four sides in turn, each side gets one gray.
 FRAME_COLORS: tuple[Srgb, ...] = (

@@ -1,16 +1,16 @@
-"""Print templates: pages as data, all in millimetres.
+"""Print templates: pages as data, all in millimeters.
 
-In: the name of a shipped template ("a4") or a TOML file of one's own. Out: a frozen `Template`, every key known and
-every number checked. A template says where things lie and how large they are; what they show (ids, colours, the
-design) comes from elsewhere. Whether its parts lie apart and inside the margins is proved by `page.lay_out_page`,
-with the piece on it.
+In: the name of a shipped template ("a4") or a TOML file of one's own. Out: a frozen `Template`, or `BoardTemplate`,
+every key known and every number checked. A template says where things lie and how large they are; what they show (ids,
+colors, the design) comes from elsewhere. Whether its parts lie apart and inside the margins is proved by
+`page.furnished`, with the piece on it.
 Left out on purpose: expressions, inheritance and includes. A page is short enough to be written out.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -65,7 +65,7 @@ class BlankPiece(Strict):
     marker_mm: Annotated[Positive, Field(ge=8)]  # of the frame; smaller ones are lost in photographs
 
 
-class TilePages(Strict):
+class TileGrid(Strict):
     """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
 
     # [x, y, width, height]: a tile's part of the piece at its largest; what is printed of it starts at the corner.
@@ -95,20 +95,35 @@ class Template(Strict):
     qr: QrCode  # names sheet and design
     marker: PageMarkers  # beside those of the piece
     blank: BlankPiece | None = None  # on a page that is made without a run
-    tiles: TilePages | None = None  # on templates for a piece larger than the page
+    tiles: TileGrid | None = None  # on templates for a piece larger than the page
     plan_page: bool = False  # a last page that says where the piece goes and how to photograph it
     text: tuple[TextLine, ...] = ()  # all that is written
 
 
+class BoardGrid(Strict):
+    """A ChArUco board's pattern; its first square, top-left, is black."""
+
+    corner_mm: Point  # its top-left corner
+    columns: Annotated[int, Field(ge=4, le=40)]  # squares side by side
+    rows: Annotated[int, Field(ge=4, le=40)]  # squares one above the other
+    square_mm: Annotated[Positive, Field(ge=8)]  # side of a square
+    marker_mm: Annotated[Positive, Field(ge=6)]  # side of a marker, at least a module less than the square
+
+
+class BoardTemplate(Strict):
+    """A whole template file of a board page."""
+
+    page_mm: tuple[Positive, Positive]  # width, height of the paper
+    margin_mm: NotNegative  # nothing is printed nearer to the edge
+    board: BoardGrid
+    ruler: Rulers
+    qr: QrCode  # names sheet and board
+    text: tuple[TextLine, ...] = ()  # also {columns}, {rows}, {square}, {marker} and {dictionary} are filled in
+
+
 def load_template(name_or_file: str | Path) -> Template:
     """The shipped template of that name, or the one in that file; an unknown name is refused with the nearest."""
-    path = Path(name_or_file)
-    if path.suffix != ".toml":
-        names = template_names()
-        if str(name_or_file) not in names:
-            raise Refused("a print template's name or a .toml file", f'"{name_or_file}"', nearest(str(path), names))
-        path = shipped("print_templates", f"{name_or_file}.toml")
-    data = read_toml(path)
+    path, data = template_data(name_or_file)
     if "card" in data:  # pages once had a bank card's outline, with words in it that would be printed alone
         raise Refused(
             f"no bank card in {path}", "[card]", "delete it and its text: a scan or a ruler shows a print's size"
@@ -120,6 +135,18 @@ def load_template(name_or_file: str | Path) -> Template:
     return template
 
 
-def template_names() -> list[str]:
-    """The shipped templates' names."""
-    return sorted(path.stem for path in shipped("print_templates").glob("*.toml"))
+def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
+    """A template's file and what it holds, unchecked: its tables tell what kind of page it is."""
+    path = Path(name_or_file)
+    if path.suffix != ".toml":
+        names = template_names()
+        if str(path) not in names:
+            raise Refused("a print template's name or a .toml file", f'"{path}"', nearest(str(path), names))
+        path = shipped("print_templates", f"{path}.toml")
+    return path, read_toml(path)
+
+
+def template_names(table: str | None = None) -> list[str]:
+    """The shipped templates' names; with `table`, of those that have it."""
+    paths = shipped("print_templates").glob("*.toml")
+    return sorted(path.stem for path in paths if table is None or table in read_toml(path))

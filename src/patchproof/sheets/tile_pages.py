@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.sheets.manifest import Marker, Swatch, Tile
-from patchproof.sheets.page import lay_out_parts, moved, size_text
+from patchproof.sheets.page import lay_out_parts, piece_words, piece_zone_mm
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import DICTIONARY, Piece, PieceMarker, marker_ids
-from patchproof.sheets.swatches import RectMm
-from patchproof.sheets.template import Template
+from patchproof.sheets.rects import RectMm, moved
+from patchproof.sheets.template import Template, TileGrid
 from patchproof.sheets.tiles import MARKERS, TilePlan, lay_out_tile, own_markers, own_swatches, plan_tiles, tile_map
 
 FIRST_TILE_PAGE = 2
@@ -36,23 +36,23 @@ class TiledPages:
 
 
 def tile_pages(
-    template: Template, piece: Piece, sheet_id: str, kind: str, qr_text: str, design: np.ndarray | None
+    template: Template,
+    grid: TileGrid,
+    piece: Piece,
+    sheet_id: str,
+    kind: str,
+    qr_text: str,
+    design: np.ndarray | None,
 ) -> TiledPages:
-    """Page 1 and the tiles' pages, proved apart each."""
-    tiles, fixed = plan_tiles(template, piece), len(piece.markers)
+    """Page 1 and the tiles' pages, proved apart each; `grid` is the template's own."""
+    tiles, fixed = plan_tiles(grid, piece), len(piece.markers)
     own = fixed + len(template.marker.corners_mm)
     ids = marker_ids(sheet_id, kind, own + MARKERS * len(tiles))
-    more, small = tile_map(piece, tiles, template.piece.zone_mm)
-    words = {
-        "sheet_id": sheet_id,
-        "kind": kind,
-        "design": size_text(piece.design_rect_mm[2:]),
-        "piece": size_text(piece.size_mm),
-        "tiles": str(len(tiles)),
-    }
-    first = lay_out_parts(template, [], [], ids[fixed:own], qr_text, words, more)
+    more, small = tile_map(piece, tiles, piece_zone_mm(template))
+    words = piece_words(piece, sheet_id, kind) | {"tiles": str(len(tiles))}
+    first = lay_out_parts(template, [], ids[fixed:own], qr_text, words, more)
     layouts = [
-        lay_out_tile(template, piece, tile, ids[own + MARKERS * i : own + MARKERS * (i + 1)], sheet_id)
+        lay_out_tile(template, grid, piece, tile, ids[own + MARKERS * i : own + MARKERS * (i + 1)], sheet_id)
         for i, tile in enumerate(tiles)
     ]
     pages = [Printed(first, () if design is None else ((small, _pale(design)),))]

@@ -16,26 +16,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from patchproof.sheets.fonts import text_width_mm
-from patchproof.sheets.page import (
-    CUT_LINE_MM,
-    MOST_TILES,
-    Box,
-    Line,
-    PageLayout,
-    Parts,
-    Window,
-    grown,
-    marker_rect,
-    moved,
-    moved_marker,
-    prove_apart,
-    quiet_box,
-    size_text,
-    text_box,
-)
-from patchproof.sheets.piece import MODULES, Piece, marker_at
-from patchproof.sheets.swatches import RectMm
-from patchproof.sheets.template import Template, TextLine
+from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
+from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES
+from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, marker_rect, moved_marker
+from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet, moved, size_text
+from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
 from patchproof.strict import Refused
 
 BLEED_MM = 1.0  # of the piece's picture on a flap
@@ -48,12 +33,12 @@ class TilePlan:
 
     name: str
     part_mm: RectMm  # in piece millimetres
-    corner_mm: tuple[float, float]  # of the part, on the page
+    corner_mm: PointMm  # of the part, on the page
     right: str | None  # the name of the tile that is glued on the right flap
     below: str | None
 
     @property
-    def page_from_piece_mm(self) -> tuple[float, float]:
+    def page_from_piece_mm(self) -> PointMm:
         """What to add to piece millimetres."""
         return self.corner_mm[0] - self.part_mm[0], self.corner_mm[1] - self.part_mm[1]
 
@@ -63,24 +48,22 @@ class TilePlan:
         return (*self.corner_mm, *self.part_mm[2:])
 
 
-def plan_tiles(template: Template, piece: Piece) -> list[TilePlan]:
+def plan_tiles(grid: TileGrid, piece: Piece) -> list[TilePlan]:
     """The tiles row by row; refused where there are more than marker ids last for."""
-    width, height = template.tiles.zone_mm[2:]
-    xs = _seams(piece, 0, width)
-    ys = _seams(piece, 1, height)
+    xs, ys = (_seams(piece, axis, most_mm) for axis, most_mm in enumerate(grid.zone_mm[2:]))
     columns, rows = len(xs) - 1, len(ys) - 1
     if columns * rows > MOST_TILES:
         raise Refused(
             f"a piece of at most {MOST_TILES} tiles, for which there are marker ids",
             f"{size_text(piece.size_mm)} mm on {columns} × {rows} = {columns * rows} tiles",
-            "make the patch smaller or choose a template with larger tiles, such as a3_tiles",
+            f"make the patch smaller or {_larger_tiles()}",
         )
     names = [[f"{chr(ord('A') + row)}{column + 1}" for column in range(columns)] for row in range(rows)]
     return [
         TilePlan(
             name=names[row][column],
             part_mm=(xs[column], ys[row], round(xs[column + 1] - xs[column], 6), round(ys[row + 1] - ys[row], 6)),
-            corner_mm=template.tiles.zone_mm[:2],
+            corner_mm=grid.zone_mm[:2],
             right=names[row][column + 1] if column + 1 < columns else None,
             below=names[row + 1][column] if row + 1 < rows else None,
         )
@@ -89,41 +72,45 @@ def plan_tiles(template: Template, piece: Piece) -> list[TilePlan]:
     ]
 
 
-def lay_out_tile(template: Template, piece: Piece, tile: TilePlan, ids: Sequence[int], sheet_id: str) -> PageLayout:
+def lay_out_tile(
+    template: Template, grid: TileGrid, piece: Piece, tile: TilePlan, ids: Sequence[int], sheet_id: str
+) -> PageLayout:
     """One tile's page, proved apart and within the margins; its own markers are the layout's, the piece's lie in
     the window.
     """
-    by, part = tile.page_from_piece_mm, tile.page_rect_mm
-    window = (*part[:2], part[2] + (BLEED_MM if tile.right else 0), part[3] + (BLEED_MM if tile.below else 0))
-    flap = template.tiles.overlap_mm
-    cut = (*part[:2], part[2] + (flap if tile.right else 0), part[3] + (flap if tile.below else 0))
-    own = [marker_at(i, at, template.tiles.marker_mm) for i, at in zip(ids, _places(template, part), strict=True)]
-    texts, module = _words(template, tile, part, sheet_id), template.tiles.marker_mm / MODULES
-    boxes = [Box("tile", grown(cut, CUT_LINE_MM)), Box("its picture", window, "tile")]
-    for i, marker in enumerate(own):
-        inside = "tile" if _meets(cut, marker_rect(marker)) else None
-        boxes.append(Box(f"tile marker {i + 1}", quiet_box(marker_rect(marker), module, template), inside))
-    for line in texts:
-        box = text_box(line)
-        boxes.append(Box(box.name, box.rect_mm, "tile" if _meets(cut, box.rect_mm) else None))
-    layout = PageLayout(
-        page_mm=template.page_mm,
+    by, part, page_mm, margin_mm = tile.page_from_piece_mm, tile.page_rect_mm, template.page_mm, template.margin_mm
+    window, cut = _extended(tile, BLEED_MM), _extended(tile, grid.overlap_mm)
+    own = [marker_at(i, at, grid.marker_mm) for i, at in zip(ids, _places(grid, part), strict=True)]
+    quiet = [quiet_box(marker_rect(marker), grid.marker_mm / MODULES, page_mm, margin_mm) for marker in own]
+    texts = _words(template, grid, tile, sheet_id)
+    boxes = [Box(f"tile marker {i}", rect) for i, rect in enumerate(quiet, 1)] + [text_box(line) for line in texts]
+    markers = [moved_marker(marker, by) for marker in piece.markers]
+    swatches = [(moved(rect, by), srgb) for rect, srgb in piece.swatches]
+    boxes = (
+        Box("tile", grown(cut, CUT_LINE_MM)),
+        Box("its picture", window, "tile"),
+        *(Box(box.name, box.rect_mm, "tile" if meet(cut, box.rect_mm) else None) for box in boxes),
+    )
+    prove_apart(boxes, page_mm, margin_mm)
+    return PageLayout(
+        page_mm=page_mm,
         cuts_mm=(cut,),
         designs_mm=(moved(piece.design_rect_mm, by),),
         markers=tuple(own),
-        swatches=(),
-        qr_mm=(),
-        ticks=(),
         texts=tuple(texts),
-        boxes=tuple(boxes),
+        boxes=boxes,
         window=Window(
             window,
-            tuple(moved_marker(m, by) for m in piece.markers if _meets(grown(window, 1e-6), _placed(m, by))),
-            tuple((moved(r, by), srgb) for r, srgb in piece.swatches if _meets(window, moved(r, by))),
+            tuple(marker for marker in markers if meet(grown(window, 1e-6), marker_rect(marker))),
+            tuple((rect, srgb) for rect, srgb in swatches if meet(window, rect)),
         ),
     )
-    prove_apart(layout.boxes, template.page_mm, template.margin_mm)
-    return layout
+
+
+def _extended(tile: TilePlan, by_mm: float) -> RectMm:
+    """The tile's part on its page, and that much more of its flaps."""
+    x, y, w, h = tile.page_rect_mm
+    return x, y, w + (by_mm if tile.right else 0), h + (by_mm if tile.below else 0)
 
 
 def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[Parts, RectMm]:
@@ -133,7 +120,8 @@ def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[
     x, y = x + (w - scale * piece.size_mm[0]) / 2, y + (h - scale * piece.size_mm[1]) / 2
 
     def small(rect: RectMm) -> RectMm:
-        return tuple(round(v, 3) for v in (x + scale * rect[0], y + scale * rect[1], scale * rect[2], scale * rect[3]))
+        left, top, wide, high = (scale * side for side in rect)
+        return round(x + left, 3), round(y + top, 3), round(wide, 3), round(high, 3)
 
     lines, texts = [], []
     for tile in tiles:
@@ -148,19 +136,18 @@ def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[
     return Parts(tuple(lines), tuple(texts), (Box("plan of the tiles", small((0, 0, *piece.size_mm))),)), design
 
 
-def own_markers(tile: TilePlan, piece: Piece) -> list:
-    """The piece's markers that the tile shows, in page millimetres."""
-    return [
-        moved_marker(m, tile.page_from_piece_mm)
-        for m in piece.markers
-        if _holds_middle(tile.page_rect_mm, _placed(m, tile.page_from_piece_mm))
-    ]
+def own_markers(tile: TilePlan, piece: Piece) -> list[PieceMarker]:
+    """The piece's markers whose middle the tile shows, in page millimeters."""
+    (x, y, w, h), markers = tile.page_rect_mm, [moved_marker(m, tile.page_from_piece_mm) for m in piece.markers]
+    rects = [marker_rect(marker) for marker in markers]
+    middles = [(left + wide / 2, top + high / 2) for left, top, wide, high in rects]
+    return [m for m, (mx, my) in zip(markers, middles, strict=True) if x <= mx < x + w and y <= my < y + h]
 
 
-def own_swatches(tile: TilePlan, piece: Piece) -> list:
-    """The piece's swatches that lie wholly on the tile, in page millimetres."""
+def own_swatches(tile: TilePlan, piece: Piece) -> list[SwatchRect]:
+    """The piece's swatches that lie wholly on the tile, in page millimeters."""
     rects = [(moved(rect, tile.page_from_piece_mm), srgb) for rect, srgb in piece.swatches]
-    return [(rect, srgb) for rect, srgb in rects if _inside(tile.page_rect_mm, rect)]
+    return [(rect, srgb) for rect, srgb in rects if holds(tile.page_rect_mm, rect, 1e-6)]
 
 
 def _seams(piece: Piece, axis: int, most_mm: float) -> list[float]:
@@ -177,8 +164,12 @@ def _seams(piece: Piece, axis: int, most_mm: float) -> list[float]:
     raise Refused(
         "a piece that can be cut into tiles without cutting a marker",
         f"markers of {piece.module_mm * MODULES:.0f} mm on tiles of {most_mm:.0f} mm",
-        "choose a template with larger tiles, such as a3_tiles",
+        _larger_tiles(),
     )
+
+
+def _larger_tiles() -> str:
+    return f"choose a template with larger tiles (of {', '.join(template_names('tiles'))})"
 
 
 def _span(rect: RectMm, axis: int, room: float) -> tuple[float, float]:
@@ -192,9 +183,9 @@ def _free(at: float, blocked: list[tuple[float, float]]) -> float:
     return round(min(free, key=lambda p: abs(p - at)), 2)
 
 
-def _places(template: Template, part: RectMm) -> list[tuple[float, float]]:
+def _places(grid: TileGrid, part: RectMm) -> list[PointMm]:
     """Corners of a tile's own markers: left and right, above and below, and under the part at the right."""
-    size, (x, y, w, h) = template.tiles.marker_mm, part
+    size, (x, y, w, h) = grid.marker_mm, part
     module = size / MODULES
     aside = BLEED_MM + module  # from the part's edge: the picture that runs on, and a quiet zone
     left = x - CUT_LINE_MM - module - size
@@ -207,9 +198,9 @@ def _places(template: Template, part: RectMm) -> list[tuple[float, float]]:
     ]
 
 
-def _words(template: Template, tile: TilePlan, part: RectMm, sheet_id: str) -> list[TextLine]:
+def _words(template: Template, grid: TileGrid, tile: TilePlan, sheet_id: str) -> list[TextLine]:
     """The tile's name above it, and on its flaps what is glued there."""
-    x, y, w, h = part
+    x, y, w, h = tile.page_rect_mm
     top = template.margin_mm + 3.4
     lines = [
         TextLine(at_mm=(x, top), size_mm=3.6, text=tile.name, bold=True),
@@ -219,12 +210,12 @@ def _words(template: Template, tile: TilePlan, part: RectMm, sheet_id: str) -> l
     if w < 60:  # a narrow tile has room for its name alone
         lines = lines[:2] if w > 45 else lines[:1]
     if tile.right:
-        middle = x + w + template.tiles.overlap_mm / 2 + BLEED_MM / 2
+        middle = x + w + grid.overlap_mm / 2 + BLEED_MM / 2
         for i, word in enumerate(("glue", tile.right, "here")):
             at = (middle - text_width_mm(word, 2.2, False) / 2, y + h / 2 + 3.2 * (i - 1))
             lines.append(TextLine(at_mm=at, size_mm=2.2, text=word, gray=0.35))
     if tile.below:
-        at = (x + 4.0, y + h + template.tiles.overlap_mm / 2 + 1.2)
+        at = (x + 4.0, y + h + grid.overlap_mm / 2 + 1.2)
         lines.append(TextLine(at_mm=at, size_mm=2.2, text=f"glue {tile.below} here", gray=0.35))
     return lines
 
@@ -232,19 +223,3 @@ def _words(template: Template, tile: TilePlan, part: RectMm, sheet_id: str) -> l
 def _and_flaps(tile: TilePlan) -> str:
     flaps = [name for name in (tile.right, tile.below) if name]
     return f"; the white {'flaps go' if len(flaps) > 1 else 'flap goes'} under {' and '.join(flaps)}" if flaps else ""
-
-
-def _placed(marker, by: tuple[float, float]) -> RectMm:
-    return moved(marker_rect(marker), by)
-
-
-def _holds_middle(outer: RectMm, rect: RectMm) -> bool:
-    return all(outer[i] <= rect[i] + rect[i + 2] / 2 < outer[i] + outer[i + 2] for i in (0, 1))
-
-
-def _meets(a: RectMm, b: RectMm) -> bool:
-    return all(a[i] < b[i] + b[i + 2] and b[i] < a[i] + a[i + 2] for i in (0, 1))
-
-
-def _inside(outer: RectMm, rect: RectMm) -> bool:
-    return all(outer[i] <= rect[i] + 1e-6 and rect[i] + rect[i + 2] <= outer[i] + outer[i + 2] + 1e-6 for i in (0, 1))

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import (
     Design,
     Manifest,
@@ -26,12 +27,13 @@ from patchproof.sheets.manifest import (
     dump_manifest,
     png_base64,
 )
-from patchproof.sheets.page import PageLayout, lay_out_page
+from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
 from patchproof.sheets.piece import DICTIONARY, Piece, PieceMarker
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
-from patchproof.sheets.swatches import FRAME_COLORS, RectMm
-from patchproof.sheets.template import Template
+from patchproof.sheets.rects import RectMm, holds
+from patchproof.sheets.swatches import FRAME_COLORS
+from patchproof.sheets.template import BoardTemplate, Template
 from patchproof.sheets.tile_pages import FIRST_TILE_PAGE, tile_pages
 from patchproof.strict import Refused
 
@@ -59,21 +61,21 @@ def write_sheet(
     code = qr_text(sheet_id, kind, design_srgb8)
     if template.tiles is None:
         page = lay_out_page(template, piece, sheet_id, kind, code)
-        manifest = _manifest(page, template, sheet_id, kind, design_srgb8, promise, settings)
-        pages = [Printed(page, pictures_of(page, design_srgb8))] * copies
+        design = None if design_srgb8 is None else printed_design(design_srgb8, page.designs_mm[0])
+        manifest = page_manifest(page, template, page.cuts_mm[0], sheet_id, kind, settings, design, promise)
+        pages = [Printed(page, () if design_srgb8 is None else ((page.designs_mm[0], design_srgb8),))] * copies
     else:
         if copies > 1:
             raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
-        tiled = tile_pages(template, piece, sheet_id, kind, code, design_srgb8)
+        tiled = tile_pages(template, template.tiles, piece, sheet_id, kind, code, design_srgb8)
+        design = None if design_srgb8 is None else printed_design(design_srgb8, tiled.design_mm, FIRST_TILE_PAGE)
         pages = list(tiled.pages)
-        manifest = _manifest(pages[0].layout, template, sheet_id, kind, None, promise, settings)
-        update = {"markers": tiled.markers, "chart": tiled.chart, "cut_mm": tiled.cut_mm, "tiles": tiled.tiles}
-        if design_srgb8 is not None:
-            update["design"] = printed_design(design_srgb8, tiled.design_mm, page=FIRST_TILE_PAGE)
-        manifest = manifest.model_copy(update=update)
+        manifest = page_manifest(
+            pages[0].layout, template, tiled.cut_mm, sheet_id, kind, settings, design, promise
+        ).changed(markers=tiled.markers, chart=tiled.chart, tiles=tiled.tiles)
     if plan is not None:
         pages.append(lay_out_plan(plan, template, sheet_id))
-        manifest = manifest.model_copy(update={"plan_page": len(pages)})
+        manifest = manifest.changed(plan_page=len(pages))
     save_sheets(pdf_path, pages, {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
@@ -129,7 +131,7 @@ def check_sheet(manifest: Manifest) -> list[str]:
     if manifest.design is None:
         lines.append("The piece carries no design: its middle stays white paper.")
     frames = {tile.page: tile.cut_mm for tile in manifest.tiles} or {1: manifest.cut_mm}
-    inside = sum(s.page in frames and _within(s.rect_mm, frames[s.page]) for s in manifest.chart)
+    inside = sum(s.page in frames and holds(frames[s.page], s.rect_mm) for s in manifest.chart)
     if inside < len(FRAME_COLORS):
         lines.append(
             f"The frame has room for {inside} of {len(FRAME_COLORS)} swatches, so color on it is measured less well."
@@ -172,28 +174,25 @@ def printed_marker(marker: PieceMarker, page: int = 1) -> Marker:
     return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
 
 
-def pictures_of(page: PageLayout, design: np.ndarray | None) -> tuple[tuple[RectMm, np.ndarray], ...]:
-    """The design in its place; nothing on pages without."""
-    return () if design is None else ((page.designs_mm[0], design),)
-
-
-def _manifest(
+def page_manifest(
     page: PageLayout,
-    template: Template,
+    template: Template | BoardTemplate,
+    cut_mm: RectMm,
     sheet_id: str,
     kind: str,
-    design: np.ndarray | None,
-    promise: Promise | None,
     settings: dict[str, Any],
+    design: Design | None = None,
+    promise: Promise | None = None,
 ) -> Manifest:
+    """The manifest of a sheet's one page."""
     return Manifest(
         sheet_id=sheet_id,
         kind=kind,
         page_mm=page.page_mm,
-        design=None if design is None else printed_design(design, page.designs_mm[0]),
+        design=design,
         markers=tuple(printed_marker(m) for m in page.markers),
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
-        cut_mm=page.cuts_mm[0] if page.cuts_mm else (0.0, 0.0, *page.page_mm),
+        cut_mm=cut_mm,
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
         promise=promise,
         settings=settings,
@@ -209,6 +208,7 @@ def check_pixels(design: np.ndarray) -> None:
 def replace_both(contents: dict[Path, bytes]) -> None:
     """Write all files under other names in the same folder, then move each to its place."""
     waiting = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
+    path = next(iter(contents))
     try:
         for path, data in contents.items():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -236,7 +236,3 @@ def _nearest_ink_mm(manifest: Manifest) -> float:
     points = [point for marker in manifest.markers for point in marker.corners_mm]
     points += [(x + dx, y + dy) for x, y, w, h in rects for dx, dy in ((0, 0), (w, h))]
     return min(min(x, y, width - x, height - y) for x, y in points)
-
-
-def _within(rect: tuple[float, ...], outer: tuple[float, ...]) -> bool:
-    return all(outer[i] <= rect[i] and rect[i] + rect[i + 2] <= outer[i] + outer[i + 2] for i in (0, 1))

@@ -1,0 +1,143 @@
+"""A page as plain geometry, and the proof that its parts lie apart.
+
+Every part also leaves a `Box`, the rectangle that is its own, white borders included; `prove_apart` shows that all
+boxes lie within the margins and that no two overlap, or refuses. All in page millimeters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
+from patchproof.sheets.piece import PieceMarker
+from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, holds, meet
+from patchproof.sheets.template import Rulers, TextLine
+from patchproof.strict import Refused
+
+TICK_MM = 0.15
+SLACK_MM = 1e-3  # that parts may touch by
+
+
+@dataclass(frozen=True)
+class Box:
+    """A part's own rectangle on the page; `inside` names the part that may and must hold it."""
+
+    name: str
+    rect_mm: RectMm
+    inside: str | None = None
+
+
+@dataclass(frozen=True)
+class Line:
+    """A black line from (x0, y0) to (x1, y1)."""
+
+    ends_mm: tuple[float, float, float, float]
+    width_mm: float
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Lines and words, and the boxes that they take."""
+
+    lines: tuple[Line, ...] = ()
+    texts: tuple[TextLine, ...] = ()
+    boxes: tuple[Box, ...] = ()
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a piece, the only thing on its page that is cut off at an edge: `rect_mm` is what shows of it."""
+
+    rect_mm: RectMm
+    markers: tuple[PieceMarker, ...]
+    swatches: tuple[SwatchRect, ...]
+
+
+@dataclass(frozen=True)
+class PageLayout:
+    """All that is on a page."""
+
+    page_mm: tuple[float, float]
+    cuts_mm: tuple[RectMm, ...] = ()  # dashed lines, one for each piece
+    designs_mm: tuple[RectMm, ...] = ()
+    markers: tuple[PieceMarker, ...] = ()  # the pieces' first
+    swatches: tuple[SwatchRect, ...] = ()  # the chart's first
+    qr_mm: tuple[RectMm, ...] = ()
+    ticks: tuple[Line, ...] = ()
+    texts: tuple[TextLine, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    squares_mm: tuple[RectMm, ...] = ()  # a board's black squares
+    window: Window | None = None
+
+
+def within_margins(page_mm: tuple[float, float], margin_mm: float) -> RectMm:
+    """What of the page may carry ink."""
+    return margin_mm, margin_mm, page_mm[0] - 2 * margin_mm, page_mm[1] - 2 * margin_mm
+
+
+def prove_apart(boxes: tuple[Box, ...], page_mm: tuple[float, float], margin_mm: float) -> None:
+    """Refuse a page on which two parts overlap, a part leaves the one that holds it, or anything lies in the margin."""
+    within = within_margins(page_mm, margin_mm)
+    by_name = {box.name: box.rect_mm for box in boxes}
+    for box in boxes:
+        if not holds(by_name[box.inside] if box.inside else within, box.rect_mm, SLACK_MM):
+            place, (x, y, w, h) = box.inside or f"the margins of {margin_mm:g} mm", box.rect_mm
+            where = f"x {x:.1f} to {x + w:.1f}, y {y:.1f} to {y + h:.1f} mm"
+            raise Refused(f"{box.name} within {place}", where, "move or shrink it in the template")
+    for a, b in combinations(boxes, 2):
+        related = a.name == b.inside or b.name == a.inside
+        if not related and meet(a.rect_mm, b.rect_mm, SLACK_MM):
+            raise Refused("parts that lie apart", f"{a.name} over {b.name}", "move one of them in the template")
+
+
+def text_box(line: TextLine) -> Box:
+    """The rectangle that a line of text takes."""
+    (x, baseline), size = line.at_mm, line.size_mm
+    width = text_width_mm(line.text, size, line.bold)
+    return Box(f'text "{line.text}"', (x, baseline - CAP_HEIGHT * size, width, (CAP_HEIGHT + DESCENT) * size))
+
+
+def quiet_box(rect: RectMm, width: float, page_mm: tuple[float, float], margin_mm: float) -> RectMm:
+    """The rectangle with its quiet zone, less what falls into the margin, which is white anyway."""
+    sides = []
+    for i in (0, 1):
+        low, high = rect[i], rect[i] + rect[i + 2]
+        sides.append((min(low, max(low - width, margin_mm)), max(high, min(high + width, page_mm[i] - margin_mm))))
+    (x0, x1), (y0, y1) = sides
+    return x0, y0, x1 - x0, y1 - y0
+
+
+def ruler_parts(rulers: Rulers) -> Parts:
+    """The ruler to the right and the one downwards."""
+    lines, digits, boxes = [], [], []
+    for name, start, down in (("x ruler", rulers.x_start_mm, False), ("y ruler", rulers.y_start_mm, True)):
+        lines += _ticks(rulers.length_mm, start, down)
+        digits += _digits(rulers.length_mm, start, down)
+        along, across = (-2.5, rulers.length_mm + 5.0), (-0.2, 9.5 if down else 7.2)
+        (x, w), (y, h) = (across, along) if down else (along, across)
+        boxes.append(Box(name, (start[0] + x, start[1] + y, w, h)))
+    return Parts(tuple(lines), tuple(digits), tuple(boxes))
+
+
+def _ticks(length_mm: float, start: PointMm, down: bool) -> list[Line]:
+    lines = [((0.0, 0.0, length_mm, 0.0), 0.3)]
+    for mm in range(int(length_mm + 1e-6) + 1):
+        depth = 4.0 if mm % 10 == 0 else 3.0 if mm % 5 == 0 else 2.0
+        lines.append(((float(mm), 0.0, float(mm), depth), TICK_MM))
+    ticks, (x, y) = [], start
+    for (a0, b0, a1, b1), width in lines:
+        ends = (x + b0, y + a0, x + b1, y + a1) if down else (x + a0, y + b0, x + a1, y + b1)
+        ticks.append(Line(ends, width))
+    return ticks
+
+
+def _digits(length_mm: float, start: PointMm, down: bool) -> list[TextLine]:
+    digits, size = [], 2.1
+    for mm in range(0, int(length_mm + 1e-6) + 1, 10):
+        if down:
+            at = (start[0] + 5.0, start[1] + mm + size * CAP_HEIGHT / 2)
+        else:
+            at = (start[0] + mm - text_width_mm(str(mm), size, False) / 2, start[1] + 4.8 + size * CAP_HEIGHT)
+        digits.append(TextLine(at_mm=at, size_mm=size, text=str(mm), gray=0.2))
+    return digits
