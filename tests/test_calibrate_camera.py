@@ -14,7 +14,7 @@ from PIL import Image
 
 from patchproof.calibrate.boards import View, corner_places_mm, see_boards
 from patchproof.calibrate.camera import calibrate_camera, solve
-from patchproof.calibrate.lens_ladder import Rung, chosen
+from patchproof.calibrate.ladder import compared, simplest
 from patchproof.channel.lens import distort_points, load_camera
 from patchproof.sheets.board import board_sheet, load_board
 from patchproof.sheets.raster import page_pixels
@@ -84,11 +84,17 @@ def test_a_known_lens_comes_back_with_its_rung(bends, rung):
     assert distort_points(pixel, found.camera, SIZE) == pytest.approx(there, abs=0.5)
 
 
-def test_the_lowest_rung_within_one_standard_error_is_chosen():
-    rungs = [Rung("pinhole", 0.20, 0.03), Rung("k1", 0.115, 0.03), Rung("k1 k2", 0.10, 0.02)]
-    assert chosen(rungs) == "k1"
-    assert chosen([rungs[0], Rung("k1", 0.121, 0.0), rungs[2]]) == "k1 k2"
-    assert chosen([Rung("pinhole", np.inf, np.inf)]) is None
+def test_the_lowest_rung_within_one_standard_error_of_the_paired_difference_is_chosen():
+    """Hard items are hard for every rung: 0.4 of one of the photographs says nothing about which one is better."""
+    best = np.array([0.4, 0.10, 0.09, 0.11])
+    # worse by 0.01 on average, ± 0.0174 and ± 0.00174: the standard errors of four are 0.0174 / √3 = 0.01005 and 0.001
+    near, far = best + 0.01 + np.array([1, -1, 1, -1]) * 0.0174, best + 0.01 + np.array([1, -1, 1, -1]) * 0.00174
+    rungs = compared(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, near, best]))
+    assert simplest(rungs) == 1 and rungs[1].worse_by == pytest.approx(0.01)
+    assert rungs[1].standard_error == pytest.approx(0.0174 / np.sqrt(3)) and rungs[2].worse_by == 0
+    assert simplest(compared(["pinhole", "k1", "k1 k2"], np.array([best + 0.1, far, best]))) == 2
+    lost = compared(["pinhole", "k1"], np.array([np.full(4, np.inf), best]))
+    assert simplest(lost) == 1 and np.isinf(lost[0].error)
 
 
 def test_stated_deviations_are_those_between_repeated_calibrations():
@@ -121,7 +127,7 @@ def test_a_moved_photograph_and_a_wrong_corner_are_left_out():
     )
     shown[5].px[4] += 7
     found = solved(shown)
-    assert [one.file for one in found.left] == ["moved.jpg"] and "moved" in found.left[0].reason
+    assert [left.file for left in found.left] == ["moved.jpg"] and "moved" in found.left[0].reason
     assert sum(len(v.ids) for v in found.views) == sum(len(v.ids) for v in shown) - len(shown[3].ids) - 1
     assert found.climbed.fit.numbers[:2] == pytest.approx(1300, rel=0.003)
 

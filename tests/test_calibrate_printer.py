@@ -18,7 +18,7 @@ from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
 from patchproof.calibrate.chart import calibrate_chart, combine, map_of, print_variation, printer_of, prints_of
 from patchproof.calibrate.chart_photo import read_chart
-from patchproof.calibrate.ladder import (
+from patchproof.calibrate.color_ladder import (
     FLAT,
     choose,
     color_width,
@@ -26,7 +26,7 @@ from patchproof.calibrate.ladder import (
     distinct,
     fit_affine,
     fit_white_black,
-    rungs,
+    kinds_of_maps,
 )
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer, vary
@@ -75,8 +75,8 @@ def test_each_rung_finds_a_printer_of_its_own_kind_and_none_above_it_is_taken(pr
     sent = chart(72)
     for name, show in kinds.items():
         seen = np.clip(show(sent) + rng.normal(0, 0.003, sent.shape), 0, 1)
-        choice = choose(rungs(priors), sent, seen)
-        assert choice.name == name, choice.figures
+        choice = choose(kinds_of_maps(priors), sent, seen)
+        assert choice.chosen.name == name, choice.rungs
         assert difference(choice.predict(UNSEEN), show(UNSEEN)).mean() < (1.0 if name == "spline" else 0.5)
 
 
@@ -105,7 +105,7 @@ def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
         return lambda colors: colors
 
     sent = chart(48)
-    free = rungs({})
+    free = kinds_of_maps({})
     choice = choose([replace(free[0], fit=spy)], sent, sent)
     corners = np.isin(distinct(sent, sent)[0], (0.0, 1.0)).all(1)
     assert choice.held_out == (~corners).sum() == 34
@@ -117,16 +117,16 @@ def test_corners_are_never_held_out_and_every_other_color_is_once(priors):
 @pytest.mark.parametrize("count", [6, 12])
 def test_few_swatches_leave_rungs_with_nothing_to_fit(priors, count):
     sent = chart(count)
-    choice = choose(rungs(priors), sent, shown(draw_inkjet(1), sent))
-    assert choice.name in {"identity", "white_black", "prior"}
+    choice = choose(kinds_of_maps(priors), sent, shown(draw_inkjet(1), sent))
+    assert choice.chosen.name in {"identity", "white_black", "prior"}
     assert "spline" in choice.left_out and "affine" in choice.left_out
 
 
 def test_splines_start_at_24_colors(priors):
     sent = np.vstack([chart(14), np.random.default_rng(4).random((10, 3))])
-    names = {figure.name for figure in choose(rungs(priors), sent, sent).figures}
+    names = {rung.name for rung in choose(kinds_of_maps(priors), sent, sent).rungs}
     assert "spline" in names
-    names = {figure.name for figure in choose(rungs(priors), sent[:-1], sent[:-1]).figures}
+    names = {rung.name for rung in choose(kinds_of_maps(priors), sent[:-1], sent[:-1]).rungs}
     assert "spline" not in names and "prior+affine" in names
 
 
@@ -143,8 +143,8 @@ def test_colors_that_are_nearly_gray_hold_no_free_map(priors):
     off = {}
     for share in (1.0, 0.2, 0.1, 0.0):
         sent = grayed(share)
-        choice = choose(rungs(priors), sent, np.clip(shown(printer, sent) + noise, 0, 1))
-        free = {figure.name for figure in choice.figures} & {"affine", "spline", "prior+affine+spline"}
+        choice = choose(kinds_of_maps(priors), sent, np.clip(shown(printer, sent) + noise, 0, 1))
+        free = {rung.name for rung in choice.rungs} & {"affine", "spline", "prior+affine+spline"}
         assert bool(free) == (choice.width >= FLAT) == (share >= 0.2)
         off[share] = difference(choice.predict(UNSEEN), shown(printer, UNSEEN)).mean()
     assert off[1.0] < 1.5 < off[0.2] < 6 and max(off.values()) < 12
@@ -174,7 +174,7 @@ def test_a_chart_read_in_part_says_what_its_figure_is_worth(monkeypatch, tmp_pat
     found = calibrate_chart([[tmp_path / "a.png"]], manifest, "x")
     assert any("hardly spread" in warning for warning in found.warnings) == (says is not None or readable == 4)
     if readable == 4:
-        assert found.choice.name in {"identity", "white_black", "prior"}
+        assert found.choice.chosen.name in {"identity", "white_black", "prior"}
 
 
 def test_the_simplest_within_one_standard_error_wins_by_hand():
@@ -182,12 +182,12 @@ def test_the_simplest_within_one_standard_error_wins_by_hand():
     sent = chart(48)
     off = np.zeros_like(sent)
     off[:, 0] = 0.1 * sent[:, 0] * (1 - sent[:, 0])
-    free = rungs({})
+    free = kinds_of_maps({})
     near = replace(free[2], name="true", fit=lambda a, b: lambda c: c + np.array([0.1, 0, 0]) * (c * (1 - c)))
-    assert choose([free[0], near], sent, sent + off).name == "true"
+    assert choose([free[0], near], sent, sent + off).chosen.name == "true"
     noise = np.random.default_rng(0).normal(0, 0.05, sent.shape)
     faint = choose([free[0], near], sent, np.clip(sent + 0.5 * off + noise, 0, 1))
-    assert faint.name == "identity" and faint.figures[0].worse_by <= faint.figures[0].standard_error
+    assert faint.chosen.name == "identity" and faint.rungs[0].worse_by <= faint.rungs[0].standard_error
 
 
 # ------------------------------------------------------------------------------------------------ photographs
@@ -251,7 +251,7 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert ended.value.code == 0 and "chosen" in told.out and "appearance" in told.out and "bad.jpg" in told.err
     mine = load_printer(str(tmp_path / "mine.npz"))
     assert mine.method == "measured" and mine.provenance["chosen"] == "spline"
-    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in rungs({"x": None})]
+    assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in kinds_of_maps({"x": None})]
     assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
     assert difference(map_of(mine)(UNSEEN), shown(printer, UNSEEN)).mean() < 2

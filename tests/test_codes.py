@@ -12,7 +12,7 @@ from patchproof.evidence.camera import View
 from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
 from patchproof.geometry import intrinsics
-from patchproof.photo.detect import Found
+from patchproof.photo.detect import MarkersInView
 from patchproof.photo.edges import Borders
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, fit_page
@@ -27,7 +27,7 @@ GOOD = dict(tilt_deg=10.0, blur_px=1.0, contrast=0.5, px_per_mm=2.0, residual_mm
 def trouble(markers=8, module_px=4.0, **figures):
     """What `measure` says of these figures, of a 100 mm design."""
     borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, module_px, True)
-    found = Found({i: borders for i in PIECE_IDS[:markers]}, (), ())
+    found = MarkersInView({i: borders for i in PIECE_IDS[:markers]}, (), ())
     fit = PageFit(np.eye(3), np.eye(8), 0.1, 0.05, PIECE_IDS[:markers])
     return measure._trouble(Geometry(**(GOOD | figures)), fit, found, SURFACE)
 
@@ -77,7 +77,7 @@ def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
         ((), (100,), None),
         ((), (100, 101), "several"),
     ):
-        found = Found({i: borders for i in PIECE_IDS}, foreign, doubled)
+        found = MarkersInView({i: borders for i in PIECE_IDS}, foreign, doubled)
         monkeypatch.setattr(measure, "find_sheet", lambda *_, found=found: found)
         if code is None:
             assert measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)[0] is found

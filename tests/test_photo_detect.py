@@ -76,7 +76,7 @@ def test_no_marker_is_completed_where_another_one_is_printed(manifest, piece):
     found = find_markers(photo, IDS)
     swapped = corners_mm(manifest)
     swapped[300] = swapped.pop(103)  # the manifest claims another code at that place
-    without = detect.Found({i: b for i, b in found.markers.items() if i != 103}, (), ())
+    without = detect.MarkersInView({i: b for i, b in found.markers.items() if i != 103}, (), ())
     assert 300 not in complete(photo, without, swapped).markers
 
 

@@ -79,6 +79,26 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
         part.unlink(missing_ok=True)
 
 
+def write_together(contents: dict[Path, bytes]) -> None:
+    """Write several files, all beside their places first: a full disk leaves what was there before."""
+    waiting = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
+    path = next(iter(contents))
+    try:
+        for path, data in contents.items():
+            make_folder(path.parent)
+            if path.is_dir():
+                raise IsADirectoryError(f"{path} is a folder")
+            waiting[path].write_bytes(data)
+        for path, part in waiting.items():
+            os.replace(part, path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise Refused("a folder that can be written to", f"{path} ({reason})", "choose another --out") from error
+    finally:
+        for part in waiting.values():
+            part.unlink(missing_ok=True)
+
+
 def _replace(part: Path, out: Path) -> None:
     old = out.with_name(f".{out.name}.old")
     shutil.rmtree(old, ignore_errors=True)

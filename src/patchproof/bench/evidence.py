@@ -16,8 +16,9 @@ from patchproof.bench.chart import Chart, OnStage, Point
 from patchproof.bench.paper import SIZE_PX
 from patchproof.bench.sheets import markers_chart, models_chart
 from patchproof.calibrate.boards import View, corner_places_mm
-from patchproof.calibrate.lens_ladder import FREE, Rung, climb
-from patchproof.claims import Estimate
+from patchproof.calibrate.ladder import Rung
+from patchproof.calibrate.lens_ladder import FREE, climb
+from patchproof.claims import Estimate, mean
 from patchproof.report.tables import Table
 from patchproof.sheets.board import load_board
 
@@ -61,10 +62,9 @@ def lens_chart(cameras: int, on_stage: OnStage) -> Chart:
 
 
 def _point(rungs: Sequence[Rung], default: str) -> Point:
-    """One rung over all cameras; each one's own standard error is known."""
-    name, middle = rungs[0].name, float(np.mean([rung.held_out_px for rung in rungs]))
-    half = 1.96 * float(np.linalg.norm([rung.standard_error_px for rung in rungs])) / len(rungs)
-    return Point(name, FREE[name], Estimate(middle, middle - half, middle + half, len(rungs)), name == default)
+    """One rung over all cameras; of a single camera without an interval."""
+    name, errors = rungs[0].name, [rung.error for rung in rungs]
+    return Point(name, FREE[name], mean(errors) or Estimate(errors[0], errors[0], errors[0], 1), name == default)
 
 
 def board_views(terms: np.ndarray, count: int, seed: int) -> list[View]:

@@ -18,7 +18,7 @@ import numpy as np
 from patchproof.bench.chart import Chart, Check, OnStage, Point
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
-from patchproof.calibrate.ladder import Map, choose, difference, distinct, rungs
+from patchproof.calibrate.color_ladder import Map, choose, difference, distinct, kinds_of_maps
 from patchproof.claims import mean, median, rate, student_mean
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.report.tables import Table
@@ -117,13 +117,13 @@ def try_printer(seed: int, swatches: int) -> Trial:
     light = read_chart(shot.photo, manifest).light
     usable = np.isfinite(light).all(1)
     sent, seen = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
-    ladder = rungs(priors)
-    choice = choose(ladder, sent, seen)
+    kinds = kinds_of_maps(priors)
+    choice = choose(kinds, sent, seen)
     truth, errors = shown_by(shows, shot, held_out_colors()), {}
-    for rung in (rung for rung in ladder if rung.name not in choice.left_out):
-        seen_by = relative(rung.fit(*distinct(sent, seen)), held_out_colors())
-        errors[rung.name] = float(difference(seen_by, truth).mean())
-    return Trial(driver, swatches, errors, {f.name: f.seconds for f in choice.figures}, choice.name)
+    for kind in (kind for kind in kinds if kind.name not in choice.left_out):
+        seen_by = relative(kind.fit(*distinct(sent, seen)), held_out_colors())
+        errors[kind.name] = float(difference(seen_by, truth).mean())
+    return Trial(driver, swatches, errors, choice.seconds, choice.chosen.name)
 
 
 def relative(predict: Map, colors: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ nor the tone curve shifts them. Pixel centers are at .5.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,7 +43,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Left:
+class LeftOut:
     """A photograph that is left out, and why."""
 
     file: str
@@ -50,17 +51,20 @@ class Left:
 
 
 @dataclass(frozen=True)
-class Seen:
+class BoardViews:
     """All photographs: views, those left out, and what the files say of the camera ("" where they say nothing)."""
 
     views: tuple[View, ...]
-    left: tuple[Left, ...]
+    left: tuple[LeftOut, ...]
     camera: str
 
 
 def see_boards(
-    photos: str | Path, board: Board, ruler_mm: tuple[float, float] | None = None, progress=lambda done, total: None
-) -> Seen:
+    photos: str | Path,
+    board: Board,
+    ruler_mm: tuple[float, float] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> BoardViews:
     """The board's corners in every picture of the folder; `ruler_mm` are the printed rulers (x, y) as measured."""
     paths, views, left, states = list_photos(photos), [], [], []
     places = corner_places_mm(board, ruler_mm)
@@ -70,7 +74,7 @@ def see_boards(
             views.append(view)
             states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
         except CannotJudge as cannot:
-            left.append(Left(path.name, cannot.advice))
+            left.append(LeftOut(path.name, cannot.advice))
         progress(number, len(paths))
     if not views:
         raise Refused(
@@ -82,8 +86,8 @@ def see_boards(
         if state == common:
             kept.append(view)
         else:
-            left.append(Left(view.file, _other_state(state, common)))
-    return Seen(tuple(kept), tuple(left), common[1][1])
+            left.append(LeftOut(view.file, _other_state(state, common)))
+    return BoardViews(tuple(kept), tuple(left), common[1][1])
 
 
 def corner_places_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:

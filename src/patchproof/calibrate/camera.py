@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.calibrate.boards import FEWEST_CORNERS, Left, View, see_boards
+from patchproof.calibrate.boards import FEWEST_CORNERS, LeftOut, View, see_boards
+from patchproof.calibrate.camera_picture import residual_picture
 from patchproof.calibrate.lens_ladder import NUMBERS, Climbed, Fit, climb, fit_rung
 from patchproof.channel.lens import Camera, check_camera
-from patchproof.output import check_file, make_folder, write_whole
+from patchproof.output import check_file, write_together
 from patchproof.sheets.board import Board, load_board
 from patchproof.strict import Refused
 
@@ -41,7 +42,7 @@ class Calibrated:
     camera: Camera
     climbed: Climbed
     views: tuple[View, ...]
-    left: tuple[Left, ...]
+    left: tuple[LeftOut, ...]
     board: Board
 
     @property
@@ -61,8 +62,6 @@ def calibrate_camera(
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Calibrated:
     """Calibrate and write the three files; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
-    from patchproof.calibrate.camera_picture import residual_picture
-
     out = Path(out)
     if out.suffix.lower() != ".json":
         raise Refused("a file name that ends in .json", f'"{out}"', "name the camera CAMERA.json")
@@ -70,20 +69,17 @@ def calibrate_camera(
     for path in (out, figures, picture):
         check_file(path, overwrite)
     printed = load_board(board)
-    seen = see_boards(photos, printed, ruler_mm, lambda done, total: progress("find corners", done, total))
-    found = solve(
-        seen.views, seen.left, printed, out.stem, seen.camera, lambda done, total: progress("lens models", done, total)
-    )
-    make_folder(out.parent)
-    write_whole(figures, lambda path: path.write_text(_text(fit_figures(found)), encoding="utf-8"))
-    write_whole(picture, lambda path: path.write_bytes(residual_picture(found)))
-    write_whole(out, lambda path: path.write_text(_text(found.camera.model_dump()), encoding="utf-8"))
-    return found
+    boards = see_boards(photos, printed, ruler_mm, lambda done, total: progress("find corners", done, total))
+    on_rung = lambda done, total: progress("lens models", done, total)  # noqa: E731
+    result = solve(boards.views, boards.left, printed, out.stem, boards.camera, on_rung)
+    shown = residual_picture(result.views, result.climbed)
+    write_together({figures: _text(fit_figures(result)), picture: shown, out: _text(result.camera.model_dump())})
+    return result
 
 
 def solve(
     views: Sequence[View],
-    left: Sequence[Left],
+    left: Sequence[LeftOut],
     board: Board,
     name: str,
     camera: str = "",
@@ -95,7 +91,7 @@ def solve(
     left = (*left, *odd)
     _enough(views, left)
     size_px = views[0].size_px
-    climbed = climb(views, lambda fit: _undoable(_camera(fit, name, size_px, "", "")), progress)
+    climbed = climb(views, lambda fit: _is_usable(fit, size_px), progress)
     _refuse_blind(climbed.fit)
     about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
     made = _camera(climbed.fit, name, size_px, about, _uncertainty(climbed.fit))
@@ -103,9 +99,9 @@ def solve(
     return Calibrated(made, climbed, tuple(views), tuple(left), board)
 
 
-def fit_figures(found: Calibrated) -> dict:
+def fit_figures(result: Calibrated) -> dict:
     """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
-    fit = found.climbed.fit
+    fit = result.climbed.fit
     figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
     photos = [
         {
@@ -115,48 +111,53 @@ def fit_figures(found: Calibrated) -> dict:
             "rms_px": figure(np.sqrt((residual**2).sum(1).mean())),
             "tilt_deg": round(float(tilt), 2),
         }
-        for view, residual, tilt in zip(found.views, fit.residuals_px, fit.tilts_deg, strict=True)
+        for view, residual, tilt in zip(result.views, fit.residuals_px, fit.tilts_deg, strict=True)
     ]
-    photos += [{"file": one.file, "status": "left out", "reason": one.reason} for one in found.left]
+    photos += [{"file": left.file, "status": "left out", "reason": left.reason} for left in result.left]
     return {
-        "board": found.board.sheet_id,
+        "board": result.board.sheet_id,
         "rung": fit.rung,
         "ladder": [
-            {"rung": r.name, "held_out_px": figure(r.held_out_px), "standard_error_px": figure(r.standard_error_px)}
-            for r in found.climbed.rungs
+            {
+                "rung": rung.name,
+                "held_out_px": figure(rung.error),
+                "worse_by_px": figure(rung.worse_by),
+                "standard_error_px": figure(rung.standard_error),
+            }
+            for rung in result.climbed.rungs
         ],
         "numbers": {
             n: {"value": float(v), "standard_deviation": float(s)}
             for n, v, s in zip(NUMBERS, fit.numbers, fit.sd, strict=True)
         },
         "rms_px": figure(fit.rms_px),
-        "coverage": round(found.coverage, 3),
+        "coverage": round(result.coverage, 3),
         "photos": sorted(photos, key=lambda photo: photo["file"]),
     }
 
 
-def calibration_lines(found: Calibrated) -> list[str]:
+def calibration_lines(result: Calibrated) -> list[str]:
     """What a user wants to know of it, in a few lines."""
-    fit, camera = found.climbed.fit, found.camera
-    steps = ", ".join(f"{r.name} {r.held_out_px:.3f}" for r in found.climbed.rungs if np.isfinite(r.held_out_px))
+    fit, camera = result.climbed.fit, result.camera
+    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.climbed.rungs if np.isfinite(rung.error))
     lines = [
         f"lens: {fit.rung} (held-out error in px: {steps})",
         f"focal length {camera.fx:.1f} ± {fit.sd[0]:.1f} × {camera.fy:.1f} ± {fit.sd[1]:.1f} px "
         f"at {camera.image_px[0]} × {camera.image_px[1]}, middle {camera.cx:.1f} ± {fit.sd[2]:.1f}, "
         f"{camera.cy:.1f} ± {fit.sd[3]:.1f}",
-        f"{len(found.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
+        f"{len(result.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
         f"{fit.tilts_deg.max():.0f}°",
     ]
-    lines += [f"left out: {one.file}: {one.reason}" for one in found.left]
-    if found.coverage < WELL_COVERED:
+    lines += [f"left out: {left.file}: {left.reason}" for left in result.left]
+    if result.coverage < WELL_COVERED:
         lines.append(
-            f"warning: the board's corners reach {found.coverage:.0%} of the way to the picture's corners; "
+            f"warning: the board's corners reach {result.coverage:.0%} of the way to the picture's corners; "
             "beyond, distortion is a guess: photograph the board there, too"
         )
     return lines
 
 
-def _enough(views: Sequence[View], left: Sequence[Left]) -> None:
+def _enough(views: Sequence[View], left: Sequence[LeftOut]) -> None:
     if len(views) < FEWEST_PHOTOS:
         why = f" ({left[0].file}: {left[0].reason})" if left else ""
         raise Refused(
@@ -166,7 +167,7 @@ def _enough(views: Sequence[View], left: Sequence[Left]) -> None:
         )
 
 
-def _without_odd(views: Sequence[View]) -> tuple[list[View], list[Left]]:
+def _without_odd(views: Sequence[View]) -> tuple[list[View], list[LeftOut]]:
     """Views without the photographs, then without the corners, that lie far off: moved, of a bent board, occluded."""
     kept, odd = list(views), []
     while len(kept) >= FEWEST_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
@@ -178,14 +179,14 @@ def _without_odd(views: Sequence[View]) -> tuple[list[View], list[Left]]:
             reason = (
                 f"its corners miss by {typical[worst]:.2f} px where most miss by {usual:.2f}: moved, or a bent board"
             )
-            odd.append(Left(kept.pop(worst).file, reason))
+            odd.append(LeftOut(kept.pop(worst).file, reason))
             continue
         farthest = max(float(error.max()) for error in errors)
         if farthest <= max(_ODD_CORNER * usual, _ODD_PX):
             break
         kept = [view.only(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
         few = "too few of its corners agree with the others: show more of the board, sharp"
-        odd += [Left(view.file, few) for view in kept if len(view.ids) < FEWEST_CORNERS]
+        odd += [LeftOut(view.file, few) for view in kept if len(view.ids) < FEWEST_CORNERS]
         kept = [view for view in kept if len(view.ids) >= FEWEST_CORNERS]
     return kept, odd
 
@@ -209,25 +210,19 @@ def _refuse_blind(fit: Fit) -> None:
         )
 
 
-def _undoable(camera: Camera) -> bool:
+def _is_usable(fit: Fit, size_px: tuple[int, int]) -> bool:
+    """Whether the lens can be undone all over the picture."""
     try:
-        check_camera(camera, "a trial")
+        check_camera(_camera(fit, "trial", size_px, "", ""), "a trial")
     except Refused:
         return False
     return True
 
 
 def _camera(fit: Fit, name: str, size_px: tuple[int, int], instrument: str, uncertainty: str) -> Camera:
+    about = {"instrument": instrument, "uncertainty": uncertainty, "when": date.today().isoformat()}
     numbers = {n: round(float(v), 6) for n, v in zip(NUMBERS, fit.numbers, strict=True)}
-    return Camera(
-        name=name,
-        method="measured",
-        when=date.today().isoformat(),
-        instrument=instrument,
-        uncertainty=uncertainty,
-        image_px=size_px,
-        **numbers,
-    )
+    return Camera.model_validate({"name": name, "method": "measured", "image_px": size_px} | about | numbers)
 
 
 def _uncertainty(fit: Fit) -> str:
@@ -235,5 +230,5 @@ def _uncertainty(fit: Fit) -> str:
     return f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
 
 
-def _text(data: dict) -> str:
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+def _text(data: dict) -> bytes:
+    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()

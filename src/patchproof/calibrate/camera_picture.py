@@ -7,15 +7,15 @@ point every way where none is; a photograph that stands out in the second was mo
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from patchproof.calibrate.camera import Calibrated
+from patchproof.calibrate.boards import View
+from patchproof.calibrate.lens_ladder import Climbed
 
 
-def residual_picture(found: Calibrated) -> bytes:
+def residual_picture(views: Sequence[View], climbed: Climbed) -> bytes:
     """Three panels: residuals over the picture, RMS of each photograph, held-out error of each rung."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -23,38 +23,36 @@ def residual_picture(found: Calibrated) -> bytes:
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     where, photos, rungs = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 1))
-    _arrows(where, found)
-    fit = found.climbed.fit
+    fit = climbed.fit
+    _arrows(where, views, np.concatenate(fit.residuals_px))
     rms = [float(np.sqrt((residual**2).sum(1).mean())) for residual in fit.residuals_px]
     photos.bar(range(1, len(rms) + 1), rms, color="#4477aa")
     photos.set(xlabel="photograph, in the order of names", ylabel="rms [px]", title=f"{fit.rms_px:.3f} px in all")
-    _ladder(rungs, found)
+    _ladder(rungs, climbed)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
     return buffer.getvalue()
 
 
-def _arrows(axes, found: Calibrated) -> None:
-    places = np.concatenate([view.px for view in found.views])
-    residuals = np.concatenate(found.climbed.fit.residuals_px)
-    width, height = found.camera.image_px
-    typical = max(float(np.median(np.linalg.norm(residuals, axis=1))), 1e-6)
-    times = 0.02 * width / typical
-    colors = np.linalg.norm(residuals, axis=1)
+def _arrows(axes, views: Sequence[View], residuals: np.ndarray) -> None:
+    places = np.concatenate([view.px for view in views])
+    width, height = views[0].size_px
+    lengths = np.linalg.norm(residuals, axis=1)
+    times = 0.02 * width / max(float(np.median(lengths)), 1e-6)
     axes.quiver(
-        *places.T, *residuals.T, colors, angles="xy", scale_units="xy", scale=1 / times, width=0.0025, cmap="viridis"
+        *places.T, *residuals.T, lengths, angles="xy", scale_units="xy", scale=1 / times, width=0.0025, cmap="viridis"
     )
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=f"residuals, {times:.0f} times as long")
 
 
-def _ladder(axes, found: Calibrated) -> None:
-    rungs = [rung for rung in found.climbed.rungs if np.isfinite(rung.held_out_px)]
-    errors = [rung.held_out_px for rung in rungs]
-    axes.errorbar(range(len(rungs)), errors, [rung.standard_error_px for rung in rungs], fmt="o-", color="#4477aa")
-    names = [rung.name for rung in rungs]
-    chosen = names.index(found.climbed.fit.rung)
+def _ladder(axes, climbed: Climbed) -> None:
+    """Bars are the standard error of the difference from the best rung."""
+    rungs = [rung for rung in climbed.rungs if np.isfinite(rung.error)]
+    names, errors = [rung.name for rung in rungs], [rung.error for rung in rungs]
+    axes.errorbar(range(len(rungs)), errors, [rung.standard_error for rung in rungs], fmt="o-", color="#4477aa")
+    chosen = names.index(climbed.fit.rung)
     axes.plot(chosen, errors[chosen], "o", markersize=12, fillstyle="none", color="#cc3311")
     if max(errors) > 10 * min(errors):
         axes.set_yscale("log")
     axes.set_xticks(range(len(rungs)), [name.replace(" p1 p2", "\np1 p2") for name in names], fontsize=8)
-    axes.set(ylabel="held-out error [px]", title=f"chosen: {found.climbed.fit.rung}")
+    axes.set(ylabel="held-out error [px]", title=f"chosen: {climbed.fit.rung}")

@@ -22,18 +22,12 @@ import numpy as np
 import torch
 
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
-from patchproof.calibrate.ladder import WIDE, Choice, Map, choose, difference, rungs
+from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
 from patchproof.channel.lens import Camera
-from patchproof.channel.printer import (
-    Printer,
-    load_printer,
-    node_colors,
-    printer_from_table,
-    vary,
-)
+from patchproof.channel.printer import Printer, load_printer, node_colors, printer_from_table, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.read import SUFFIXES, read_photo
+from patchproof.photo.read import pictures_in, read_photo
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
 
@@ -71,20 +65,21 @@ def calibrate_chart(
     """The printer that these photographs show; each inner list holds those of one print."""
     readings, warnings = _read_all(prints, manifest, camera, on_photo)
     by_print = [
-        combine([one.chart.light for one in readings if one.of_print == i])
-        for i in sorted({one.of_print for one in readings})
+        combine([reading.chart.light for reading in readings if reading.of_print == i])
+        for i in sorted({reading.of_print for reading in readings})
     ]
     light = combine(by_print, robust=False)
     sent = np.array([swatch.srgb for swatch in manifest.chart])
-    known = np.isfinite(light).all(1)
+    known = np.all(np.isfinite(light), axis=1)
     if known.sum() < LEAST_SWATCHES:
         do = "photograph the whole chart from closer, sharp and not too light"
         raise Refused(f"at least {LEAST_SWATCHES} readable swatches", f"{known.sum()}", do)
-    choice = choose(rungs(known_printers()), sent[known], srgb_from_linear(light[known]))
+    choice = choose(kinds_of_maps(known_printers()), sent[known], srgb_from_linear(light[known]))
     agreement = _agreement(readings, by_print)
     warnings += [
-        f"{one.path.name} differs from the other photographs of its print by ΔE00 {error:.1f}: glare, or another print?"
-        for one, error in zip(readings, agreement, strict=True)
+        f"{reading.path.name} differs from the other photographs of its print by ΔE00 {error:.1f}: glare, or another "
+        "print?"
+        for reading, error in zip(readings, agreement, strict=True)
         if error is not None and error > STRANGE_PHOTO
     ]
     if choice.width < WIDE:
@@ -98,13 +93,13 @@ def calibrate_chart(
         "camera": None if camera is None else camera.name,
         "sheet_id": manifest.sheet_id,
         "relative_to": "paper: sRGB white is seen as bare paper",
-        "chosen": choice.name,
+        "chosen": choice.chosen.name,
         "ladder": ladder_table(choice),
         "swatches": {"colors": choice.colors, "held_out": choice.held_out, "unreadable": _unreadable(manifest, known)},
         "delta_e00_of_duplicates": _duplicates(sent[known], light[known]),
         "print_to_print": print_variation(by_print),
-        "photographs": [_row(one, error) for one, error in zip(readings, agreement, strict=True)],
-        "uncertainty": f"mean ΔE00 {choice.figure.delta_e00:.2f} of {choice.held_out} held-out colors of the chart",
+        "photographs": [_row(reading, error) for reading, error in zip(readings, agreement, strict=True)],
+        "uncertainty": f"mean ΔE00 {choice.chosen.error:.2f} of {choice.held_out} held-out colors of the chart",
     }
     return Calibration(printer_of(name, choice.predict, provenance), choice, tuple(readings), tuple(warnings))
 
@@ -113,10 +108,9 @@ def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
     """Photographs by print: each folder holds those of one print; single files are all of one."""
     singles, prints = [path for path in paths if not path.is_dir()], []
     for folder in (path for path in paths if path.is_dir()):
-        inside = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-        if not inside:
+        prints.append(pictures_in(folder))
+        if not prints[-1]:
             raise Refused("a folder with photographs of one print", f"none in {folder}", "name the photographs")
-        prints.append(inside)
     for path in singles:
         if not path.is_file():
             raise Refused("a photograph of the chart", f"no file at {path}", "check the path")
@@ -180,34 +174,28 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
 
     mean = combine(prints, robust=False)
     known = np.isfinite(np.stack(prints)).all((0, 2))
-    middle, found, away = torch.tensor(mean[known].clip(0, 1)), [], []
-    for one in prints:
-        target = srgb_from_linear(one[known])
+    middle, changes, away = torch.tensor(mean[known].clip(0, 1)), [], []
+    for light in prints:
+        target = srgb_from_linear(light[known])
 
         def rest(change: np.ndarray, target: np.ndarray = target) -> np.ndarray:
             return (srgb_from_linear(vary(middle, torch.tensor(change)).numpy()) - target).ravel()
 
-        found.append(least_squares(rest, np.zeros(3), x_scale=_PRINT_CHANGE).x)
+        changes.append(least_squares(rest, np.zeros(3), x_scale=_PRINT_CHANGE).x)
         away.append(difference(target, srgb_from_linear(mean[known])).mean())
-    gain, density, lift = np.std(found, axis=0, ddof=1)
+    gain, density, lift = np.std(changes, axis=0, ddof=1)
     figures = {"delta_e00": np.mean(away), "dot_gain_sd": gain, "density_sd": density, "black_lift_sd": lift}
     return {"prints": len(prints), **{key: round(float(value), 4) for key, value in figures.items()}}
 
 
 def ladder_table(choice: Choice) -> list[dict[str, Any]]:
     """Each rung's figures as stored; those that had too few colors have none."""
-    rows = [
-        {
-            "rung": figure.name,
-            "delta_e00": round(figure.delta_e00, 3),
-            "worse_by": round(figure.worse_by, 3),
-            "standard_error": round(figure.standard_error, 3),
-        }
-        for figure in choice.figures
-    ]
-    return rows + [
-        {"rung": name, "delta_e00": None, "reason": "swatches too few or too much alike"} for name in choice.left_out
-    ]
+    rows: list[dict[str, Any]] = []
+    for rung in choice.rungs:
+        figures = {"delta_e00": rung.error, "worse_by": rung.worse_by, "standard_error": rung.standard_error}
+        rows.append({"rung": rung.name, **{key: round(value, 3) for key, value in figures.items()}})
+    reason = "swatches too few or too much alike"
+    return rows + [{"rung": name, "delta_e00": None, "reason": reason} for name in choice.left_out]
 
 
 def summary_lines(calibration: Calibration) -> list[str]:
@@ -215,9 +203,13 @@ def summary_lines(calibration: Calibration) -> list[str]:
     choice, told = calibration.choice, calibration.printer.provenance
     lines = [f"{told['source']}; {told['model_of']}"]
     for row in told["ladder"]:
-        mark = "  <- chosen: the simplest within one standard error of the best" if row["rung"] == choice.name else ""
-        figure = "swatches too few or too much alike"
-        if row["delta_e00"] is not None:
+        mark = (
+            "  <- chosen: the simplest within one standard error of the best"
+            if row["rung"] == choice.chosen.name
+            else ""
+        )
+        figure = row.get("reason")
+        if figure is None:
             figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
         lines.append(f"  {row['rung']:20s} {figure}{mark}")
     lines.append(f"held out: {choice.held_out} of {choice.colors} colors in turn")
@@ -227,7 +219,9 @@ def summary_lines(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _read_all(prints, manifest: Manifest, camera: Camera | None, on_photo) -> tuple[list[Reading], list[str]]:
+def _read_all(
+    prints: Sequence[Sequence[Path]], manifest: Manifest, camera: Camera | None, on_photo: Callable[[int, int], None]
+) -> tuple[list[Reading], list[str]]:
     """All photographs that can be read, and what is wrong with the others; refused where none is left."""
     if not manifest.chart:
         raise Refused("a sheet with a chart", f"sheet {manifest.sheet_id} without", "name the page's own JSON")
@@ -247,20 +241,20 @@ def _read_all(prints, manifest: Manifest, camera: Camera | None, on_photo) -> tu
 
 def _agreement(readings: Sequence[Reading], by_print: Sequence[np.ndarray]) -> list[float | None]:
     """Mean ΔE00 of each photograph from its print; None where it is the only one."""
-    numbers = [one.of_print for one in readings]
+    numbers = [reading.of_print for reading in readings]
     means = dict(zip(sorted(set(numbers)), by_print, strict=True))
     errors = []
-    for one in readings:
-        both = np.isfinite(one.chart.light).all(1)
-        alone = numbers.count(one.of_print) == 1 or not both.any()
-        seen, mean = (srgb_from_linear(light[both]) for light in (one.chart.light, means[one.of_print]))
-        errors.append(None if alone else float(difference(seen, mean).mean()))
+    for reading in readings:
+        both = np.isfinite(reading.chart.light).all(1)
+        alone = numbers.count(reading.of_print) == 1 or not both.any()
+        own, mean = (srgb_from_linear(light[both]) for light in (reading.chart.light, means[reading.of_print]))
+        errors.append(None if alone else float(difference(own, mean).mean()))
     return errors
 
 
 def _unreadable(manifest: Manifest, known: np.ndarray) -> int:
     """Swatches of charts in view that no photograph shows well enough; those of the piece are not the chart's."""
-    pages = {swatch.page for swatch, one in zip(manifest.chart, known, strict=True) if one}
+    pages = {swatch.page for swatch, readable in zip(manifest.chart, known.tolist(), strict=True) if readable}
     return sum(not known[row] for page in pages for row in chart_rows(manifest, page))
 
 
@@ -274,16 +268,16 @@ def _duplicates(sent: np.ndarray, light: np.ndarray) -> float | None:
     return round(float(difference(*(srgb_from_linear(light[pairs[:, i]]) for i in (0, 1))).mean()), 3)
 
 
-def _row(one: Reading, error: float | None) -> dict[str, Any]:
+def _row(reading: Reading, error: float | None) -> dict[str, Any]:
     return {
-        "file": one.path.name,
-        "sha256": hashlib.sha256(one.path.read_bytes()).hexdigest(),
-        "print": one.of_print + 1,
-        "when": _day(one.path),
-        "paper": [round(value, 3) for value in one.chart.paper],
-        "unevenness": round(one.chart.unevenness, 2),
-        "paper_misfit": round(one.chart.misfit, 4),
-        "px_per_mm": round(one.chart.px_per_mm, 2),
+        "file": reading.path.name,
+        "sha256": hashlib.sha256(reading.path.read_bytes()).hexdigest(),
+        "print": reading.of_print + 1,
+        "when": _day(reading.path),
+        "paper": [round(value, 3) for value in reading.chart.paper],
+        "unevenness": round(reading.chart.unevenness, 2),
+        "paper_misfit": round(reading.chart.misfit, 4),
+        "px_per_mm": round(reading.chart.px_per_mm, 2),
         "delta_e00_from_print": None if error is None else round(error, 2),
     }
 

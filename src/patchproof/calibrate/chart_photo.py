@@ -19,11 +19,12 @@ from patchproof.channel.tone import light_of_codes
 from patchproof.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
-from patchproof.photo.detect import Found, find_markers, is_mirrored
+from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
-from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.manifest import Manifest, Marker
+from patchproof.sheets.rects import RectMm, holds
 
 LEAST_CORE_PX = 4.0  # a swatch's side between blurred borders
 MOST_CLIPPED = 0.05  # share of the white paper at full white: beyond it nobody knows how light it was
@@ -34,8 +35,6 @@ _PITCH_MM, _PLACE_MM = 2.5, 2.0  # between places of bare paper, and the side of
 _CLEAR_MM = 1.0  # between such a place and anything printed, and as much again as the blur
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of x and y in the logarithm of the paper's light
 _PLACES_PER_TERM = 5
-
-Rect = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -87,30 +86,30 @@ def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -
         if (codes >= CLIPPED_CODE).any(-1).mean() <= MOST_CLIPPED:
             light[row] = light_of_codes(codes / 255, camera).mean(0) / paper
     level = under.mean(1)
-    middle = tuple(float(value) for value in np.median(under, 0))
-    return ChartPhoto(light, middle, float(level.max() / level.min()), misfit, page.px_per_mm)
+    red, green, blue = np.median(under, 0).tolist()
+    return ChartPhoto(light, (red, green, blue), float(level.max() / level.min()), misfit, page.px_per_mm)
 
 
 def chart_rows(manifest: Manifest, page: int) -> list[int]:
     """Which swatches make up a page's chart: those outside of the piece, which may hang elsewhere by now."""
     here = [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
-    return [i for i in here if not _within(manifest.chart[i].rect_mm, manifest.cut_mm)] or here
+    return [i for i in here if not holds(manifest.cut_mm, manifest.chart[i].rect_mm)] or here
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     """The page that is in view, from the markers beside the chart; those of the piece help where it is uncut."""
     dictionary = manifest.markers[0].dictionary
     markers = [marker for marker in manifest.markers if marker.dictionary == dictionary]
-    found = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
-    if not found.markers:
-        raise _no_sheet(srgb, found, markers, dictionary)
-    seen = [marker for marker in markers if marker.id in found.markers]
-    numbers = [marker.page for marker in seen if chart_rows(manifest, marker.page)] or [seen[0].page]
+    detected = find_markers(srgb, {marker.id for marker in markers}, dictionary=dictionary)
+    if not detected.markers:
+        raise _no_sheet(srgb, detected, markers, dictionary)
+    pages = [marker.page for marker in markers if marker.id in detected.markers]
+    numbers = [page for page in pages if chart_rows(manifest, page)] or pages[:1]
     number = max(sorted(set(numbers)), key=numbers.count)
     corners_mm = {marker.id: np.array(marker.corners_mm) for marker in markers if marker.page == number}
-    found = complete(srgb, found, corners_mm, dictionary)
-    corners_px = {i: borders.corners_px for i, borders in found.markers.items() if i in corners_mm}
-    beside = {i: px for i, px in corners_px.items() if not _inside(corners_mm[i], manifest.cut_mm)}
+    detected = complete(srgb, detected, corners_mm, dictionary)
+    corners_px = {i: borders.corners_px for i, borders in detected.markers.items() if i in corners_mm}
+    beside = {i: px for i, px in corners_px.items() if not holds(manifest.cut_mm, _around(corners_mm[i]))}
     fit = fit_page(beside if len(beside) > 1 else corners_px, corners_mm)
     together = fit_page(corners_px, corners_mm)
     if set(beside) <= set(together.inlier_ids):
@@ -119,19 +118,19 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
     if not len(rects):
         raise CannotJudge("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")
     scale, _ = local_scale(fit.px_from_mm, tuple((rects[:, :2] + rects[:, 2:] / 2).mean(0)))
-    return _Page(number, fit.px_from_mm, blur_px(found.markers.values()), float(scale))
+    return _Page(number, fit.px_from_mm, blur_px(detected.markers.values()), float(scale))
 
 
-def _no_sheet(srgb, found: Found, markers, dictionary: str) -> CannotJudge:
+def _no_sheet(srgb: np.ndarray, detected: MarkersInView, markers: list[Marker], dictionary: str) -> CannotJudge:
     if is_mirrored(srgb, {marker.id for marker in markers}, dictionary):
         return CannotJudge("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
-    if found.foreign:
+    if detected.foreign:
         advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
-        return CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
+        return CannotJudge("wrong_sheet", len(detected.foreign), 0, advice)
     return CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
 
 
-def _core(rect: Rect, page: _Page, shape) -> Rect | None:
+def _core(rect: RectMm, page: _Page, shape) -> RectMm | None:
     """The part of a swatch that blur leaves alone; None where there is none or it lies out of the picture."""
     x, y, w, h = rect
     quad = apply_homography(page.px_from_mm, rect_corners(rect))
@@ -153,7 +152,7 @@ def _bare_places(manifest: Manifest, page: _Page, shape) -> np.ndarray:
     corner = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
     printed = [swatch.rect_mm for swatch in manifest.chart if swatch.page == page.number]
     printed += [_around(marker.corners_mm) for marker in manifest.markers if marker.page == page.number]
-    if chart_rows(manifest, page.number) and any(not _within(rect, manifest.cut_mm) for rect in rows):
+    if chart_rows(manifest, page.number) and any(not holds(manifest.cut_mm, rect) for rect in rows):
         printed.append(manifest.cut_mm)
     bare = np.ones(len(corner), bool)
     for x, y, w, h in printed:
@@ -181,7 +180,8 @@ def _paper(srgb: np.ndarray, page: _Page, places: np.ndarray, camera: Camera | N
         x, y = ((at - middle) / reach).T
         return np.stack([x**i * y**j for i, j in _TERMS[:count]], 1)
 
-    known, weight = rows(centers), np.ones(len(places))
+    known = rows(centers)
+    weight, error, surface = np.ones(len(places)), np.zeros(len(places)), np.zeros((count, 3))
     for _ in range(30):
         root = np.sqrt(weight)[:, None]
         surface = np.linalg.lstsq(known * root, light * root, rcond=None)[0]
@@ -205,19 +205,10 @@ def _codes(srgb: np.ndarray, page: _Page, rect, samples: int = _SAMPLES) -> np.n
     return srgb[line, column].reshape(*at.shape[:-3], samples**2, 3)
 
 
-def _around(corners) -> Rect:
-    low, high = np.min(corners, 0), np.max(corners, 0)
-    return (*low, *(high - low))
+def _around(corners) -> RectMm:
+    (x0, y0), (x1, y1) = np.min(corners, 0), np.max(corners, 0)
+    return x0, y0, x1 - x0, y1 - y0
 
 
-def _within(rect: Rect, outer: Rect) -> bool:
-    return _inside(rect_corners(rect), outer)
-
-
-def _inside(points: np.ndarray, rect: Rect) -> bool:
-    x, y, w, h = rect
-    return bool(((points >= [x, y]) & (points <= [x + w, y + h])).all())
-
-
-def _in_picture(points: np.ndarray, shape) -> bool:
+def _in_picture(points: np.ndarray, shape: tuple[int, ...]) -> bool:
     return bool(((points >= 0) & (points <= [shape[1], shape[0]])).all())

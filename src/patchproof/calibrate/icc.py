@@ -6,23 +6,20 @@ always relative colorimetric: bare paper is 1, and an eye's or camera's adaptati
 LittleCMS (through Pillow) works in 8 bits here; without NOOPTIMIZE it replaces the chain by a coarse one (ΔE00 up to 5
 on coated, 14 on uncoated paper). A bake measures its table against the exact chain and keeps the figures.
 Left out on purpose: black point compensation, in which drivers differ.
-
-    python -m patchproof.calibrate.icc FOGRA39L_coated.icc --name coated --licence CC0 --source "colord project" --out .
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import io
-import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table, save_printer
+from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table
 from patchproof.color import ciede2000, lab_from_srgb
 from patchproof.strict import Refused
 
@@ -36,12 +33,9 @@ _INTENTS = {
 
 
 def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: bool = False) -> Printer:
-    """The printer of a profile; `licence` and `source` are what the caller knows of it and go into provenance.
-
-    `perceptual` is the intent on the way to the printer, else relative colorimetric.
-    """
-    data = _profile_bytes(Path(profile_path))
-    show, profile = _chain(data, Path(profile_path).name, perceptual)
+    """The printer of a profile; `licence` and `source` go into provenance, `perceptual` is the intent towards paper."""
+    data = _profile_bytes(profile_path)
+    show, profile = _chain(data, profile_path.name, perceptual)
     nodes = np.round(node_colors() * 255).astype(np.uint8)
     lut = show(nodes)
     white = lut[-1, -1, -1]
@@ -67,25 +61,6 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
     return printer
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Bake a profile and write it; the way the shipped printers were made."""
-    parser = argparse.ArgumentParser(prog="python -m patchproof.calibrate.icc", description=bake.__doc__)
-    parser.add_argument("profile", type=Path)
-    for option in ("--name", "--licence", "--source"):
-        parser.add_argument(option, required=True)
-    parser.add_argument("--out", type=Path, required=True, help="folder for NAME.npz and NAME.json")
-    given = parser.parse_args(arguments)
-    try:
-        printer = bake(given.profile, given.name, given.licence, given.source)
-        given.out.mkdir(parents=True, exist_ok=True)
-        path = save_printer(printer, given.out)
-    except Refused as error:
-        print(error, file=sys.stderr)
-        return 1
-    print(f"{path}: ΔE00 to the exact chain {printer.provenance['delta_e00_to_exact_chain']}")
-    return 0
-
-
 def _profile_bytes(path: Path) -> bytes:
     """The file, refused where it is missing, too large, or shorter than its own header says."""
     if not path.is_file():
@@ -102,14 +77,15 @@ def _profile_bytes(path: Path) -> bytes:
     return data
 
 
-def _chain(data: bytes, file_name: str, perceptual: bool = False):
+def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.ndarray], np.ndarray], Any]:
     """(uint8 ... × 3 sRGB sent → uint8 sRGB seen, the profile's description) by LittleCMS."""
     from PIL import Image, ImageCms
 
     try:
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
-        kind, colors = profile.profile.device_class.strip(), profile.profile.xcolor_space.strip()
-        _description(profile.profile), _paper_white(profile.profile)  # damage shows where a tag is read
+        tags: Any = profile.profile
+        kind, colors = tags.device_class.strip(), tags.xcolor_space.strip()
+        _description(tags), _paper_white(tags)  # damage shows where a tag is read
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
         got = f"{file_name} ({' '.join(str(error).split())[:100]})"
         raise Refused("an ICC profile that can be read", got, "use another one") from error
@@ -130,7 +106,7 @@ def _chain(data: bytes, file_name: str, perceptual: bool = False):
         image = Image.fromarray(np.ascontiguousarray(srgb_8bit.reshape(1, -1, 3)))
         return np.asarray(ImageCms.applyTransform(image, chain)).reshape(srgb_8bit.shape)
 
-    return show, profile.profile
+    return show, tags
 
 
 def _description(profile) -> str:
@@ -143,19 +119,15 @@ def _paper_white(profile) -> tuple[float, float, float] | None:
         return None
     t = np.array(profile.media_white_point[0]) / _D50
     f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
-    lab = 116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])
-    return tuple(round(float(value), 2) + 0.0 for value in lab)
+    lightness, a, b = (round(float(v), 2) + 0.0 for v in (116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])))
+    return lightness, a, b
 
 
 def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-    """How far the interpolated table is from the chain itself on random colours."""
+    """How far the interpolated table is from the chain itself on random colors."""
     sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
     exact = lab_from_srgb(show(sent) / 255)
     seen = printer.apply(torch.tensor(sent / 255).T[None, :, :, None])[0, :, :, 0].T.numpy()
     error = ciede2000(exact, lab_from_srgb(seen))
     figures = {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()}
     return {"colors": _CHECKED_COLORS, **{key: round(float(value), 3) for key, value in figures.items()}}
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,202 +1,44 @@
-"""The ladder: maps from colors to colors, from none to free, and the choice among them by colors that they did not see.
+"""The rule for climbing a ladder of models: the simplest one whose held-out error is no worse than the best one's.
 
-In: N×3 sRGB colors sent and seen, and known printers as priors. Out: `Choice`: the map, and every rung's figure. Each
-rung is tried on colors that it was not fitted to (ten folds; the corners of the RGB cube always stay in training, since
-a color outside of those seen is a guess); the simplest rung whose mean ΔE00 is within one standard error of the best
-wins. The standard error is that of the paired difference from the best, color by color: it is smaller than that of a
-mean, and says what the rule asks, whether the better one is better. Too few colors to hold any out, or colors that are
-all nearly gray, leave only rungs with nothing to fit, or paper and black: held-out grays tell nothing of other colors.
+In: what each model misses of every item that it was not fitted to, simplest model first. No worse means within one
+standard error (Breiman's rule), and that is the standard error of the *paired* difference from the best, item by item:
+items that are hard for every model say nothing about which one is better.
 
-The splines see each color as sRGB and as CIELAB together: drivers work in either, and in one of them a printer is close
-to straight. With 48 swatches that took ΔE00 3.2 to 2.3 where the driver looks for nearest colors, and cost 0.2 where it
-only mixes inks.
-
-Sources: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 7.10 (cross-validation, the rule
-of one standard error); Duchon, Splines minimizing rotation-invariant semi-norms in Sobolev spaces, 1977.
+Sources: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, 3.4.3 (the rule of one standard
+error); Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 7.10 (cross-validation).
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.color import ciede2000, lab_from_srgb, linear_from_srgb, srgb_from_linear
-
-Colors = np.ndarray  # N×3 sRGB in [0, 1]
-Map = Callable[[Colors], Colors]
-
-FOLDS = 10
-LEAST_HELD_OUT = 6  # with fewer, a mean says nothing of a rung
-# Rms distance of the colors from their flattest plane; charts have 0.30 and more. With the chart's colors drawn towards
-# gray, held-out errors said 1.0 to 1.5 where others were off by up to 3 at 0.13, 4 at 0.06, 14 at 0.03, 35 at 0.001.
-WIDE, FLAT = 0.15, 0.05
-SMOOTHING = 1e-3  # of splines: from 1e-4 to 1e-2 held-out errors differ by less than 0.05
-_LAB_SCALE = 60.0  # CIELAB units that count as much as the whole range of one sRGB channel
-
 
 @dataclass(frozen=True)
 class Rung:
-    """A kind of map: how to fit it, and the fewest distinct colors that takes."""
+    """A model's mean held-out error, by how much that is worse than the best model's, and the standard error of that
+    difference; infinite where there was no fit.
+    """
 
     name: str
-    fit: Callable[[Colors, Colors], Map]
-    least: int
-    endpoints: bool = False  # nothing is fitted, or paper and black only
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One rung's held-out ΔE00: mean, standard error of what it is worse than the best by, and the time of a fit."""
-
-    name: str
-    delta_e00: float
+    error: float
     worse_by: float
     standard_error: float
-    seconds: float
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The rung that was chosen, fitted to all colors; `figures` of all rungs that were tried, simplest first."""
-
-    name: str
-    predict: Map
-    figures: tuple[Figure, ...]
-    colors: int
-    held_out: int
-    left_out: tuple[str, ...]  # rungs that would have needed more colors, or more colorful ones
-    width: float  # of the colors: rms distance from their flattest plane
-
-    @property
-    def figure(self) -> Figure:
-        """That of the chosen rung."""
-        return next(figure for figure in self.figures if figure.name == self.name)
+def compared(names: Sequence[str], errors: np.ndarray) -> tuple[Rung, ...]:
+    """The rungs of errors models × items, at least one of them finite; rows that are not finite had no fit."""
+    means = np.where(np.isfinite(errors).all(1), errors.mean(1), np.inf)
+    worse = errors[np.isfinite(means)] - errors[means.argmin()]
+    by, spread = np.full((2, len(means)), np.inf)
+    by[np.isfinite(means)] = worse.mean(1)
+    spread[np.isfinite(means)] = worse.std(1, ddof=1) / np.sqrt(worse.shape[1]) if worse.shape[1] > 1 else 0.0
+    rows = zip(names, means.tolist(), by.tolist(), spread.tolist(), strict=True)
+    return tuple(Rung(*row) for row in rows)
 
 
-def rungs(priors: Mapping[str, Map]) -> tuple[Rung, ...]:
-    """All rungs, simplest first; those of priors are left out where there are none."""
-    free = (
-        Rung("identity", lambda sent, seen: lambda colors: colors, 0, True),
-        Rung("white_black", fit_white_black, 2, True),
-        Rung("affine", fit_affine, 12),
-    )
-    known = (
-        Rung("prior", lambda sent, seen: _best(priors, sent, seen), 0, True),
-        Rung("prior+affine", lambda sent, seen: fit_prior_affine(priors, sent, seen), 12),
-        Rung("prior+affine+spline", lambda sent, seen: fit_prior_spline(priors, sent, seen), 24),
-    )
-    return free + (known if priors else ()) + (Rung("spline", fit_spline, 24),)
-
-
-def choose(ladder: Sequence[Rung], sent: Colors, seen: Colors) -> Choice:
-    """The simplest rung that is not worse than the best; colors sent twice are averaged first."""
-    sent, seen = distinct(sent, seen)
-    corners, width = np.isin(sent, (0.0, 1.0)).all(1), color_width(sent)
-    tried = [rung for rung in ladder if len(sent) >= rung.least and (rung.endpoints or width >= FLAT)]
-    folds = _folds(np.flatnonzero(~corners))
-    if (~corners).sum() < LEAST_HELD_OUT:
-        ends = (sent == 1).all(1) | (sent.sum(1) == sent.sum(1).min())
-        tried, folds = [rung for rung in tried if rung.endpoints], [np.flatnonzero(~ends if not ends.all() else ends)]
-    errors, seconds = zip(*(_held_out(rung, sent, seen, folds) for rung in tried), strict=True)
-    figures = _figures(tried, np.array(errors), seconds)
-    chosen = next(i for i, figure in enumerate(figures) if figure.worse_by <= figure.standard_error)
-    left_out = tuple(rung.name for rung in ladder if rung not in tried)
-    fitted = tried[chosen].fit(sent, seen)
-    return Choice(figures[chosen].name, fitted, figures, len(sent), len(errors[0]), left_out, width)
-
-
-def color_width(colors: Colors) -> float:
-    """Rms distance of N×3 colors from the plane that they lie nearest to: 0 of grays, 0.29 of the whole cube."""
-    return float(np.linalg.svd(colors - colors.mean(0), compute_uv=False)[-1] / np.sqrt(len(colors)))
-
-
-def distinct(sent: Colors, seen: Colors) -> tuple[Colors, Colors]:
-    """Each color sent once, with the mean light of how it was seen."""
-    colors, index = np.unique(np.asarray(sent, float), axis=0, return_inverse=True)
-    light, index = linear_from_srgb(np.asarray(seen, float)), index.reshape(-1)
-    total = np.stack([np.bincount(index, light[:, c]) for c in range(3)], 1)
-    return colors, srgb_from_linear(total / np.bincount(index)[:, None])
-
-
-def difference(seen: Colors, expected: Colors) -> np.ndarray:
-    """ΔE00 N of sRGB colors; what lies outside of [0, 1] counts as clipped."""
-    return ciede2000(lab_from_srgb(np.clip(seen, 0, 1)), lab_from_srgb(np.clip(expected, 0, 1)))
-
-
-def fit_white_black(sent: Colors, seen: Colors) -> Map:
-    """Per channel an affine map in light: white stays, and the darkest color sent becomes the one seen."""
-    light, shown = linear_from_srgb(sent), linear_from_srgb(seen)
-    dark = light.sum(1).argmin()
-    lift = np.clip((shown[dark] - light[dark]) / np.maximum(1 - light[dark], 1e-6), 0, 0.99)
-    return lambda colors: srgb_from_linear(lift + (1 - lift) * linear_from_srgb(colors))
-
-
-def fit_affine(sent: Colors, seen: Colors) -> Map:
-    """Least squares in sRGB's code values: 12 numbers. In light it was twice as far off (ΔE00 8 instead of 5)."""
-    matrix = np.linalg.lstsq(_with_ones(sent), seen, rcond=None)[0]
-    return lambda colors: _with_ones(colors) @ matrix
-
-
-def fit_spline(sent: Colors, seen: Colors) -> Map:
-    """A thin-plate spline with an affine part."""
-    from scipy.interpolate import RBFInterpolator
-
-    spline = RBFInterpolator(_features(sent), seen, kernel="thin_plate_spline", smoothing=SMOOTHING, degree=1)
-    return lambda colors: spline(_features(colors))
-
-
-def fit_prior_affine(priors: Mapping[str, Map], sent: Colors, seen: Colors) -> Map:
-    """An affine map after the prior for which that leaves least."""
-    corrected = (_after(prior, fit_affine(prior(sent), seen)) for prior in priors.values())
-    return min(corrected, key=lambda model: difference(model(sent), seen).mean())
-
-
-def fit_prior_spline(priors: Mapping[str, Map], sent: Colors, seen: Colors) -> Map:
-    """The corrected prior, and a spline of what it leaves."""
-    start = fit_prior_affine(priors, sent, seen)
-    rest = fit_spline(sent, seen - start(sent))
-    return lambda colors: start(colors) + rest(colors)
-
-
-def _best(priors: Mapping[str, Map], sent: Colors, seen: Colors) -> Map:
-    """The prior that shows these colors best."""
-    return min(priors.values(), key=lambda prior: difference(prior(sent), seen).mean())
-
-
-def _after(first: Map, then: Map) -> Map:
-    return lambda colors: then(first(colors))
-
-
-def _features(colors: Colors) -> np.ndarray:
-    return np.hstack([colors, lab_from_srgb(colors) / _LAB_SCALE])
-
-
-def _with_ones(colors: Colors) -> np.ndarray:
-    return np.column_stack([colors, np.ones(len(colors))])
-
-
-def _folds(held_out: np.ndarray) -> list[np.ndarray]:
-    """Indices of up to ten folds, mixed by a fixed seed."""
-    mixed = np.random.default_rng(0).permutation(held_out)
-    return [fold for fold in np.array_split(mixed, FOLDS) if len(fold)]
-
-
-def _held_out(rung: Rung, sent: Colors, seen: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """ΔE00 of each held-out color, fold by fold, and the mean seconds of a fit."""
-    errors, begin = [], time.perf_counter()
-    for fold in folds:
-        train = np.setdiff1d(np.arange(len(sent)), fold)
-        errors.append(difference(rung.fit(sent[train], seen[train])(sent[fold]), seen[fold]))
-    return np.concatenate(errors), (time.perf_counter() - begin) / len(folds)
-
-
-def _figures(tried: Sequence[Rung], errors: np.ndarray, seconds: Sequence[float]) -> tuple[Figure, ...]:
-    """`errors` rungs × colors."""
-    means = errors.mean(1)
-    worse = errors - errors[means.argmin()]
-    spread = worse.std(1, ddof=1) / np.sqrt(errors.shape[1]) if errors.shape[1] > 1 else np.zeros(len(tried))
-    rows = zip(tried, means, worse.mean(1), spread, seconds, strict=True)
-    return tuple(Figure(rung.name, *(float(value) for value in row)) for rung, *row in rows)
+def simplest(rungs: Sequence[Rung]) -> int:
+    """Which rung to stand on."""
+    return next(i for i, rung in enumerate(rungs) if np.isfinite(rung.error) and rung.worse_by <= rung.standard_error)

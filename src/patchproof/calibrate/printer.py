@@ -13,7 +13,7 @@ from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import Printer, save_printer
-from patchproof.output import check_file, make_folder, write_whole
+from patchproof.output import check_file, write_together
 from patchproof.sheets.manifest import load_manifest
 from patchproof.strict import Refused
 
@@ -44,8 +44,8 @@ def printer_from_chart(
     """Write the printer that photographs of a chart show; returns the summary and warnings."""
     out = _new_file(out, overwrite)
     known = None if camera is None else load_camera(camera)
-    found = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, known, on_photo)
-    return [*summary_lines(found), _written(found.printer, out)], found.warnings
+    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, known, on_photo)
+    return [*summary_lines(result), _written(result.printer, out)], result.warnings
 
 
 def _new_file(out: Path, overwrite: bool) -> Path:
@@ -59,11 +59,7 @@ def _new_file(out: Path, overwrite: bool) -> Path:
 
 
 def _written(printer: Printer, out: Path) -> str:
-    make_folder(out.parent)
     with TemporaryDirectory() as folder:
         made = save_printer(printer, Path(folder))
-        for suffix in (".npz", ".json"):
-            write_whole(
-                out.with_suffix(suffix), lambda part, s=suffix: part.write_bytes(made.with_suffix(s).read_bytes())
-            )
+        write_together({out.with_suffix(suffix): made.with_suffix(suffix).read_bytes() for suffix in (".npz", ".json")})
     return f"written: {out}, {out.with_suffix('.json').name}"

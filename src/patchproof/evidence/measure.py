@@ -23,7 +23,7 @@ from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete, find_sheet
-from patchproof.photo.detect import Found, find_markers, is_mirrored
+from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
@@ -112,7 +112,7 @@ def measure(
     return MeasuredPhoto(entry(color=color), counted, pictures, light)
 
 
-def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
+def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:
     """The sheet's markers and the surface they lie on: the whole, or one page of a piece in tiles. `CannotJudge` where
     none is seen, or where it is not clear which sheet it is.
     """
@@ -139,17 +139,17 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
         return found, surface
     surface = _page_in_view(found, surface)
     ours = {i: borders for i, borders in found.markers.items() if i in surface.corners_mm}
-    found = Found(ours, found.foreign, found.doubled)
+    found = MarkersInView(ours, found.foreign, found.doubled)
     return complete(srgb, found, surface.corners_mm, surface.dictionary), surface
 
 
-def _page_in_view(found: Found, surface: Surface) -> Surface:
+def _page_in_view(found: MarkersInView, surface: Surface) -> Surface:
     """The page that most of the markers belong to which an assembled piece hides; the whole where there is none."""
     hidden = [len(found.markers.keys() & page.corners_mm.keys() - surface.corners_mm.keys()) for page in surface.pages]
     return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 
-def _fit(found: Found, surface: Surface) -> PageFit | None:
+def _fit(found: MarkersInView, surface: Surface) -> PageFit | None:
     """The homography of the piece, with the page's own markers where they lie in the same plane."""
     sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
     corners = sure or found.corners_px
@@ -166,7 +166,7 @@ def _fit(found: Found, surface: Surface) -> PageFit | None:
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
 
 
-def _unrolled(photo: Photo, found: Found, surface: Surface) -> Unrolled | None:
+def _unrolled(photo: Photo, found: MarkersInView, surface: Surface) -> Unrolled | None:
     """The piece made flat where its markers do not lie in one plane and a cylinder or a lens says why."""
     corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in surface.piece_ids}
     try:
@@ -175,12 +175,14 @@ def _unrolled(photo: Photo, found: Found, surface: Surface) -> Unrolled | None:
         return None  # a shape that no camera sees is no explanation; the plane's residual decides
 
 
-def _is_uncut(fit: PageFit, found: Found, surface: Surface) -> bool:
+def _is_uncut(fit: PageFit, found: MarkersInView, surface: Surface) -> bool:
     pages = set(fit.inlier_ids) & surface.page_ids
     return bool(pages) or not (found.markers.keys() & surface.piece_ids)
 
 
-def _geometry(fit: PageFit, unrolled: Unrolled | None, found: Found, light: FrameLight, surface: Surface) -> Geometry:
+def _geometry(
+    fit: PageFit, unrolled: Unrolled | None, found: MarkersInView, light: FrameLight, surface: Surface
+) -> Geometry:
     px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
     shown = partial(
         Geometry,
@@ -215,7 +217,7 @@ def _pose(view: View, fit: PageFit, flat: bool, surface: Surface) -> Pose | None
     )
 
 
-def _trouble(geometry: Geometry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
+def _trouble(geometry: Geometry, fit: PageFit, found: MarkersInView, surface: Surface) -> CannotJudge | None:
     """Why geometry or color cannot be trusted, the nearest cause first; None where they can."""
     tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm

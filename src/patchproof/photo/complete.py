@@ -1,10 +1,10 @@
 """All markers of a known page: those that the detector sees, and those it missed, where the others say they must be.
 
-In: the photograph and where every marker lies on the page. Out: `Found`. After each level of the detector a homography
-from the markers found predicts the corners of the rest; borders are fitted from there, and a marker counts when its
-borders fit near the prediction and its cells are the printed ones. That needs no contours, so it still works for
-small, blurred or partly covered markers, and it spares the finer levels, which cost most; they then look only where
-markers are still missing. Prediction never identifies a sheet by itself.
+In: the photograph and where every marker lies on the page. Out: `MarkersInView`. After each level of the detector a
+homography from the markers found predicts the corners of the rest; borders are fitted from there, and a marker counts
+when its borders fit near the prediction and its cells are the printed ones. That needs no contours, so it still works
+for small, blurred or partly covered markers, and it spares the finer levels, which cost most; they then look only
+where markers are still missing. Prediction never identifies a sheet by itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from patchproof.photo.detect import (
     COARSEST_PX,
     DICTIONARY,
     Box,
-    Found,
+    MarkersInView,
     cells_of,
     fitted,
     levels,
@@ -46,14 +46,14 @@ def find_sheet(
     corners_mm: Mapping[int, np.ndarray],
     dictionary: str = DICTIONARY,
     coarsest_px: int = COARSEST_PX,
-) -> Found:
+) -> MarkersInView:
     """The markers of `corners_mm` (page mm by id) that are in the picture.
 
     The search ends when every one of `expected` is found, or shown to be out of the picture or covered.
     """
     printed = printed_markers(dictionary)
     seen: dict[int, list[np.ndarray]] = {}
-    box, found = whole(srgb), Found({}, (), ())
+    box, found = whole(srgb), MarkersInView({}, (), ())
     for level in levels(srgb, box, coarsest_px):
         before = set(seen)
         look(srgb, box, level, printed, seen)
@@ -67,7 +67,7 @@ def find_sheet(
     return found
 
 
-def _still_wanted(srgb, wanted: Set[int], found: Found, corners_mm, scale: float) -> tuple[Set[int], Box]:
+def _still_wanted(srgb, wanted: Set[int], found: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], Box]:
     """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
     sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
     if len(sure) < 2:  # one marker says too little about where the others are
@@ -89,8 +89,8 @@ def _still_wanted(srgb, wanted: Set[int], found: Found, corners_mm, scale: float
 
 
 def complete(
-    srgb: np.ndarray, found: Found, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
-) -> Found:
+    srgb: np.ndarray, found: MarkersInView, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
+) -> MarkersInView:
     """`found` with all markers of `corners_mm` that verify at their predicted places; bad fits are replaced."""
     printed = printed_markers(dictionary)
     for _ in range(3):  # each round's markers predict farther ones better
@@ -98,11 +98,11 @@ def complete(
         if not more:
             break
         kept = {i: b for i, b in found.markers.items() if i not in more}
-        found = Found(dict(sorted((kept | more).items())), found.foreign, found.doubled)
+        found = MarkersInView(dict(sorted((kept | more).items())), found.foreign, found.doubled)
     return found
 
 
-def _round(srgb, found: Found, corners_mm, printed) -> dict[int, Borders]:
+def _round(srgb, found: MarkersInView, corners_mm, printed) -> dict[int, Borders]:
     """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
     sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
     if not sure:

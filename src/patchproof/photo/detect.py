@@ -1,6 +1,6 @@
 """Find the printed markers in a photograph, coarse to fine.
 
-In: uint8 sRGB pixels and the ids that the sheet carries. Out: `Found`: corners in photo pixels (centres at .5,
+In: uint8 sRGB pixels and the ids that the sheet carries. Out: `MarkersInView`: corners in photo pixels (centres at .5,
 clockwise from the code's top-left) with what their borders show of blur and light, the ids of the same dictionary
 that are not the sheet's, and ids seen at two places. The detector looks at linear light: in code values blurred paper
 grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linear light read 45. The pyramid starts
@@ -34,7 +34,7 @@ Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class Found:
+class MarkersInView:
     """`markers` by id; `foreign` ids of the same dictionary; `doubled` ids of ours that lie at two places."""
 
     markers: dict[int, Borders]
@@ -61,7 +61,7 @@ def find_markers(
     also: Set[int] = frozenset(),
     dictionary: str = DICTIONARY,
     or_all_of: Sequence[Set[int]] = (),
-) -> Found:
+) -> MarkersInView:
     """All markers of `expected` and `also` in the picture; the search ends when every one of `expected` is found, or
     every one of a set in `or_all_of`.
     """
@@ -74,14 +74,14 @@ def find_markers(
     return fitted(srgb, seen, set(expected) | set(also), printed)
 
 
-def fitted(srgb: np.ndarray, seen: dict[int, list[np.ndarray]], ours: Set[int], printed) -> Found:
+def fitted(srgb: np.ndarray, seen: dict[int, list[np.ndarray]], ours: Set[int], printed) -> MarkersInView:
     """What was `seen` with borders fitted in the full photograph."""
     known = sorted(seen.keys() & ours)
     rough = np.array([seen[marker_id][0] for marker_id in known]).reshape(-1, 4, 2)
     borders = refine(srgb, rough, cells_of(printed, known)) if known else []
     markers = {i: b for i, b in zip(known, borders, strict=True) if possible(b.corners_px)}
     foreign = tuple(sorted(seen.keys() - set(known)))
-    return Found(markers, foreign, tuple(i for i in known if len(seen[i]) > 1))
+    return MarkersInView(markers, foreign, tuple(i for i in known if len(seen[i]) > 1))
 
 
 def printed_markers(dictionary: str):

@@ -9,13 +9,13 @@ Left out on purpose: asking before overwriting, which is the command line's busi
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from patchproof.output import write_together
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import (
     Design,
@@ -102,7 +102,7 @@ def save_sheets(pdf_path: Path, pages: Sequence[Printed], manifests: dict[Path, 
     names = [ATTACHMENT] if len(texts) == 1 else [numbered(ATTACHMENT, i) for i in range(len(texts))]
     title = f"patchproof sheet {' '.join(m.sheet_id for m in manifests.values())} {first.kind}"
     pdf = pages_pdf(pages, title, dict(zip(names, texts.values(), strict=True)))
-    replace_both({pdf_path: pdf} | {path: text.encode() for path, text in texts.items()})
+    write_together({pdf_path: pdf} | {path: text.encode() for path, text in texts.items()})
 
 
 def qr_text(sheet_id: str, kind: str, design_srgb8: np.ndarray | None) -> str:
@@ -203,29 +203,6 @@ def check_pixels(design: np.ndarray) -> None:
     """Refuse what is no picture of uint8 H×W×3."""
     if design.dtype != np.uint8 or design.ndim != 3 or design.shape[2] != 3 or design.size == 0:
         raise Refused("a design of uint8 H×W×3 pixels", f"{design.dtype} {design.shape}", "convert it to 8-bit RGB")
-
-
-def replace_both(contents: dict[Path, bytes]) -> None:
-    """Write all files under other names in the same folder, then move each to its place."""
-    waiting = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in contents}
-    path = next(iter(contents))
-    try:
-        for path, data in contents.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_dir():
-                raise IsADirectoryError(f"{path} is a folder")
-            waiting[path].write_bytes(data)
-        for path, part in waiting.items():
-            os.replace(part, path)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise Refused(
-            "a folder that can be written to", f"{path} ({reason})", "choose another place for the sheet"
-        ) from error
-    finally:
-        for part in waiting.values():
-            if part.exists():
-                part.unlink()
 
 
 def _nearest_ink_mm(manifest: Manifest) -> float:
