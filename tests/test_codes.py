@@ -28,7 +28,7 @@ def trouble(markers=8, module_px=4.0, **figures):
     """What `measure` says of these figures, of a 100 mm design."""
     borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, module_px, True)
     found = MarkersInView({i: borders for i in PIECE_IDS[:markers]}, (), ())
-    fit = PageFit(np.eye(3), np.eye(8), 0.1, 0.05, PIECE_IDS[:markers])
+    fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[:markers])
     return measure._trouble(Geometry(**(GOOD | figures)), fit, found, SURFACE)
 
 

@@ -33,7 +33,7 @@ def worst_error_mm(found, true):
 def test_exact_corners_give_the_homography_back():
     true = view(40, 15, 600, 20)
     fit = fit_page(noisy_corners(true, 0), marker_corners())
-    assert worst_error_mm(fit.px_from_mm, true) < 1e-6 and fit.residual_px < 1e-6
+    assert worst_error_mm(fit.px_from_mm, true) < 1e-6 and fit.residual_mm < 1e-6
     assert fit.inlier_ids == PIECE_IDS
 
 

@@ -85,7 +85,7 @@ def write_together(contents: dict[Path, bytes]) -> None:
     path = next(iter(contents))
     try:
         for path, data in contents.items():
-            make_folder(path.parent)
+            path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_dir():
                 raise IsADirectoryError(f"{path} is a folder")
             waiting[path].write_bytes(data)
@@ -96,7 +96,8 @@ def write_together(contents: dict[Path, bytes]) -> None:
         raise Refused("a folder that can be written to", f"{path} ({reason})", "choose another --out") from error
     finally:
         for part in waiting.values():
-            part.unlink(missing_ok=True)
+            if part.exists():
+                part.unlink()
 
 
 def _replace(part: Path, out: Path) -> None:

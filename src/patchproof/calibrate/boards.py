@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.detect import luminance
-from patchproof.photo.read import FORMATS, list_photos, read_photo
+from patchproof.photo.detect import detector_settings, luminance, printed_markers
+from patchproof.photo.read import list_photos, read_photo, readable_formats
 from patchproof.sheets.board import Board
 from patchproof.strict import Refused
 
@@ -112,9 +112,9 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
 
     Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
     """
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    dictionary = printed_markers(board.dictionary)
     light = np.clip(luminance(srgb) * 255 + 0.5, 0, 255).astype(np.uint8)
-    quads, names, _ = cv2.aruco.ArucoDetector(dictionary, _settings()).detectMarkers(light)
+    quads, names, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings()).detectMarkers(light)
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none
@@ -128,21 +128,12 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     return np.asarray(ids).reshape(-1), np.asarray(corners, float).reshape(-1, 2) + 0.5, len(quads)
 
 
-def _settings():
-    """Those of `photo.detect`: the defaults lose most markers that are blurred by a third of a module."""
-    settings = cv2.aruco.DetectorParameters()
-    settings.perspectiveRemovePixelPerCell = 8
-    settings.perspectiveRemoveIgnoredMarginPerCell = 0.3
-    settings.adaptiveThreshConstant = 3
-    return settings
-
-
 def _tags(path: Path) -> tuple[int, str]:
     """(EXIF orientation, maker and model) as the file has them."""
     from PIL import Image
 
     try:
-        with Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN]) as image:
+        with Image.open(path, formats=readable_formats()) as image:
             exif = image.getexif()
             words = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
             return int(exif.get(_ORIENTATION, 1)), " ".join(word for word in words if word)

@@ -3,7 +3,7 @@
 In: linear light as photographed and as promised, media-relative (paper = 1). Out: `ColorFit`. The ladder: with at
 least eight usable swatches a full affine map (12 numbers: gains, channel mixing and a veil), fitted robustly; else
 per channel from paper and ink. Either takes out light and camera; what no affine map explains stays, and that is what
-a colour difference should measure.
+a color difference should measure.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def affine12(seen: np.ndarray, promised: np.ndarray) -> ColorFit | None:
         return None
     # errors count as the eye sees them: steps of code values are finer in the dark
     eye = 1 / (np.maximum(seen.mean(1), 0) + 0.05) ** 0.6
-    weight = np.ones(len(seen))
+    weight, seen_from_promised = np.ones(len(seen)), np.zeros((3, 4))
     for turn in range(30):
         w = (eye * np.sqrt(weight))[:, None]
         seen_from_promised = np.linalg.lstsq(rows * w, seen * w, rcond=None)[0].T

@@ -69,15 +69,11 @@ def find_sheet(
 
 def _still_wanted(srgb, wanted: Set[int], found: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], Box]:
     """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
-    sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
-    if len(sure) < 2:  # one marker says too little about where the others are
+    if sum(b.fitted for b in found.markers.values()) < 2:  # one marker says too little about where the others are
         return wanted, whole(srgb)
-    try:
-        px_from_mm = fit_page(sure, corners_mm).px_from_mm
-    except (CannotJudge, np.linalg.LinAlgError):
+    quads = _predicted(srgb, found, {i: corners_mm[i] for i in wanted}, corners_mm)
+    if quads is None:
         return wanted, whole(srgb)
-    quads = {i: apply_homography(px_from_mm, np.asarray(corners_mm[i])) for i in wanted}
-    quads = {i: quad for i, quad in quads.items() if possible(quad) and _inside(quad, srgb)}
     wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
     if not wanted:
         return wanted, whole(srgb)
@@ -104,17 +100,11 @@ def complete(
 
 def _round(srgb, found: MarkersInView, corners_mm, printed) -> dict[int, Borders]:
     """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
-    sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
-    if not sure:
+    sure = {i for i, b in found.markers.items() if b.fitted}
+    predicted = _predicted(srgb, found, {i: mm for i, mm in corners_mm.items() if i not in sure}, corners_mm)
+    if not predicted:
         return {}
-    try:
-        px_from_mm = fit_page(sure, corners_mm).px_from_mm
-    except (CannotJudge, np.linalg.LinAlgError):
-        return {}
-    predicted = {i: apply_homography(px_from_mm, np.asarray(mm)) for i, mm in corners_mm.items() if i not in sure}
-    ids = sorted(i for i, quad in predicted.items() if possible(quad) and _inside(quad, srgb))
-    if not ids:
-        return {}
+    ids = sorted(predicted)
     cells = cells_of(printed, ids)
     borders = refine(srgb, np.array([predicted[i] for i in ids]), cells)
     return {
@@ -122,6 +112,16 @@ def _round(srgb, found: MarkersInView, corners_mm, printed) -> dict[int, Borders
         for i, b, code in zip(ids, borders, cells, strict=True)
         if b.fitted and _near(b, predicted[i]) and _reads(srgb, b, code)
     }
+
+
+def _predicted(srgb, found: MarkersInView, missing_mm, corners_mm) -> dict[int, np.ndarray] | None:
+    """Where the fitted markers say that missing ones lie in the picture, by id; None where they cannot tell."""
+    try:
+        px_from_mm = fit_page({i: b.corners_px for i, b in found.markers.items() if b.fitted}, corners_mm).px_from_mm
+    except (CannotJudge, np.linalg.LinAlgError):
+        return None
+    quads = {i: apply_homography(px_from_mm, np.asarray(mm)) for i, mm in missing_mm.items()}
+    return {i: quad for i, quad in quads.items() if possible(quad) and _inside(quad, srgb)}
 
 
 def _inside(quad: np.ndarray, srgb: np.ndarray) -> bool:

@@ -1,6 +1,6 @@
 """Find the printed markers in a photograph, coarse to fine.
 
-In: uint8 sRGB pixels and the ids that the sheet carries. Out: `MarkersInView`: corners in photo pixels (centres at .5,
+In: uint8 sRGB pixels and the ids that the sheet carries. Out: `MarkersInView`: corners in photo pixels (centers at .5,
 clockwise from the code's top-left) with what their borders show of blur and light, the ids of the same dictionary
 that are not the sheet's, and ids seen at two places. The detector looks at linear light: in code values blurred paper
 grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linear light read 45. The pyramid starts
@@ -171,13 +171,18 @@ def contrast_picture(srgb: np.ndarray) -> np.ndarray:
     return cv2.createCLAHE(3.0, (8, 8)).apply(code_picture(srgb))
 
 
-def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int, np.ndarray]]:
-    """Ids and corners of one gray picture, part of one whose longer side has `whole_px` pixels."""
+def detector_settings() -> cv2.aruco.DetectorParameters:
+    """Chosen on warped pages of known geometry: of 48 markers blurred by 0.3 modules the defaults find 37, these 46."""
     settings = cv2.aruco.DetectorParameters()
-    # chosen on warped pages of known geometry: of 48 markers blurred by 0.3 modules the defaults find 37, these 46
     settings.perspectiveRemovePixelPerCell = 8
     settings.perspectiveRemoveIgnoredMarginPerCell = 0.3
     settings.adaptiveThreshConstant = 3
+    return settings
+
+
+def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int, np.ndarray]]:
+    """Ids and corners of one gray picture, part of one whose longer side has `whole_px` pixels."""
+    settings = detector_settings()
     settings.minDistanceToBorder = 0
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
@@ -186,7 +191,7 @@ def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int
     if ids is None:
         return
     for marker_id, quad in zip(np.asarray(ids).reshape(-1), corners, strict=True):
-        # the detector counts from pixel centres: its 0 is our .5
+        # the detector counts from pixel centers: its 0 is our .5
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
         if possible(quad):
             yield int(marker_id), quad

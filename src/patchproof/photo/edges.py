@@ -45,18 +45,16 @@ class Borders:
 def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray) -> list[Borders]:
     """Fit all borders of M×4×2 rough corners (clockwise); `cells` M×n×n are the modules, rim included, 1 = paper."""
     rough, modules = np.asarray(corners_px, float), cells.shape[1]
-    behind = np.stack(
-        [cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1
-    )  # M×4×n, along each border
-    corners, state, reach_px = rough, None, np.full((len(rough), 4), np.inf)
+    # M×4×n, along each border
+    behind = np.stack([cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1)
+    corners, good, reach_px = rough, np.zeros(len(rough), bool), np.full((len(rough), 4), np.inf)
+    sigma = black = white = np.zeros((len(rough), 4))
     for _ in range(2):  # the second round samples across the borders that the first one found, no farther than needed
-        state = _fit_round(luminance, corners, behind, reach_px)
-        moved = np.linalg.norm(state[0] - rough, axis=2).max(1)
-        near = moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
-        good = near & state[1]
-        corners = np.where(good[:, None, None], state[0], rough)
-        reach_px = np.where(good[:, None], np.maximum(REACH_SIGMAS * state[2], LEAST_REACH_PX), np.inf)
-    _, _, sigma, black, white = state
+        met, good, sigma, black, white = _fit_round(luminance, corners, behind, reach_px)
+        moved = np.linalg.norm(met - rough, axis=2).max(1)
+        good &= moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
+        corners = np.where(good[:, None, None], met, rough)
+        reach_px = np.where(good[:, None], np.maximum(REACH_SIGMAS * sigma, LEAST_REACH_PX), np.inf)
     module = _module_px(corners, modules)
     return [
         Borders(
@@ -72,7 +70,7 @@ def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray
 
 
 def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Bilinear values of H×W or H×W×C at `... × 2` pixel positions (centres at .5); the rim is repeated."""
+    """Bilinear values of H×W or H×W×C at `... × 2` pixel positions (centers at .5); the rim is repeated."""
     where = [points[..., 1] - 0.5, points[..., 0] - 0.5]
     if image.ndim == 2:
         return map_coordinates(image, where, order=1, mode="nearest")

@@ -34,7 +34,7 @@ class Label:
 def label_of(manifest: Manifest) -> Label:
     """What the code on this manifest's page says."""
     if manifest.page_code is not None:
-        return parsed(manifest.page_code)
+        return Label(*manifest.page_code.split(":")[1:])
     return Label(manifest.sheet_id, manifest.design.sha256[:16] if manifest.design else manifest.kind)
 
 
@@ -64,14 +64,14 @@ def read_label(srgb: np.ndarray) -> Label | None:
 def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], label: Label) -> None:
     """`CannotJudge("wrong_sheet")` where the page under this homography carries another code than `label`."""
     scale = min(_PAGE_PX_PER_MM, _LARGEST_PX / max(page_mm))
-    said = read_label(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
-    if said is None or said == label:
+    read = read_label(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
+    if read is None or read == label:
         return
-    if said.sheet_id != label.sheet_id:
-        advice = f"its code says sheet {said.sheet_id}, the JSON is of {label.sheet_id}: name that sheet's JSON"
+    if read.sheet_id != label.sheet_id:
+        advice = f"its code says sheet {read.sheet_id}, the JSON is of {label.sheet_id}: name that sheet's JSON"
     else:
         advice = (
-            f"it is sheet {said.sheet_id} with another design: its code says {said.printed}, the JSON {label.printed}; "
+            f"it is sheet {read.sheet_id} with another design: its code says {read.printed}, the JSON {label.printed}; "
             "name the JSON that was written with this PDF"
         )
     raise CannotJudge("wrong_sheet", None, None, advice)

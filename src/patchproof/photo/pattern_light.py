@@ -1,7 +1,7 @@
 """The light of paper and ink from whole markers, for photographs too blurred to show either one unmixed.
 
-In: a photograph, its homography, the printed markers. Out: `PatternLight`. The printed
-cells are blurred as the photograph is, and every channel's linear light is regressed on them at the cells' centers:
+In: a photograph, its homography, the printed markers. Out: `PatternLight`. The printed cells are blurred as the
+photograph is, and every channel's linear light is regressed on them at the cells' centers:
 light = ink + (paper - ink) · pattern. At a blur of half a module no place shows pure paper or ink, and reading either
 one beside a border is off by a quarter of the contrast; the regression stays unbiased as long as the blur is known.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, local_scale
-from patchproof.photo.detect import cells_of
+from patchproof.photo.detect import cells_of, printed_markers
 from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE
 
@@ -42,9 +42,9 @@ def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
 ) -> PatternLight | None:
     """Paper, ink and blur of an uint8 photograph whose borders show `blur_px`; None where too few cells are in it."""
-    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    printed = printed_markers(dictionary)
     ids = sorted(corners_mm)
-    markers, seen = [], []
+    markers, lights = [], []
     for cells, corners in zip(cells_of(printed, ids), (corners_mm[i] for i in ids), strict=True):
         module_px = local_scale(px_from_mm, corners.mean(0))[0] * np.linalg.norm(corners[1] - corners[0]) / len(cells)
         points = apply_homography(px_from_mm, _centers_mm(corners, len(cells)))
@@ -52,8 +52,8 @@ def pattern_light(
         values = sample(srgb, points)
         usable &= (values < CLIPPED_CODE).all(1)
         markers.append((cells, module_px, usable))
-        seen.append(linear_from_srgb(values[usable] / 255.0))
-    light = np.concatenate(seen)
+        lights.append(linear_from_srgb(values[usable] / 255.0))
+    light = np.concatenate(lights)
     if len(light) < _LEAST_SAMPLES:
         return None
     fits = []
@@ -70,7 +70,8 @@ def pattern_light(
 
 def _regressed(pattern: np.ndarray, light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Median error, paper and ink; robust, since a glare or a thumb may cover a marker."""
-    rows, weight = np.column_stack([1 - pattern, pattern]), np.ones(len(pattern))
+    rows, weight, error = np.column_stack([1 - pattern, pattern]), np.ones(len(pattern)), np.zeros(len(pattern))
+    ink = paper = np.zeros(3)
     for _ in range(4):
         ink, paper = np.linalg.lstsq(rows * weight[:, None], light * weight[:, None], rcond=None)[0]
         error = np.linalg.norm(rows @ np.stack([ink, paper]) - light, axis=1)

@@ -1,7 +1,7 @@
 """A photograph file as upright 8-bit sRGB pixels, with its focal length where the camera wrote one.
 
 In: any still picture that Pillow reads as one of `FORMATS` (HEIC with the `heic` extra). Out: `Photo`. EXIF
-orientation is applied, an embedded colour profile (phones write Display P3) is converted to sRGB, alpha lies on
+orientation is applied, an embedded color profile (phones write Display P3) is converted to sRGB, alpha lies on
 white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, so that one bad file
 never stops a batch. Ignored on purpose: the DPI that a photograph claims, and sidecar files.
 """
@@ -47,7 +47,7 @@ def read_photo(path: str | Path) -> Photo:
         with warnings.catch_warnings():
             # oversized pictures get our own limit below; odd EXIF is not worth a word
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=_formats(Image)) as image:
+            with Image.open(path, formats=readable_formats()) as image:
                 pixels = image.width * image.height
                 if pixels > LARGEST_PX:
                     raise _unreadable(
@@ -60,9 +60,7 @@ def read_photo(path: str | Path) -> Photo:
                 srgb = np.ascontiguousarray(_eight_bit_rgb(_in_srgb(upright)))
     except CannotJudge:
         raise
-    except (
-        Exception
-    ) as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...); all mean the same here
+    except Exception as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...), all alike here
         raise _unreadable(_why(path, error)) from error
     diagonal_px = math.hypot(*srgb.shape[:2])
     return Photo(srgb, focal_35mm / _DIAGONAL_35MM * diagonal_px if focal_35mm else None, path)
@@ -89,16 +87,19 @@ def pictures_in(folder: Path) -> list[Path]:
     return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
 
 
-def _formats(image_module) -> list[str]:
-    image_module.init()
-    return [name for name in FORMATS if name in image_module.OPEN]
+def readable_formats() -> list[str]:
+    """Those of `FORMATS` that this Pillow reads."""
+    from PIL import Image
+
+    Image.init()
+    return [name for name in FORMATS if name in Image.OPEN]
 
 
 def _allow_heic(path: Path) -> None:
     if path.suffix.lower() not in {".heic", ".heif"}:
         return
     try:
-        import pillow_heif
+        import pillow_heif  # type: ignore[reportMissingImports]  # an extra
     except ImportError:
         advice = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
         raise _unreadable(advice) from None

@@ -1,6 +1,6 @@
-"""From marker corners to millimetres: the homography of a flat sheet, how sure it is, and the patch cut out flat.
+"""From marker corners to millimeters: the homography of a flat sheet, how sure it is, and the patch cut out flat.
 
-In: corners in pixels and in page millimetres, by marker id. Out: `PageFit`. Least median of squares finds the corners
+In: corners in pixels and in page millimeters, by marker id. Out: `PageFit`. Least median of squares finds the corners
 that agree (it breaks down when half of them lie), Gauss-Newton on the reprojection error of those gives the
 homography and its covariance. The uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn
 from that covariance. Few corners say little of their own noise, so what is made of it is wider (Student's t); a single
@@ -37,22 +37,19 @@ _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is ave
 
 @dataclass(frozen=True)
 class PageFit:
-    """`px_from_mm` 3×3, the 8×8 covariance of its first entries, residuals of the corners that agree, their ids."""
+    """`px_from_mm` 3×3, the 8×8 covariance of its first entries, what the corners that agree miss, and their ids."""
 
     px_from_mm: np.ndarray
     covariance: np.ndarray
-    residual_px: float
     residual_mm: float
     inlier_ids: tuple[int, ...]
 
 
 def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]) -> PageFit:
     """The homography page mm → photo px from all markers that both mappings know; `CannotJudge` where there is none."""
-    ids = sorted(corners_px.keys() & corners_mm.keys())
+    ids, px, mm = common_corners(corners_px, corners_mm)
     if not ids:
         raise CannotJudge("too_few_markers", 0, 1, "no marker of this sheet is in view: show the whole patch")
-    px = np.concatenate([np.asarray(corners_px[i], float) for i in ids])
-    mm = np.concatenate([np.asarray(corners_mm[i], float) for i in ids])
     keep = _agreeing(mm, px) if len(ids) > 2 else np.ones(len(px), bool)
     homography = fit_homography(mm[keep], px[keep])
     for _ in range(3):
@@ -67,15 +64,37 @@ def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.n
     )
 
 
+def common_corners(
+    corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]
+) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+    """(ids, px 4N×2, mm 4N×2) of the markers that both mappings know."""
+    ids = tuple(sorted(corners_px.keys() & corners_mm.keys()))
+    px, mm = (np.array([corners[i] for i in ids], float).reshape(-1, 2) for corners in (corners_px, corners_mm))
+    return ids, px, mm
+
+
 def corner_uncertainty_mm(fit: PageFit, rect_mm) -> float:
     """95 % point of the largest error among the rectangle's corners in page mm, from 1000 draws of the covariance."""
     corners = rect_corners(rect_mm)
-    rows = _jacobian(fit.px_from_mm, corners)  # 8×8, px by parameters
-    to_mm = _mm_from_px(fit.px_from_mm, corners)
+    jacobian = _jacobian(fit.px_from_mm, corners)
+    return largest_shift_mm(root_of(fit.covariance), jacobian.T, _mm_from_px(fit.px_from_mm, corners))
+
+
+def largest_shift_mm(root: np.ndarray, px_by_parameter: np.ndarray, mm_from_px: np.ndarray) -> float:
+    """95 % point of the largest error of C points, from 1000 draws of P parameters whose covariance is root · rootᵀ, by
+    the derivatives P×2C and C×2×2.
+    """
     # a fixed generator: the same photo must give the same bytes
-    draws = np.random.default_rng(0).standard_normal((1000, 8)) @ _root(fit.covariance).T
-    shift_mm = np.einsum("cij,ncj->nci", to_mm, (draws @ rows.T).reshape(-1, 4, 2))
+    draws = np.random.default_rng(0).standard_normal((1000, len(root))) @ root.T
+    shift_mm = np.einsum("cij,ncj->nci", mm_from_px, (draws @ px_by_parameter).reshape(len(draws), -1, 2))
     return float(np.percentile(np.linalg.norm(shift_mm, axis=2).max(1), 95))
+
+
+def covariance_of(jacobian: np.ndarray, noise_px: float, rcond: float = 1e-15) -> np.ndarray:
+    """P×P of least-squares parameters by their Jacobian N×P of pixels; columns are scaled before inverting."""
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+    inverse = np.linalg.pinv(jacobian / scale, rcond=rcond)
+    return noise_px**2 * (inverse @ inverse.T) / np.outer(scale, scale)
 
 
 def view_uncertainty(fit: PageFit, matrix_px: np.ndarray, point_mm) -> tuple[float, float]:
@@ -85,12 +104,12 @@ def view_uncertainty(fit: PageFit, matrix_px: np.ndarray, point_mm) -> tuple[flo
     spread is that of the pose one standard deviation off along each axis of the homography's covariance.
     """
 
-    def seen(entries) -> np.ndarray:
+    def view_of(entries: np.ndarray) -> np.ndarray:
         homography = np.append(entries, 1.0).reshape(3, 3)
         return np.array(view_angles(plane_pose(homography, matrix_px), point_mm))[[0, 2]]
 
     entries = fit.px_from_mm.ravel()[:8]
-    apart = np.array([seen(entries + axis) - seen(entries - axis) for axis in _root(fit.covariance).T]) / 2
+    apart = np.array([view_of(entries + axis) - view_of(entries - axis) for axis in root_of(fit.covariance).T]) / 2
     apart[:, 0] = (apart[:, 0] + 90) % 180 - 90  # half of an angle's difference
     azimuth, distance = 1.96 * np.linalg.norm(apart, axis=0)
     return float(azimuth), float(distance)
@@ -168,7 +187,7 @@ def _jacobian(homography, mm) -> np.ndarray:
 
 
 def _mm_from_px(homography, mm) -> np.ndarray:
-    """N×2×2 derivatives of page millimetres by photo pixels at page points."""
+    """N×2×2 derivatives of page millimeters by photo pixels at page points."""
     ones = np.column_stack([mm, np.ones(len(mm))])
     u, v, w = (ones @ homography.T).T
     place = np.stack([u / w, v / w], 1)
@@ -183,16 +202,17 @@ def _with_figures(homography, mm, px, ids) -> PageFit:
     if freedom > 0:
         student = stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
         noise = max(CORNER_NOISE_PX, float(np.sqrt((residual**2).sum() / freedom) * student))
-    jacobian = _jacobian(homography, mm)
-    scale = np.linalg.norm(jacobian, axis=0)
-    inverse = np.linalg.pinv(jacobian / scale)
-    covariance = noise**2 * (inverse @ inverse.T) / np.outer(scale, scale)
-    residual_mm = np.linalg.norm(np.einsum("nij,nj->ni", _mm_from_px(homography, mm), residual), axis=1)
-    root_mean = lambda lengths: float(np.sqrt(np.mean(lengths**2)))  # noqa: E731
-    return PageFit(homography, covariance, root_mean(np.linalg.norm(residual, axis=1)), root_mean(residual_mm), ids)
+    covariance = covariance_of(_jacobian(homography, mm), noise)
+    return PageFit(homography, covariance, rms_length_mm(_mm_from_px(homography, mm), residual), ids)
 
 
-def _root(covariance) -> np.ndarray:
+def rms_length_mm(mm_from_px: np.ndarray, residual_px: np.ndarray) -> float:
+    """Of residuals N×2 px in millimeters, by the derivatives N×2×2."""
+    lengths = np.linalg.norm(np.einsum("nij,nj->ni", mm_from_px, residual_px), axis=1)
+    return float(np.sqrt(np.mean(lengths**2)))
+
+
+def root_of(covariance: np.ndarray) -> np.ndarray:
     """A matrix R with R Rᵀ = covariance, also where that is singular."""
     values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.maximum(values, 0))

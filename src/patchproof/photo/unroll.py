@@ -1,6 +1,6 @@
 """Sheets that are no plane in the photograph: curled paper is unrolled, a lens's bending taken out, where that pays.
 
-In: marker corners in pixels and page millimetres, and the flat fit's word that they do not agree. Out: `Unrolled`: a
+In: marker corners in pixels and page millimeters, and the flat fit's word that they do not agree. Out: `Unrolled`: a
 picture in which the sheet is flat, with its homography, so that whatever measures flat sheets measures this one. Two
 explanations are tried against the plane: paper rolled round a cylinder of any radius and direction, seen by a pinhole
 camera (nine parameters, the focal length held near the file's own where there is one), and a plane seen through a lens
@@ -23,7 +23,15 @@ from scipy.spatial.transform import Rotation
 
 from patchproof.geometry import apply_homography, fit_homography, plane_pose, rect_corners
 from patchproof.photo.edges import REACH, border_frame, meet
-from patchproof.photo.rectify import CORNER_NOISE_PX, PageFit
+from patchproof.photo.rectify import (
+    CORNER_NOISE_PX,
+    PageFit,
+    common_corners,
+    covariance_of,
+    largest_shift_mm,
+    rms_length_mm,
+    root_of,
+)
 
 FLAT_PX = 0.15  # rms per coordinate up to which a plane needs no better explanation: three times the corners' own noise
 PAYS = 0.5  # of the plane's residual
@@ -81,11 +89,9 @@ def explain(
     focal_px: float | None = None,
 ) -> Explained | None:
     """A cylinder or a lens that explains the corners in a picture of this size; None where a plane does as well."""
-    ids = sorted(corners_px.keys() & corners_mm.keys())
+    ids, px, mm = common_corners(corners_px, corners_mm)
     if len(ids) < LEAST_MARKERS:
         return None
-    px = np.concatenate([np.asarray(corners_px[i], float) for i in ids])
-    mm = np.concatenate([np.asarray(corners_mm[i], float) for i in ids])
     flat = fit_homography(mm, px)
     plain = _rms(apply_homography(flat, mm) - px)
     if not plain > FLAT_PX:
@@ -110,25 +116,24 @@ def unroll(
 
     The uncertainty is that of the corners of `rect_mm`.
     """
-    found = explain(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px)
-    if found is None:
+    explained = explain(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px)
+    if explained is None:
         return None
-    flat, mm, px, best = found.flat, found.mm, found.px, found.shape
+    flat, mm, px, best = explained.flat, explained.mm, explained.px, explained.shape
     grid = _net(sheet_mm)
     straight = fit_homography(grid, best.px(grid))
     error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
     picture = _straightened(srgb, best.px, straight, sheet_mm, margin_px=error)
-    residual_mm = np.linalg.norm(np.einsum("nij,nj->ni", _mm_from_px(best.px, mm), best.px(mm) - px), axis=1)
     # the covariance of the homography alone says nothing about the bend: `uncertainty_mm` has it all
-    ids = tuple(sorted(corners_px.keys() & corners_mm.keys()))
-    fit = PageFit(straight, np.zeros((8, 8)), best.rms_px * np.sqrt(2), _rms(residual_mm), ids)
+    ids = common_corners(corners_px, corners_mm)[0]
+    fit = PageFit(straight, np.zeros((8, 8)), rms_length_mm(_mm_from_px(best.px, mm), best.px(mm) - px), ids)
     return Unrolled(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best.radius_mm)
 
 
 def _best(flat, mm, px, size, focal_px) -> Shape:
     """The explanation that leaves least."""
-    found = [rolled(flat, mm, px, size, focal_px), through_lens(flat, mm, px, size)]
-    return min((one for one in found if one is not None), key=lambda one: one.rms_px)
+    paper, lens = rolled(flat, mm, px, size, focal_px), through_lens(flat, mm, px, size)
+    return lens if paper is None or lens.rms_px < paper.rms_px else paper
 
 
 def _chord_shift(shape: Shape, mm: np.ndarray) -> np.ndarray:
@@ -153,7 +158,7 @@ def rolled(flat, mm, px, size, focal_px) -> Shape | None:
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
 
     def project(p, points):
-        # p: rotation vector, the page centre in the camera (mm), log of focal / guess, bend, direction of the bend
+        # p: rotation vector, the page center in the camera (mm), log of focal / guess, bend, direction of the bend
         c, s = np.cos(p[8]), np.sin(p[8])
         x, y = ((points - center) @ [[c, -s], [s, c]]).T  # along the bend, along the rulings
         turn = p[7] * x / reach
@@ -195,25 +200,25 @@ def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
     by_depth = (moved[0] - moved[1]) / (0.02 * reach)
     x, y = at.T / reach
     form = [by_depth * (term * reach)[:, None] for term in (x * x, x * y, y * y)]
-    seen = apply_homography(flat, mm)
-    left = px - seen
-    u, v = ((seen - seen.mean(0)) / np.ptp(seen, axis=0).max()).T
+    plain = apply_homography(flat, mm)
+    left = px - plain
+    u, v = ((plain - plain.mean(0)) / np.ptp(plain, axis=0).max()).T
     ones, no = np.ones_like(u), np.zeros_like(u)
     plane = [ones, u, v, no, no, no, u * u, u * v], [no, no, no, ones, u, v, u * v, v * v]  # near homographies
     columns = [np.column_stack([np.array(plane[i]).T, *[f[:, i] for f in form]]) for i in (0, 1)]
     xx, xy, yy = np.linalg.lstsq(np.concatenate(columns), left.T.ravel(), rcond=1e-6)[0][8:]
     values, vectors = np.linalg.eigh([[xx, xy / 2], [xy / 2, yy]])
     order = np.argsort(-np.abs(values))
-    found = []
+    starts = []
     for i, sign in ((order[0], 1), (order[0], -1), (order[1], 1)):
         bend = sign * np.copysign(np.clip(abs(2 * values[i]), *_FIRST_BEND), values[i])
-        found.append((float(bend), float(np.arctan2(vectors[1, i], vectors[0, i]))))
-    return found
+        starts.append((float(bend), float(np.arctan2(vectors[1, i], vectors[0, i]))))
+    return starts
 
 
 def _projected(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
-    seen = points @ camera[:, :3].T + camera[:, 3]
-    return seen[:, :2] / seen[:, 2:]
+    image = points @ camera[:, :3].T + camera[:, 3]
+    return image[:, :2] / image[:, 2:]
 
 
 def _scales(start: np.ndarray) -> np.ndarray:
@@ -238,28 +243,23 @@ def through_lens(flat, mm, px, size) -> Shape:
 def _shape(project: Project, fit, mm, px, radius_mm) -> Shape:
     left = project(fit.x, mm) - px
     noise = max(CORNER_NOISE_PX, float(np.sqrt((left**2).sum() / (left.size - len(fit.x)))))
-    scale = np.maximum(np.linalg.norm(fit.jac, axis=0), 1e-12)
-    inverse = np.linalg.pinv(fit.jac / scale, rcond=1e-9)
-    return Shape(project, fit.x, noise**2 * (inverse @ inverse.T) / np.outer(scale, scale), _rms(left), radius_mm)
+    return Shape(project, fit.x, covariance_of(fit.jac, noise, 1e-9), _rms(left), radius_mm)
 
 
 def _uncertainty_mm(shape: Shape, corners: np.ndarray) -> float:
-    """95 % point of the largest corner error, from 1000 draws of the first-order spread."""
+    """Of the first-order spread."""
     here, rows = shape.px(corners), []
     spread = np.sqrt(np.maximum(np.diag(shape.covariance), 1e-30))
     for i, sigma in enumerate(spread):
         step = np.zeros(len(spread))
         step[i] = 0.1 * sigma
         rows.append((shape.project(shape.parameters + step, corners) - here).ravel() / (0.1 * sigma))
-    values, vectors = np.linalg.eigh(shape.covariance / np.outer(spread, spread))
-    root = spread[:, None] * vectors * np.sqrt(np.maximum(values, 0))
-    draws = np.random.default_rng(0).standard_normal((1000, len(spread))) @ root.T
-    shift = np.einsum("cij,ncj->nci", _mm_from_px(shape.px, corners), (draws @ rows).reshape(-1, len(corners), 2))
-    return float(np.percentile(np.linalg.norm(shift, axis=2).max(1), 95))
+    root = spread[:, None] * root_of(shape.covariance / np.outer(spread, spread))
+    return largest_shift_mm(root, np.array(rows), _mm_from_px(shape.px, corners))
 
 
 def _mm_from_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> np.ndarray:
-    """N×2×2 derivatives of page millimetres by pixels, by central differences over a tenth of a millimetre."""
+    """N×2×2 derivatives of page millimeters by pixels, by central differences over a tenth of a millimeter."""
     steps = 0.05 * np.eye(2)
     columns = [(project(mm + step) - project(mm - step)) / 0.1 for step in steps]
     return np.linalg.inv(np.stack(columns, -1))
@@ -276,12 +276,11 @@ def _straightened(srgb, project, px_from_mm, sheet_mm, margin_px: float) -> np.n
     left, top, width, height = sheet_mm
     on_sheet = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
     source = (project(mm[on_sheet]) - 0.5).astype(np.float32)
-    maps = [np.full(x.shape, -1, np.float32) for _ in range(2)]
-    for one, values in zip(maps, source.T, strict=True):
-        one[on_sheet.reshape(x.shape)] = values
-    part = cv2.remap(srgb, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    picture = srgb.copy()
     where = on_sheet.reshape(x.shape)
+    at = np.full((*x.shape, 2), -1, np.float32)
+    at[where] = source
+    part = cv2.remap(srgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    picture = srgb.copy()
     picture[low[1] : high[1], low[0] : high[0]][where] = part[where]
     return picture
 
