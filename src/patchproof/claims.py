@@ -104,18 +104,16 @@ def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[floa
 
 
 @lru_cache(maxsize=4096)
-def prediction_interval(successes: int, n: int, photos: int, confidence: float = CONFIDENCE) -> tuple[int, int]:
-    """Counts [lo, hi] that `photos` new images will show with the given confidence, after `successes` of `n`."""
+def prediction_interval(successes: int, n: int, photos: int) -> tuple[int, int]:
+    """Counts [lo, hi] that `photos` new images will show, after `successes` of `n`."""
     from scipy.stats import betabinom
 
     predictive = betabinom(photos, successes + 0.5, n - successes + 0.5)
-    tail = (1 - confidence) / 2
+    tail = (1 - CONFIDENCE) / 2
     return int(predictive.ppf(tail)), int(predictive.ppf(1 - tail))
 
 
-def paired_difference(
-    a: list[bool], b: list[bool], confidence: float = CONFIDENCE
-) -> tuple[float, tuple[float, float]]:
+def paired_difference(a: list[bool], b: list[bool]) -> tuple[float, tuple[float, float]]:
     """Rate of `a` minus rate of `b` on the same n ≥ 1 conditions, with Newcombe's paired interval (method 10)."""
     n = len(a)
     if n == 0 or n != len(b):
@@ -123,7 +121,7 @@ def paired_difference(
     both = sum(x and y for x, y in zip(a, b, strict=True))
     only_a, only_b = sum(a) - both, sum(b) - both
     neither = n - both - only_a - only_b
-    (low_a, high_a), (low_b, high_b) = wilson(sum(a), n, confidence), wilson(sum(b), n, confidence)
+    (low_a, high_a), (low_b, high_b) = wilson(sum(a), n), wilson(sum(b), n)
     rate_a, rate_b = sum(a) / n, sum(b) / n
     margins = (both + only_a) * (only_b + neither) * (both + only_b) * (only_a + neither)
     # φ corrected for continuity, only where it is positive (Newcombe's rule)
@@ -136,20 +134,16 @@ def paired_difference(
     return difference, (low, high)
 
 
-def independent_difference(
-    successes_a: int, n_a: int, successes_b: int, n_b: int, confidence: float = CONFIDENCE
-) -> tuple[float, tuple[float, float]]:
+def independent_difference(successes_a: int, n_a: int, successes_b: int, n_b: int) -> tuple[float, tuple[float, float]]:
     """Rate of a minus rate of b on different images, with Newcombe's interval of two Wilson scores."""
-    (low_a, high_a), (low_b, high_b) = wilson(successes_a, n_a, confidence), wilson(successes_b, n_b, confidence)
+    (low_a, high_a), (low_b, high_b) = wilson(successes_a, n_a), wilson(successes_b, n_b)
     rate_a, rate_b = successes_a / max(n_a, 1), successes_b / max(n_b, 1)
     difference = rate_a - rate_b
     low = difference - math.hypot(rate_a - low_a, high_b - rate_b)
     return difference, (low, difference + math.hypot(high_a - rate_a, rate_b - low_b))
 
 
-def clustered_mean(
-    values: Sequence[float], confidence: float = CONFIDENCE, draws: int = 10_000
-) -> tuple[float, tuple[float, float]]:
+def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]:
     """Mean of one figure per cluster with a percentile bootstrap over clusters: what is alike within a cluster (seeds
     and conditions of one object before one network) is not evidence of its own. The same values give the same
     interval. Needs LEAST_CLUSTERS: of fewer it would claim far too much (of one, certainty), and of ten it covers
@@ -159,8 +153,8 @@ def clustered_mean(
 
     if len(values) < LEAST_CLUSTERS:
         raise ValueError(f"expected at least {LEAST_CLUSTERS} clusters, got {len(values)}")
-    means = resampled_means(np.asarray(values, float), draws)
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    means = resampled_means(np.asarray(values, float), 10_000)
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(np.mean(values)), (float(low), float(high))
 
 

@@ -1,4 +1,4 @@
-"""Colour maths: sRGB ↔ linear light ↔ CIELAB, and the colour difference CIEDE2000.
+"""Color maths: sRGB ↔ linear light ↔ CIELAB, and the color difference CIEDE2000.
 
 In and out: numpy arrays or torch tensors with the channels in the *last* axis (`... × 3`), or any shape where a
 function works per value. `*_srgb` is display-encoded in [0, 1], `*_linear` is light relative to sRGB white. CIELAB is
@@ -72,7 +72,7 @@ def tinted_white(light: np.ndarray, b: np.ndarray) -> np.ndarray:
 def ciede2000(lab_a, lab_b):
     """ΔE00 between two `... × 3` CIELAB arrays; eqs. 2-22 of Sharma et al., same symbols."""
     xp = _library(lab_a)
-    tiny = 1e-12  # inside square roots: a finite gradient (0) where two colours are equal
+    tiny = 1e-12  # inside square roots: a finite gradient (0) where two colors are equal
     L1, a1, b1 = lab_a[..., 0], lab_a[..., 1], lab_a[..., 2]
     L2, a2, b2 = lab_b[..., 0], lab_b[..., 1], lab_b[..., 2]
     C_bar = (xp.sqrt(a1**2 + b1**2 + tiny) + xp.sqrt(a2**2 + b2**2 + tiny)) / 2

@@ -1,11 +1,11 @@
 """Poses, pinhole cameras and homographies, in float64 numpy.
 
-Frames. World: millimetres, right-handed, y up, origin at the centre of the object's bounding box. Camera: x right, y
-down, z forward. Page and piece: millimetres, x right, y down. Image: pixels, pixel centres at .5. `camera_from_world`
+Frames. World: millimeters, right-handed, y up, origin at the center of the object's bounding box. Camera: x right, y
+down, z forward. Page and piece: millimeters, x right, y down. Image: pixels, pixel centers at .5. `camera_from_world`
 is 4×4 and `camera_from_world @ [X, 1]` is the point as the camera sees it; names say frame to frame, right to left.
 Left out on purpose: lens distortion. It is applied only where a camera file has it.
 
-Source of the homography's meaning and the normalised DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1
+Source of the homography's meaning and the normalized DLT: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.1
 and 8.1.
 """
 
@@ -62,7 +62,7 @@ def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
 
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
-    """3×3 from plane millimetres (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin."""
+    """3×3 from plane millimeters (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin."""
     pose = camera_from_world @ world_from_plane
     return normalized(matrix_px @ pose[:3, [0, 1, 3]])
 
@@ -92,7 +92,7 @@ def apply_homography(homography, points) -> np.ndarray:
 
 
 def fit_homography(source, target) -> np.ndarray:
-    """Least-squares homography source → target from N ≥ 4 point pairs (normalised DLT); no outliers are expected."""
+    """Least-squares homography source → target from N ≥ 4 point pairs (normalized DLT); no outliers are expected."""
     source, target = np.asarray(source, float), np.asarray(target, float)
     to_a, to_b = _conditioner(source), _conditioner(target)
     a, b = apply_homography(to_a, source), apply_homography(to_b, target)
@@ -148,7 +148,7 @@ def rect_corners(rect) -> np.ndarray:
 
 
 def _conditioner(points) -> np.ndarray:
-    """Similarity that centres points and brings them to mean distance √2 (Hartley's conditioning)."""
+    """Similarity that centers points and brings them to mean distance √2 (Hartley's conditioning)."""
     center = points.mean(0)
     spread = np.sqrt(2) / max(np.linalg.norm(points - center, axis=1).mean(), 1e-300)
     return np.array([[spread, 0, -spread * center[0]], [0, spread, -spread * center[1]], [0, 0, 1.0]])

@@ -51,7 +51,6 @@ class Calibration:
 
     printer: Printer
     choice: Choice
-    readings: tuple[Reading, ...]
     warnings: tuple[str, ...]
 
 
@@ -101,7 +100,7 @@ def calibrate_chart(
         "photographs": [_row(reading, error) for reading, error in zip(readings, agreement, strict=True)],
         "uncertainty": f"mean ΔE00 {choice.chosen.error:.2f} of {choice.held_out} held-out colors of the chart",
     }
-    return Calibration(printer_of(name, choice.predict, provenance), choice, tuple(readings), tuple(warnings))
+    return Calibration(printer_of(name, choice.predict, provenance), choice, tuple(warnings))
 
 
 def prints_of(paths: Sequence[Path]) -> list[list[Path]]:

@@ -1,8 +1,8 @@
-"""Meshes: what the object looks like, in millimetres.
+"""Meshes: what the object looks like, in millimeters.
 
 In: parts, read by `load_mesh` or made by code. Out: one triangle list in the scene's frame
-with per-corner texture coordinates, normals and colours, and warnings that say what was assumed.
-Faces that cannot be drawn (NaN corners, no area) are left out; size and centre are those of the faces that are drawn.
+with per-corner texture coordinates, normals and colors, and warnings that say what was assumed.
+Faces that cannot be drawn (NaN corners, no area) are left out; size and center are those of the faces that are drawn.
 Left out on purpose: closed surfaces. A renderer needs no inside, so open, non-manifold and loose triangles will do.
 """
 
@@ -18,7 +18,7 @@ from patchproof.strict import Refused
 
 @dataclass(frozen=True)
 class Material:
-    """A base colour in linear light and, where there is one, a texture as uint8 H×W×3 sRGB; they multiply as light."""
+    """A base color in linear light and, where there is one, a texture as uint8 H×W×3 sRGB; they multiply as light."""
 
     name: str
     base_color_linear: tuple[float, float, float]
@@ -39,13 +39,11 @@ class Part:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle list; the colour of a point is texture (as light) · base colour · corner colour."""
+    """A triangle list; the color of a point is texture (as light) · base color · corner color."""
 
-    vertices: np.ndarray  # float64 V×3: mm, right-handed, y up, origin at the bounding box's centre
+    vertices: np.ndarray  # float64 V×3: mm, right-handed, y up, origin at the bounding box's center
     faces: np.ndarray  # int64 F×3, counter-clockwise seen from outside
-    corner_uv: (
-        np.ndarray
-    )  # float32 F×3×2: u right, v down from the texture's top-left, in textures (wraps); 0 where none
+    corner_uv: np.ndarray  # float32 F×3×2: u right, v down from the texture's top-left (wraps); 0 where none
     corner_normal: np.ndarray  # float32 F×3×3 unit: the file's where it has them, else the face's own
     corner_color_linear: np.ndarray  # float32 F×3×3; 1 where none
     face_material: np.ndarray  # int64 F, into materials
@@ -54,12 +52,12 @@ class Mesh:
 
 
 def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:
-    """One mesh of several parts, centred, its longest extent `length_mm`; parts may share a Material object.
+    """One mesh of several parts, centered, its longest extent `length_mm`; parts may share a Material object.
 
     Faces with NaN or infinite corners and faces without area are left out with a warning; refused where none is left.
     """
     vertices, faces, owner = _joined(parts)
-    finite = np.isfinite(vertices).all(1)
+    finite = np.all(np.isfinite(vertices), axis=1)
     whole = finite[faces].all(1)
     # everything is first divided by the largest coordinate, so that neither 1e-200 nor 1e300 over- or underflows
     size = np.abs(vertices[faces[whole]]).max(initial=0.0)
@@ -118,7 +116,7 @@ def _face_normals(unit: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _corners(part: Part, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(uv F×3×2, normals F×3×3, colours F×3×3) of a part's corners, float32."""
+    """(uv F×3×2, normals F×3×3, colors F×3×3) of a part's corners, float32."""
     count = len(part.faces)
     uv = np.zeros((count, 3, 2), np.float32)
     if part.uv is not None:
@@ -140,3 +138,31 @@ def _compact(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     used = np.zeros(count, bool)
     used[faces] = True
     return np.flatnonzero(used), (np.cumsum(used) - 1)[faces]
+
+
+def topology_warnings(parts: Sequence[Part]) -> list[str]:
+    """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
+    loose = crowded = edges = 0
+    for part in parts:
+        corners = _places(part.vertices)[part.faces]
+        pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+        count = np.unique(pairs[:, 0] * (len(part.vertices) + 1) + pairs[:, 1], return_counts=True)[1]
+        loose += np.count_nonzero(count == 1)
+        crowded += np.count_nonzero(count > 2)
+        edges += len(count)
+    warnings = []
+    if edges > 5 and loose > 0.9 * edges:  # more than two triangles, hardly an edge shared
+        warnings.append("the mesh is a soup of loose triangles; each is drawn as it is")
+    if crowded:
+        warnings.append(f"{crowded} edges belong to more than two faces (not a manifold); faces are drawn as they are")
+    return warnings
+
+
+def _places(vertices: np.ndarray) -> np.ndarray:
+    """A number per vertex, equal for equal positions; hashed, since sorting rows would take longer than loading."""
+    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)
+    with np.errstate(over="ignore"):
+        key = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+        key = (key ^ (key >> np.uint64(29)) ^ bits[:, 1]) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ (key >> np.uint64(32)) ^ bits[:, 2]) * np.uint64(0x94D049BB133111EB)
+    return np.unique(key, return_inverse=True)[1]

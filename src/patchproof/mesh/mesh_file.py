@@ -1,13 +1,13 @@
 """Mesh files: OBJ (with MTL), GLB, glTF, PLY and STL turned into parts, and what had to be assumed on the way.
 
 In: a file and the rotation into the world's axes. Out: parts with the scene graph's transforms applied, and warnings.
-Colours: a glTF base colour and COLOR_0 are linear light, as its specification says; an OBJ's Kd and the vertex colours
-of OBJ and PLY are taken as sRGB, as their exporters write them. Vertex colours multiply the material in glTF; elsewhere
+Colors: a glTF base color and COLOR_0 are linear light, as its specification says; an OBJ's Kd and the vertex colors
+of OBJ and PLY are taken as sRGB, as their exporters write them. Vertex colors multiply the material in glTF; elsewhere
 they stand for a missing texture. A texture's alpha is dropped: what it would let shine through is drawn opaque.
 Refused: a file that cannot be parsed, and a texture that the file names but that is missing or broken.
 Left out on purpose: metal, roughness, emission, normal maps, transparency, skins and animation.
 
-trimesh parses. Its loaders are called below its `Trimesh` class, which would round colours to 8 bits and make up
+trimesh parses. Its loaders are called below its `Trimesh` class, which would round colors to 8 bits and make up
 normals that the file does not have; they keep silent about missing files and invent a 2×2 image; both are looked for.
 """
 
@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import linear_from_srgb
-from patchproof.mesh.mesh import Material, Part
+from patchproof.mesh.mesh import Material, Part, topology_warnings
 from patchproof.strict import Refused
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
-GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5: what an object without colour is taken to be
+GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5: what an object without color is taken to be
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -46,7 +46,7 @@ def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[Part], lis
     ]
     if not parts:
         raise Refused("a mesh with faces", f"none in {path.name}", "export the object as triangles")
-    return parts, [*dict.fromkeys(reader.warnings), *_topology_warnings(parts)]
+    return parts, [*dict.fromkeys(reader.warnings), *topology_warnings(parts)]
 
 
 class _Assets:
@@ -90,8 +90,7 @@ class _Reader:
             raise
         except Exception as error:  # the parsers raise whatever they stumble over
             self._refuse_missing()
-            reason = f"{type(error).__name__}: {error}"[:120]
-            got = f"{path.name} that cannot be read ({reason})"
+            got = f"{path.name} that cannot be read ({f'{type(error).__name__}: {error}'[:120]})"
             raise Refused(f"a mesh as {self.kind.upper()}", got, "export it again") from error
         self._refuse_missing()
         self._warn_about_gltf()
@@ -138,7 +137,7 @@ class _Reader:
             colors = None
         if colors is None or len(colors) == len(vertices):
             return Part(placed, faces, material, uv, normals, colors)
-        corners = faces.reshape(-1)  # one colour per face: give every face corners of its own
+        corners = faces.reshape(-1)  # one color per face: give every face corners of its own
         uv, normals = (None if array is None else array[corners] for array in (uv, normals))
         own = np.arange(len(corners)).reshape(-1, 3)
         return Part(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
@@ -153,9 +152,8 @@ class _Reader:
     def _refuse_missing(self):
         for name in dict.fromkeys(self.assets.missing):
             if not name.lower().endswith(".mtl"):
-                raise Refused(
-                    f"the file {name}, which {self.path.name} names", "none", f"put it into {self.path.parent}"
-                )
+                do = f"put it into {self.path.parent}"
+                raise Refused(f"the file {name}, which {self.path.name} names", "none", do)
             self.warnings.append(f"the material file {name} is missing")
         for name in self.assets.broken:
             raise Refused(f"the texture {name} of {self.path.name}", "no picture that can be read", "export it again")
@@ -172,14 +170,14 @@ class _Reader:
         uv = getattr(visual, "uv", None)
         if uv is None or len(uv) != count:
             return None
-        finite = np.isfinite(uv).all(1)
+        finite = np.all(np.isfinite(uv), axis=1)
         if not finite.all():
             self.warnings.append(f"{np.count_nonzero(~finite)} texture coordinates are not numbers and are taken as 0")
         u, v = np.asarray(uv, float)[:, :2].T
         return np.where(finite[:, None], np.column_stack([u, 1 - v]), 0.0)
 
     def _corner_colors(self, raw: dict, vertex_count: int, face_count: int) -> np.ndarray | None:
-        """Linear colours per vertex, or per face, or None."""
+        """Linear colors per vertex, or per face, or None."""
         colors = raw.get("vertex_colors")
         if colors is None:
             colors = getattr(raw.get("visual"), "vertex_attributes", {}).get("color")
@@ -228,7 +226,8 @@ class _Reader:
             return Material(name, GRAY_LINEAR if texture is None else WHITE, texture)
         if texture is not None and not np.any(kd):  # exporters write Kd 0 0 0 beside a map and mean "the map alone"
             kd = WHITE
-        return Material(name, tuple(linear_from_srgb(np.clip(np.asarray(kd, float), 0, 1)).tolist()), texture)
+        red, green, blue = linear_from_srgb(np.clip(np.asarray(kd, float), 0, 1)).tolist()
+        return Material(name, (red, green, blue), texture)
 
     def _gltf_base_color(self, source, primitive: dict, has_texture: bool) -> tuple[float, float, float]:
         """The factor as the file has it; trimesh's is rounded to 8 bits, and serves for old extensions only."""
@@ -236,16 +235,15 @@ class _Reader:
         metal_rough = material.get("pbrMetallicRoughness", {})
         named = metal_rough.get("baseColorTexture")
         if named is not None and not has_texture and getattr(source, "baseColorTexture", None) is None:
-            got = "none or a broken one"
-            raise Refused(
-                f"the texture of {source.name!s} in {self.path.name} as PNG, JPEG or WebP", got, "export it again"
-            )
+            expected = f"the texture of {source.name!s} in {self.path.name} as PNG, JPEG or WebP"
+            raise Refused(expected, "none or a broken one", "export it again")
         if named is not None and named.get("texCoord", 0) != 0:
             self.warnings.append("a texture asks for its second set of coordinates; the first is used")
         factor = metal_rough.get("baseColorFactor")
         if factor is None:
             factor = WHITE if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255
-        return tuple(float(value) for value in factor[:3])
+        red, green, blue = map(float, factor[:3])
+        return red, green, blue
 
     def _texture(self, image) -> np.ndarray:
         """An image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
@@ -308,33 +306,3 @@ def _normal_transform(rotation: np.ndarray) -> np.ndarray:
     a, b, c = rotation
     cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
     return -cofactors if np.linalg.det(rotation) < 0 else cofactors
-
-
-def _topology_warnings(parts: list[Part]) -> list[str]:
-    """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
-    loose = crowded = edges = 0
-    for part in parts:
-        corners = _places(part.vertices)[part.faces]
-        pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-        count = np.unique(pairs[:, 0] * (len(part.vertices) + 1) + pairs[:, 1], return_counts=True)[1]
-        loose, crowded, edges = (
-            loose + np.count_nonzero(count == 1),
-            crowded + np.count_nonzero(count > 2),
-            edges + len(count),
-        )
-    found = []
-    if edges > 5 and loose > 0.9 * edges:  # more than two triangles, hardly an edge shared
-        found.append("the mesh is a soup of loose triangles; each is drawn as it is")
-    if crowded:
-        found.append(f"{crowded} edges belong to more than two faces (not a manifold); faces are drawn as they are")
-    return found
-
-
-def _places(vertices: np.ndarray) -> np.ndarray:
-    """A number per vertex, equal for equal positions; hashed, since sorting rows would take longer than loading."""
-    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)
-    with np.errstate(over="ignore"):
-        key = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
-        key = (key ^ (key >> np.uint64(29)) ^ bits[:, 1]) * np.uint64(0xBF58476D1CE4E5B9)
-        key = (key ^ (key >> np.uint64(32)) ^ bits[:, 2]) * np.uint64(0x94D049BB133111EB)
-    return np.unique(key, return_inverse=True)[1]

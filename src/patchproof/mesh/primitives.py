@@ -29,21 +29,15 @@ def build(name: str, seed: int = 0) -> Mesh:
 
 
 def parts(name: str, seed: int = 0) -> list[Part]:
-    """The closed parts of one object in millimetres, standing on y = 0; three vertices of its own for every face."""
+    """The closed parts of one object in millimeters, standing on y = 0; three vertices of its own for every face."""
     if name not in _OBJECTS:
         raise Refused("the name of a primitive", f'"{name}"', nearest(name, _OBJECTS))
     return _OBJECTS[name](np.random.default_rng([names().index(name), seed]))
 
 
 WHITE, BLACK, STEEL, WOOD = (0.92, 0.92, 0.9), (0.1, 0.1, 0.11), (0.66, 0.67, 0.7), (0.65, 0.46, 0.28)
-PAINTS = (
-    (0.75, 0.16, 0.13),
-    (0.15, 0.3, 0.62),
-    (0.16, 0.45, 0.25),
-    (0.9, 0.72, 0.15),
-    (0.9, 0.9, 0.88),
-    (0.3, 0.31, 0.34),
-)
+RED, BLUE, GREEN, YELLOW = (0.75, 0.16, 0.13), (0.15, 0.3, 0.62), (0.16, 0.45, 0.25), (0.9, 0.72, 0.15)
+PAINTS = (RED, BLUE, GREEN, YELLOW, (0.9, 0.9, 0.88), (0.3, 0.31, 0.34))
 
 
 def _paint(rng, choices=PAINTS) -> np.ndarray:
@@ -62,25 +56,18 @@ def _mug(rng) -> list[Part]:
     outer = [(0, 0), (r * foot * 0.92, 0), (r * foot, h * 0.04), (r * (0.5 + foot / 2), h * 0.4), (r, h * 0.8), (r, h)]
     body = lathe([*outer, (r - wall, h), (r * foot - wall, h * 0.08), (0, h * 0.07)], "body", color)
     bow = _arc((r - wall / 2, h * 0.52), (rng.uniform(22, 32), h * rng.uniform(0.26, 0.34)), -90, 90, 13)
-    handle = tube(
-        [(0, y, z) for z, y in bow], rng.uniform(4.5, 6.5), "handle", color if rng.random() < 0.7 else _paint(rng)
-    )
-    return [body, handle]
+    thick, paint = rng.uniform(4.5, 6.5), color if rng.random() < 0.7 else _paint(rng)
+    return [body, tube([(0, y, z) for z, y in bow], thick, "handle", paint)]
 
 
 def _bottle(rng) -> list[Part]:
     h, r = rng.uniform(230, 310), rng.uniform(32, 42)
     neck, shoulder, cap = r * rng.uniform(0.3, 0.42), h * rng.uniform(0.52, 0.66), h * rng.uniform(0.05, 0.09)
-    glass = _paint(
-        rng, ((0.12, 0.3, 0.16), (0.34, 0.18, 0.08), (0.6, 0.75, 0.75), (0.15, 0.25, 0.5), (0.75, 0.2, 0.15))
-    )
-    slope = [
-        (neck + (r - neck) * (0.5 + 0.5 * np.cos(t)), shoulder + h * 0.16 * t / np.pi)
-        for t in np.linspace(0.4, np.pi, 6)
-    ]
-    body = lathe(
-        [(0, 0), (r * 0.93, 0), (r, h * 0.025), (r, shoulder), *slope, (neck, h - cap), (0, h - cap)], "body", glass
-    )
+    glasses = ((0.12, 0.3, 0.16), (0.34, 0.18, 0.08), (0.6, 0.75, 0.75), (0.15, 0.25, 0.5), (0.75, 0.2, 0.15))
+    glass, bends = _paint(rng, glasses), np.linspace(0.4, np.pi, 6)
+    slope = [(neck + (r - neck) * (0.5 + 0.5 * np.cos(t)), shoulder + h * 0.16 * t / np.pi) for t in bends]
+    side = [(0, 0), (r * 0.93, 0), (r, h * 0.025), (r, shoulder), *slope, (neck, h - cap), (0, h - cap)]
+    body = lathe(side, "body", glass)
     low, high = h * rng.uniform(0.1, 0.18), h * rng.uniform(0.38, 0.46)
     band = lathe([(0, low), (r + 0.4, low), (r + 0.4, high), (0, high)], "label", _paint(rng))
     lid = lathe([(0, h - cap), (neck + 1.5, h - cap), (neck + 1.5, h), (0, h)], "cap", _paint(rng))
@@ -88,12 +75,8 @@ def _bottle(rng) -> list[Part]:
 
 
 def _traffic_cone(rng) -> list[Part]:
-    h, base, foot, top = (
-        rng.uniform(450, 750),
-        rng.uniform(0.52, 0.62),
-        rng.uniform(0.19, 0.23),
-        rng.uniform(0.03, 0.05),
-    )
+    h, base = rng.uniform(450, 750), rng.uniform(0.52, 0.62)
+    foot, top = rng.uniform(0.19, 0.23), rng.uniform(0.03, 0.05)
     orange = _paint(rng, ((0.95, 0.4, 0.08), (0.9, 0.25, 0.1), (0.93, 0.55, 0.1)))
     thick = h * 0.04
 
@@ -170,16 +153,12 @@ def _chair(rng) -> list[Part]:
         made.append(box((leg, seat + back, leg), (-d / 2 + leg / 2, 0, z), "leg", frame))
     slats = int(rng.integers(1, 5))
     pitch = back * 0.8 / slats
+    slat = (leg * 0.6, pitch * (0.62 if slats > 1 else 1), w - leg)
     for i in range(slats):
-        y = seat + back * 0.17 + i * pitch
-        made.append(
-            box((leg * 0.6, pitch * (0.62 if slats > 1 else 1), w - leg), (-d / 2 + leg / 2, y, 0), "back", color)
-        )
+        made.append(box(slat, (-d / 2 + leg / 2, seat + back * 0.17 + i * pitch, 0), "back", color))
     if rng.random() < 0.5:
-        made += [
-            box((d - leg, leg * 0.6, leg * 0.6), (0, seat * 0.4, z), "rail", frame)
-            for z in (leg / 2 - w / 2, w / 2 - leg / 2)
-        ]
+        rail = (d - leg, leg * 0.6, leg * 0.6)
+        made += [box(rail, (0, seat * 0.4, z), "rail", frame) for z in (leg / 2 - w / 2, w / 2 - leg / 2)]
     return made
 
 
@@ -189,9 +168,8 @@ def _table_lamp(rng) -> list[Part]:
     metal = _paint(rng, (*PAINTS, STEEL, WOOD))
     cover = _paint(rng, ((0.93, 0.88, 0.75), (0.95, 0.93, 0.9), (0.8, 0.3, 0.25), (0.35, 0.5, 0.6)))
     stem = [(10 + belly * np.sin(np.pi * t) ** 2, h * (0.06 + 0.45 * t)) for t in np.linspace(0, 1, 9)]
-    base = lathe(
-        [(0, 0), (foot, 0), (foot, h * 0.025), (foot * 0.4, h * 0.05), *stem, (9, h * 0.9), (0, h * 0.9)], "base", metal
-    )
+    side = [(0, 0), (foot, 0), (foot, h * 0.025), (foot * 0.4, h * 0.05), *stem, (9, h * 0.9), (0, h * 0.9)]
+    base = lathe(side, "base", metal)
     profile = [(0, h - 6), (top - 4, h - 6), (shade - 4, low), (shade, low), (top, h), (0, h)]
     return [base, lathe(profile, "shade", cover)]
 
@@ -222,11 +200,8 @@ def _mailbox(rng) -> list[Part]:
     leg, bow, paint = rng.uniform(100, 220), rng.uniform(0.3, 0.5), _paint(rng, PAINTS[:4])
     arch = _arc((0, leg + y), (z / 2, z * bow), 0, 180, 13)
     made = [prism([(-z / 2, leg), (z / 2, leg), *arch], -x / 2, x / 2, "body", paint)]
-    made += [
-        box((50, leg + 5, 50), (a * (x / 2 - 30), 0, b * (z / 2 - 30)), "leg", paint * 0.8)
-        for a in (-1, 1)
-        for b in (-1, 1)
-    ]
+    for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        made.append(box((50, leg + 5, 50), (a * (x / 2 - 30), 0, b * (z / 2 - 30)), "leg", paint * 0.8))
     handle = box((x * 0.7, 30, 50), (0, leg + y * 0.98, z / 2 + 5), "handle", _paint(rng, (STEEL, BLACK)))
     slot = box((x * 0.8, y * rng.uniform(0.14, 0.22), 12), (0, leg + y * 0.74, z / 2), "slot", BLACK)
     card = box((x * rng.uniform(0.4, 0.7), y * rng.uniform(0.15, 0.3), 8), (0, leg + y * 0.35, z / 2), "card", WHITE)
@@ -251,16 +226,10 @@ def _watering_can(rng) -> list[Part]:
     inside = [(r * taper - wall, h), (r * taper - wall, h * 0.8), (0, h * 0.8)]
     body = lathe([(0, 0), (r, 0), (r, 8), (r * taper, h), *inside], "body", color)
     reach, rise = rng.uniform(190, 250), rng.uniform(1.0, 1.25)
-    path = [
-        (0, h * 0.2, r * 0.8),
-        (0, h * 0.32, r + reach * 0.3),
-        (0, h * 0.68, r + reach * 0.65),
-        (0, h * rise, r + reach),
-    ]
-    spout = tube(path, [26, 20, 15, 12], "spout", color)
-    rose = lathe(
-        [(0, 0), (13, 0), (rng.uniform(30, 42), 40), (0, 46)], "rose", color if rng.random() < 0.5 else _paint(rng)
-    )
+    path = [(h * 0.2, r * 0.8), (h * 0.32, r + reach * 0.3), (h * 0.68, r + reach * 0.65), (h * rise, r + reach)]
+    spout = tube([(0, y, z) for y, z in path], [26, 20, 15, 12], "spout", color)
+    side = [(0, 0), (13, 0), (rng.uniform(30, 42), 40), (0, 46)]
+    rose = lathe(side, "rose", color if rng.random() < 0.5 else _paint(rng))
     rose = moved(turned(rose, 0, rng.uniform(35, 60)), (0, h * rise - 8, r + reach - 8))
     bow = _arc((-r * taper * 0.75, h * 0.72), (rng.uniform(75, 105), h * rng.uniform(0.4, 0.55)), 60, 260, 15)
     return [body, spout, rose, tube([(0, y, z) for z, y in bow], rng.uniform(8, 12), "handle", color)]
@@ -272,16 +241,8 @@ def _hammer(rng) -> list[Part]:
     shaft = [(r * 0.95, 0), (r * 1.15, 12), (r, h * 0.3), (r * 0.72, h * 0.55), (r * 0.7, h)]
     handle = lathe([(0, 0), *shaft, (0, h)], "handle", grip)
     head, face, reach = h - r * 1.1, rng.uniform(15, 19), rng.uniform(48, 62)
-    profile = [
-        (0, -22),
-        (r, -22),
-        (r * 1.15, 0),
-        (face * 0.75, 18),
-        (face * 0.75, reach - 20),
-        (face, reach - 14),
-        (face, reach),
-        (0, reach),
-    ]
+    profile = [(0, -22), (r, -22), (r * 1.15, 0), (face * 0.75, 18), (face * 0.75, reach - 20)]
+    profile += [(face, reach - 14), (face, reach), (0, reach)]
     made = [handle, moved(turned(lathe(profile, "head", steel), 0, 90), (0, head, 0))]
     drop, back = rng.uniform(20, 45), reach * rng.uniform(1.1, 1.4)
     for side in (-1, 1):

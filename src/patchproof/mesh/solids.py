@@ -1,6 +1,6 @@
 """Closed solids from rings of points: lathe, tube, prism and box, as mesh parts with normals and texture coordinates.
 
-In: millimetres, y up, and an sRGB color. Out: parts wound counter-clockwise seen from outside, three vertices of their
+In: millimeters, y up, and an sRGB color. Out: parts wound counter-clockwise seen from outside, three vertices of their
 own for every face, so that normals and texture coordinates may jump between faces. Sides that bend by less than the
 crease angle shade smoothly. Texture coordinates are cylindrical on lathe and tube (caps: the disc inscribed in the
 texture) and planar on prism and box (each face direction sees the texture upright, once over the part).
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from patchproof.color import linear_from_srgb
 from patchproof.mesh.mesh import Material, Part
@@ -38,7 +39,8 @@ def skin(rings: Sequence[np.ndarray], name: str, srgb: Sequence[float], planar: 
     corners = np.array(triangles)
     normals = _corner_normals(corners)
     uv = _planar_uv(corners) if planar else np.array(uv)
-    material = Material(name, tuple(float(c) for c in linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1))))
+    red, green, blue = linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1)).tolist()
+    material = Material(name, (red, green, blue))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return Part(corners.reshape(-1, 3), faces, material, uv.reshape(-1, 2), normals.reshape(-1, 3))
 
@@ -51,22 +53,22 @@ def lathe(profile: Sequence[tuple[float, float]], name: str, srgb, around: int =
     return skin([(circle if r > 0 else circle[:1]) * r + up * y for r, y in profile], name, srgb)
 
 
-def tube(path: Sequence[Sequence[float]], radius, name: str, srgb, around: int = 12) -> Part:
+def tube(points: Sequence[Sequence[float]], radius: ArrayLike, name: str, srgb, around: int = 12) -> Part:
     """A round tube along N×3 points, flat ends; `radius` is one figure or one per point."""
-    path = np.asarray(path, float)
-    radius = np.broadcast_to(np.asarray(radius, float), len(path))
+    path = np.asarray(points, float)
+    radii = np.broadcast_to(np.asarray(radius, float), len(path))
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     angle = np.arange(around)[:, None] * 2 * np.pi / around
     rings, e1 = [path[:1]], np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
-    for point, direction, r in zip(path, along, radius, strict=True):
+    for point, direction, r in zip(path, along, radii, strict=True):
         e1 = e1 - direction * (e1 @ direction)  # carried along without twist
         e1 = e1 / np.linalg.norm(e1)
         rings.append(point + r * (np.cos(angle) * e1 + np.sin(angle) * np.cross(direction, e1)))
     return skin([*rings, path[-1:]], name, srgb)
 
 
-def prism(outline: Sequence[tuple[float, float]], x0: float, x1: float, name: str, srgb) -> Part:
+def prism(outline: ArrayLike, x0: float, x1: float, name: str, srgb) -> Part:
     """An outline of (z, y) in either direction, star-shaped about its middle, from x0 to x1."""
     z, y = np.asarray(outline, float).T
     if np.sum(z * np.roll(y, -1) - y * np.roll(z, -1)) > 0:  # seen from +x, z runs to the left
@@ -97,7 +99,8 @@ def turned(part: Part, axis: int, degrees: float) -> Part:
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix[i, i], matrix[i, j], matrix[j, i], matrix[j, j] = c, -s, s, c
-    return replace(part, vertices=part.vertices @ matrix.T, normals=part.normals @ matrix.T)
+    normals = None if part.normals is None else part.normals @ matrix.T
+    return replace(part, vertices=part.vertices @ matrix.T, normals=normals)
 
 
 def _pole_uv(rings, row: int, column: int) -> tuple[float, float]:

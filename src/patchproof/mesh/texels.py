@@ -1,10 +1,9 @@
 """Which texels faces cover: triangles in UV space drawn onto the texture's own grid.
 
 In: corners F×3×2 in texels (u times width, v times height; any integer, since textures wrap). Out: how many faces cover
-each texel, or how many texels of a mask each face shows. With `grow` = 0 a texel
-counts where its center lies in the face, and two faces that share an edge never count it twice; with `grow` = g it
-counts where its center is within g of the face in both x and y: 0.5 is every texel that the face touches, 1.5 one texel
-more, which is all that a bilinear look-up reads.
+each texel, or how many texels of a mask each face shows. With `grow` = 0 a texel counts where its center lies in the
+face, and two faces that share an edge never count it twice; with `grow` = g it counts where its center is within g of
+the face in both x and y: 0.5 is every texel that the face touches, 1.5 one more, all that a bilinear look-up reads.
 Left out on purpose: area-weighted coverage.
 """
 
@@ -26,7 +25,7 @@ def coverage(corners: np.ndarray, size: tuple[int, int], grow: float = 0.0) -> n
         turns, rest = np.divmod(stop - start, width)
         start = start % width
         end = start + rest
-        np.add.at(steps, (row, 0), turns.astype(np.int32) + (end > width))
+        np.add.at(steps, (row, np.zeros_like(row)), turns.astype(np.int32) + (end > width))
         np.add.at(steps, (row, start), 1)
         np.add.at(steps, (row, np.where(end > width, end - width, end)), -1)
     return np.cumsum(steps, axis=1, dtype=np.int32, out=steps)[:, :width]

@@ -71,12 +71,13 @@ def _atlas(vertices: np.ndarray, faces: np.ndarray, texels: int) -> tuple[np.nda
     # xatlas takes edges under 1e-4 for none, in any unit: at a length of 1000 that is 1e-7 of the object
     points = (points - points.min(0)) * (1000 / np.ptp(points, axis=0).max())
     part = _directions(points, own)
-    for _ in range(_ATTEMPTS):
-        uv, size = _packed(points, own, part, texels)
+    uv, size = _packed(points, own, part, texels)
+    for _ in range(_ATTEMPTS - 1):
         overlapping = face_counts(uv * size, coverage(uv * size, size) > 1)[0] > 0
         if not overlapping.any():
             break
         part[overlapping] = part.max() + 1  # xatlas lets a chart fold over itself now and then: cut the folds out
+        uv, size = _packed(points, own, part, texels)
     return uv.astype(np.float32), size
 
 
@@ -96,13 +97,13 @@ def _packed(points: np.ndarray, faces: np.ndarray, part: np.ndarray, texels: int
     atlas.generate(xatlas.ChartOptions(), packing)
     if not atlas.width or not atlas.height:
         raise Refused("a surface that can be unwrapped", f"{len(faces)} faces that cannot", "unwrap it by hand")
-    uv, size = np.zeros((len(faces), 3, 2)), np.array([atlas.width, atlas.height])
+    uv, width, height = np.zeros((len(faces), 3, 2)), int(atlas.width), int(atlas.height)
     for order, index in enumerate(np.unique(part)):
         _, corners, points_uv = atlas[order]
         uv[part == index] = points_uv[corners]
     # a margin of half a padding, because textures wrap: the left rim has the right one for a neighbor
-    uv = (uv * size + PADDING_TEXELS / 2) / (size + PADDING_TEXELS)
-    return uv, tuple(int(side) + PADDING_TEXELS for side in size)
+    padded = width + PADDING_TEXELS, height + PADDING_TEXELS
+    return (uv * [width, height] + PADDING_TEXELS / 2) / padded, padded
 
 
 def _directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -159,8 +160,8 @@ def _baked(corners: np.ndarray, colors_linear: np.ndarray, size: tuple[int, int]
             row, column = row.clip(0, height - 1), column.clip(0, width - 1)
             light[row, column] = (weight[..., None] * colors_linear[face]).sum(1)
             empty[row, column] = False
-    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return np.rint(255 * srgb_from_linear(light[tuple(nearest)].clip(0, 1))).astype(np.uint8)
+    y, x = np.asarray(distance_transform_edt(empty, return_distances=False, return_indices=True))
+    return np.rint(255 * srgb_from_linear(light[y, x].clip(0, 1))).astype(np.uint8)
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ that are not the sheet's, and ids seen at two places. The detector looks at line
 grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linear light read 45. The pyramid starts
 below 1000 px and stops at the level where every expected id has been found; only if some are missing are code values
 tried, local contrast (CLAHE) where the photo is dark, and twice the size where there are less than 4 megapixels to
-look at. Corners of all levels are then fitted in the full photograph (`edges`). Where the page's millimetres are known
+look at. Corners of all levels are then fitted in the full photograph (`edges`). Where the page's millimeters are known
 `complete.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.10 to 5.x will do.
 """
 

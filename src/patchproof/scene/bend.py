@@ -89,7 +89,7 @@ def curled(card: Placement, radius_mm: float) -> Placement:
         raise Refused("a flat card to curl", f"a piece on a {card.family}", "leave out bend")
     across, into = card.world_from_piece[:3, [0, 2]].T
     points, width = net(card.size_mm, _PIECE_NET) * [1, -1] + np.array(card.size_mm) / 2, card.size_mm[0]
-    scale = float(np.linalg.norm(across))  # a print may be larger than its millimetres say
+    scale = float(np.linalg.norm(across))  # a print may be larger than its millimeters say
     turn = (points[:, :1] - width / 2) * scale / radius_mm
     flat = np.concatenate([width / 2 + radius_mm / scale * np.sin(turn), points[:, 1:]], 1)
     lifted = radius_mm * (1 - np.cos(turn)) * into
@@ -169,7 +169,7 @@ def _fitted(chart: Chart, points_mm: np.ndarray, tangent: Frame, size_mm, spin_d
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    unit = float(np.hypot(*size_mm)) / 2  # millimetres and 1/mm are scaled to about 1
+    unit = float(np.hypot(*size_mm)) / 2  # millimeters and 1/mm are scaled to about 1
 
     def moved(x: np.ndarray) -> Chart:
         axes = Rotation.from_rotvec(x[:3] @ chart.axes).apply(chart.axes)

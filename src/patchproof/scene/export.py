@@ -1,7 +1,7 @@
 """The object with its textures as one GLB file that other programs open.
 
-In: a mesh and one uint8 sRGB texture per material. Out: glTF 2.0, in metres as its specification wants (the mesh is in
-millimetres), y up, textures as lossless PNG inside, repeating. trimesh writes it; nothing in it depends on the time, so
+In: a mesh and one uint8 sRGB texture per material. Out: glTF 2.0, in meters as its specification wants (the mesh is in
+millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes it; nothing in it depends on the time, so
 the same textures give the same bytes. Surfaces are matte, and seen from both sides as the renderer here sees them.
 Left out on purpose: the piece, lights and cameras. Material names are kept and may repeat; geometries are numbered.
 """

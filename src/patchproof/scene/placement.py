@@ -34,7 +34,7 @@ _SIDES = {  # side: (up, normal); right is up × normal
 
 @dataclass(frozen=True)
 class Placement:
-    """A piece on its place. Piece millimetres: from its top-left corner, x right, y down."""
+    """A piece on its place. Piece millimeters: from its top-left corner, x right, y down."""
 
     family: str  # "card", "cylinder" or "exponential"
     size_mm: tuple[float, float]
@@ -51,7 +51,7 @@ class Placement:
     warnings: tuple[str, ...] = ()
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
-        """World millimetres N×3 of piece points N×2; bilinear between a bent piece's vertices."""
+        """World millimeters N×3 of piece points N×2; bilinear between a bent piece's vertices."""
         frame = self.world_from_piece
         if self.is_flat:
             return points_mm @ frame[:3, :2].T + frame[:3, 3]

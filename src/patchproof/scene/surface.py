@@ -19,7 +19,7 @@ _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
 
 @dataclass(frozen=True)
 class Chart:
-    """A cylinder beside the surface, in millimetres along it: s across its axis, t along it, h outwards.
+    """A cylinder beside the surface, in millimeters along it: s across its axis, t along it, h outwards.
 
     `axes` 3×3 are rows across, along, normal at the origin (right-handed); `curvature` 1/mm is that of the cylinder, 0
     for a plane and negative where it bulges away from the normal. `right` is the piece's own right in (s, t).
@@ -62,7 +62,7 @@ class Chart:
 
 
 def net(size_mm: tuple[float, float], n: int) -> np.ndarray:
-    """n·n×2 piece points by rows from the top: millimetres right and up from the piece's middle."""
+    """n·n×2 piece points by rows from the top: millimeters right and up from the piece's middle."""
     width, height = size_mm
     across, along = np.meshgrid(np.linspace(-width / 2, width / 2, n), np.linspace(height / 2, -height / 2, n))
     return np.stack([across.ravel(), along.ravel()], 1)

@@ -1,6 +1,6 @@
 """The page's color chart: which colors, and where each one lies.
 
-In: how many swatches and their grid. Out: (rectangle in page millimetres, sRGB) pairs. The colors are the 8 corners
+In: how many swatches and their grid. Out: (rectangle in page millimeters, sRGB) pairs. The colors are the 8 corners
 of the RGB cube, an 8-step gray ramp (6 between black and white), 6 duplicates from which the noise of reading is
 estimated, and a low-discrepancy filling of the cube. Their places are shuffled once and for all, so that a gradient
 of light across the page is not mistaken for a color. All values are whole steps of 1/255, so that every printer
@@ -37,7 +37,7 @@ def chart_colors(count: int) -> list[Srgb]:
 
 
 def chart_swatches(grid: ChartGrid) -> tuple[SwatchRect, ...]:
-    """The chart's swatches row by row, in page millimetres."""
+    """The chart's swatches row by row, in page millimeters."""
     colors = chart_colors(grid.columns * grid.rows)
     order = hash_order(f"chart {ORDERS.get((grid.columns, grid.rows), 184)}", len(colors))
     pitch = grid.swatch_mm + grid.gap_mm

@@ -1,6 +1,6 @@
 """SHEET.json: the exact geometry of a printed sheet and the promise that was made before printing.
 
-Millimetres from the page's top-left corner, x right, y down; pages count from 1; rates in [0, 1]; unknown figures null.
+Millimeters from the page's top-left corner, x right, y down; pages count from 1; rates in [0, 1]; unknown figures null.
 The manifest is all that the judge gets to see of the design's making, so it carries the design's own pixels (PNG,
 base64) beside their SHA-256, which is taken over the raw RGB bytes, row by row.
 """
@@ -65,7 +65,7 @@ class Marker(Strict):
 
 
 class Swatch(Strict):
-    """One patch of known sRGB colour."""
+    """One patch of known sRGB color."""
 
     rect_mm: Rect
     srgb: tuple[Share, Share, Share]

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
 from patchproof.sheets.swatches import frame_swatches
 from patchproof.strict import Refused, nearest
@@ -142,6 +143,11 @@ def moved_marker(marker: PieceMarker, by: PointMm) -> PieceMarker:
     """The marker elsewhere."""
     a, b, c, d = ((round(x + by[0], 6), round(y + by[1], 6)) for x, y in marker.corners_mm)
     return PieceMarker(marker.id, (a, b, c, d))
+
+
+def printed(marker: PieceMarker, page: int = 1) -> Marker:
+    """The marker as the manifest carries it."""
+    return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
 
 
 def marker_rect(marker: PieceMarker) -> RectMm:

@@ -2,7 +2,7 @@
 
 In: a template with a [tiles] table, a piece and its design. Out: `TiledPages`. Page 1 carries the chart, the rulers and
 a plan of the tiles; each tile follows on a page of its own. The design's page is that of the first tile, and
-`design.rect_mm` and `cut_mm` lie in its millimetres, reaching beyond its edges; `tiles` carries every other page there.
+`design.rect_mm` and `cut_mm` lie in its millimeters, reaching beyond its edges; `tiles` carries every other page there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from patchproof.sheets.manifest import Marker, Swatch, Tile
 from patchproof.sheets.page import lay_out_parts, piece_words, piece_zone_mm
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import DICTIONARY, Piece, PieceMarker, marker_ids
+from patchproof.sheets.piece import Piece, PieceMarker, marker_ids, printed
 from patchproof.sheets.rects import RectMm, moved
 from patchproof.sheets.template import Template, TileGrid
 from patchproof.sheets.tiles import MARKERS, TilePlan, lay_out_tile, own_markers, own_swatches, plan_tiles, tile_map
@@ -93,4 +93,4 @@ def _all_markers(
 ) -> list[Marker]:
     of_piece = [(m, n) for n, tile in enumerate(tiles, FIRST_TILE_PAGE) for m in own_markers(tile, piece)]
     checks = [(m, 1) for m in first] + [(m, n) for n, page in enumerate(own, FIRST_TILE_PAGE) for m in page]
-    return [Marker(dictionary=DICTIONARY, id=m.id, corners_mm=m.corners_mm, page=n) for m, n in of_piece + checks]
+    return [printed(m, n) for m, n in of_piece + checks]

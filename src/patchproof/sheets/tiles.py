@@ -2,7 +2,7 @@
 
 In: a template with a [tiles] table and a piece. Out: `Tile`s (which part of the piece, on which page, where) and their
 page layouts. A tile shows its part of the piece; to the right and below, where another tile follows, a flap of 10 mm
-goes on: the piece's picture for one more millimetre, so that no gap shows where scissors slip, then white paper with a
+goes on: the piece's picture for one more millimeter, so that no gap shows where scissors slip, then white paper with a
 marker that the next tile will hide. Each tile has five markers of its own, in flaps and trimmed margins, which tell its
 scan or photograph from any other's; when all is glued, the piece's own frame alone is left to be seen.
 Seams are as even as they can be without cutting through a marker of the frame (nor, where there is room, a swatch).
@@ -32,14 +32,14 @@ class TilePlan:
     """A tile: its name (row letter, column number), its part of the piece, and where that lies on its page."""
 
     name: str
-    part_mm: RectMm  # in piece millimetres
+    part_mm: RectMm  # in piece millimeters
     corner_mm: PointMm  # of the part, on the page
     right: str | None  # the name of the tile that is glued on the right flap
     below: str | None
 
     @property
     def page_from_piece_mm(self) -> PointMm:
-        """What to add to piece millimetres."""
+        """What to add to piece millimeters."""
         return self.corner_mm[0] - self.part_mm[0], self.corner_mm[1] - self.part_mm[1]
 
     @property

@@ -20,7 +20,6 @@ from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import (
     Design,
     Manifest,
-    Marker,
     Promise,
     Swatch,
     design_sha256,
@@ -29,7 +28,7 @@ from patchproof.sheets.manifest import (
 )
 from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
-from patchproof.sheets.piece import DICTIONARY, Piece, PieceMarker
+from patchproof.sheets.piece import Piece, printed
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm, holds
 from patchproof.sheets.swatches import FRAME_COLORS
@@ -169,11 +168,6 @@ def printed_design(design: np.ndarray, rect_mm: RectMm, page: int = 1) -> Design
     )
 
 
-def printed_marker(marker: PieceMarker, page: int = 1) -> Marker:
-    """A marker as the manifest carries it."""
-    return Marker(dictionary=DICTIONARY, id=marker.id, corners_mm=marker.corners_mm, page=page)
-
-
 def page_manifest(
     page: PageLayout,
     template: Template | BoardTemplate,
@@ -190,7 +184,7 @@ def page_manifest(
         kind=kind,
         page_mm=page.page_mm,
         design=design,
-        markers=tuple(printed_marker(m) for m in page.markers),
+        markers=tuple(printed(m) for m in page.markers),
         chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
         cut_mm=cut_mm,
         ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
