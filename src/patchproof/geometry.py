@@ -12,13 +12,14 @@ and 8.1.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+UP = (0.0, 1.0, 0.0)
 
 
-def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray:
-    """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to its right when
-    positive.
-
-    Seen from outside, facing the side, positive azimuth moves the camera to the right. Arrays give N×3.
+def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, up: ArrayLike = UP) -> np.ndarray:
+    """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to the right of whoever
+    faces the side when positive. Arrays give N×3.
     """
     forward, up = _unit(forward), _unit(up)
     right = np.cross(up, forward)  # the viewer who faces the side has this on the right hand
@@ -27,7 +28,7 @@ def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray
     return np.cos(elevation) * level + np.sin(elevation) * up
 
 
-def look_at(eye_mm, target_mm, roll_deg=0.0, up=(0.0, 1.0, 0.0)) -> np.ndarray:
+def look_at(eye_mm: ArrayLike, target_mm: ArrayLike, roll_deg: ArrayLike = 0.0, up: ArrayLike = UP) -> np.ndarray:
     """`camera_from_world` 4×4 of a camera at `eye_mm` that looks at `target_mm`, turned clockwise by roll.
 
     Arrays, N×3 and N, give N×4×4.
@@ -136,9 +137,9 @@ def view_angles(camera_from_plane, point) -> tuple[float, float, float]:
     rotation, translation = camera_from_plane[:3, :3], camera_from_plane[:3, 3]
     camera_in_plane = -rotation.T @ translation
     x, y, z = camera_in_plane - np.array([point[0], point[1], 0.0])
-    toward = -z  # plane z points into the paper (x right, y down, right-handed)
     distance = float(np.sqrt(x * x + y * y + z * z))
-    return float(np.degrees(np.arctan2(x, toward))), float(np.degrees(np.arcsin(-y / distance))), distance
+    # plane z points into the paper (x right, y down, right-handed)
+    return float(np.degrees(np.arctan2(x, -z))), float(np.degrees(np.arcsin(-y / distance))), distance
 
 
 def rect_corners(rect) -> np.ndarray:

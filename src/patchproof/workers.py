@@ -12,15 +12,8 @@ same paths. Left out on purpose: sharing data between items. Each names files, a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -78,20 +71,22 @@ class Workers:
         """Keep `in_flight` items in work; those whose workers died are left in `lost`."""
         todo, running = iter(numbered), {}
         while True:
-            while len(running) < in_flight and (one := next(todo, None)) is not None:
-                running[self._submit(function, one[1])] = one
+            while len(running) < in_flight and (taken := next(todo, None)) is not None:
+                running[self._submit(function, taken[1])] = taken
             if not running:
                 return
-            finished = wait(running, return_when=FIRST_COMPLETED).done
+            finished = futures.wait(running, return_when=futures.FIRST_COMPLETED).done
             broken = any(map(_broke, finished))
             if broken:
-                finished = wait(running).done  # one dead process breaks the pool, and with it all that was in flight
+                finished = futures.wait(
+                    running
+                ).done  # one dead process breaks the pool, and with it all that was in flight
             for future in finished:
-                one = running.pop(future)
+                numbered_item = running.pop(future)
                 if _broke(future):
-                    lost.append(one)
+                    lost.append(numbered_item)
                 else:
-                    yield one[0], future
+                    yield numbered_item[0], future
             if broken:
                 self._executor.shutdown(wait=True)
                 self._executor = self._start()
@@ -168,10 +163,10 @@ def one_thread() -> Iterator[None]:
 class _Here(Executor):
     """Work done at once, in this process."""
 
-    def submit(self, function, /, *args) -> Future:
+    def submit(self, fn, /, *args, **kwargs) -> Future:
         future: Future = Future()
         try:
-            future.set_result(function(*args))
+            future.set_result(fn(*args, **kwargs))
         except Exception as error:
             future.set_exception(error)
         return future
@@ -183,23 +178,23 @@ class _OneThreadEach(Executor):
     def __init__(self, executor: Executor):
         self._executor = executor
 
-    def submit(self, function, /, *args) -> Future:
-        return self._executor.submit(_on_one_thread, function, *args)
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        return self._executor.submit(_on_one_thread, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._executor.shutdown(wait=wait)
 
 
-def _on_one_thread(function, *args):
+def _on_one_thread(function, *args, **kwargs):
     with one_thread():
-        return function(*args)
+        return function(*args, **kwargs)
 
 
 def _processes(jobs: int) -> Executor:
     import multiprocessing
 
     # spawn: forking a process that has run torch threads can hang
-    return _OneThreadEach(ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")))
+    return _OneThreadEach(futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")))
 
 
 @contextmanager
@@ -207,8 +202,7 @@ def _client(address: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError:
-        do = 'pip install "patchproof[cluster]"'
-        raise Refused("dask.distributed for --cluster", "none", do) from None
+        raise Refused("dask.distributed for --cluster", "none", 'pip install "patchproof[cluster]"') from None
     try:
         client = Client(address, timeout=_ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -47,8 +48,9 @@ def folded(trained: SmallNetwork) -> SmallNetwork:
     """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
     plain = SmallNetwork(trained.classify.out_features)
     for ours, theirs in ((plain.halve, trained.halve), (plain.refine, trained.refine)):
-        for i, (conv, norm) in enumerate(theirs):
-            ours[i] = torch.nn.utils.fuse_conv_bn_eval(conv, norm)
+        for i, pair in enumerate(theirs):
+            conv_and_norm: list[Any] = list(pair.children())
+            ours[i] = torch.nn.utils.fuse_conv_bn_eval(*conv_and_norm)
     plain.classify = trained.classify
     return plain.eval()
 

@@ -23,14 +23,12 @@ def _find(labels: Sequence[str], label: str | int) -> int:
         if not 0 <= label < len(labels):
             raise Refused(f"a label index from 0 to {len(labels) - 1}", str(label), "use one of those, or a name")
         return label
-    found = [i for i, entry in enumerate(labels) if _folded(label) in map(_folded, [entry, *entry.split(",")])]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        could_be = " or ".join(f'{i} ("{labels[i]}")' for i in found)
-        raise Refused(
-            "a label that names one class", f'"{label}", which is in {len(found)}', f"use the index {could_be}"
-        )
+    matches = [i for i, entry in enumerate(labels) if _folded(label) in map(_folded, [entry, *entry.split(",")])]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        do = "use the index " + " or ".join(f'{i} ("{labels[i]}")' for i in matches)
+        raise Refused("a label that names one class", f'"{label}", which is in {len(matches)}', do)
     raise Refused("a label that the network knows", f'"{label}"', _nearest(labels, label))
 
 

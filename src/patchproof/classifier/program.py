@@ -43,9 +43,8 @@ def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
     if not path.is_file():
         raise Refused("a torch.export program", f"no file at {path}", "check the path")
     if path.stat().st_size > MAX_BYTES:
-        raise Refused(
-            f"a program of at most {MAX_BYTES >> 30} GiB", f"{path}, which is larger", "use a smaller network"
-        )
+        got = f"{path}, which is larger"
+        raise Refused(f"a program of at most {MAX_BYTES >> 30} GiB", got, "use a smaller network")
     input_px, labels = _card(path.with_suffix(".json"))
     stored = path.read_bytes()  # once, so that what is hashed is what is loaded
     network = _network(harmless_copy(stored, path), path, device)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import importlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,8 +26,8 @@ class Normalized(nn.Module):
     def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float]):
         super().__init__()
         self.network = network
-        self.register_buffer("mean", torch.tensor(mean).reshape(1, -1, 1, 1))
-        self.register_buffer("std", torch.tensor(std).reshape(1, -1, 1, 1))
+        self.mean = nn.Buffer(torch.tensor(mean).reshape(1, -1, 1, 1))
+        self.std = nn.Buffer(torch.tensor(std).reshape(1, -1, 1, 1))
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×S×S sRGB in [0, 1] → N×K logits."""
@@ -41,9 +42,9 @@ def load_torchvision(name: str, device: torch.device | str = "cpu") -> Classifie
         raise Refused("a torchvision classifier", f'"{name}"', _near(name, known, "torchvision.models.list_models()"))
     weights = models.get_model_weights(name).DEFAULT
     network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
-    seen = weights.transforms()
-    normalized = Normalized(network, seen.mean, seen.std)
-    return _classifier(f"torchvision:{name}", normalized, seen.crop_size[0], weights.meta["categories"], device)
+    view = weights.transforms()
+    normalized = Normalized(network, view.mean, view.std)
+    return _classifier(f"torchvision:{name}", normalized, view.crop_size[0], weights.meta["categories"], device)
 
 
 def load_timm(name: str, device: torch.device | str = "cpu") -> Classifier:
@@ -56,11 +57,10 @@ def load_timm(name: str, device: torch.device | str = "cpu") -> Classifier:
     if not subset:
         do = "use one trained on ImageNet, or write a module:package.factory with its labels"
         raise Refused("a timm model whose labels are known", f'"{name}" with {network.num_classes} outputs', do)
-    info, seen = timm.data.ImageNetInfo(subset), timm.data.resolve_model_data_config(network)
+    info, view = timm.data.ImageNetInfo(subset), timm.data.resolve_model_data_config(network)
     labels = [info.index_to_description(index) for index in range(network.num_classes)]
-    return _classifier(
-        f"timm:{name}", Normalized(network, seen["mean"], seen["std"]), seen["input_size"][-1], labels, device
-    )
+    normalized = Normalized(network, view["mean"], view["std"])
+    return _classifier(f"timm:{name}", normalized, view["input_size"][-1], labels, device)
 
 
 def _classifier(name: str, network: nn.Module, input_px: int, labels: Sequence[str], device) -> Classifier:
@@ -68,7 +68,7 @@ def _classifier(name: str, network: nn.Module, input_px: int, labels: Sequence[s
     return Classifier(name, weights_sha256(network), int(input_px), tuple(labels), network)
 
 
-def _downloaded(name: str, load: Callable[[], nn.Module]) -> nn.Module:
+def _downloaded(name: str, load: Callable[[], Any]) -> Any:
     try:
         return load()
     except Exception as error:  # each library raises its own for no network, no weights and no space

@@ -188,7 +188,7 @@ class _Reader:
         colors = np.asarray(colors)[:, :3]
         top = np.iinfo(colors.dtype).max if colors.dtype.kind in "iu" else 1.0
         colors = np.asarray(colors, float) / top
-        broken = ~np.isfinite(colors).all(1)
+        broken = ~np.all(np.isfinite(colors), axis=1)
         if broken.any():
             self.warnings.append(f"{np.count_nonzero(broken)} vertex colors are not numbers and are taken as gray 0.5")
         if top == 1.0 and not self.is_gltf and np.max(colors[~broken], initial=0.0) > 1:
@@ -273,14 +273,11 @@ def _is_image(data: bytes) -> bool:
 
 def _gltf_header(path: Path) -> dict:
     """The JSON of a GLB or glTF file. trimesh reads another file, model.gltf, where a .gltf is no JSON."""
-    with open(path, "rb") as file:
-        if path.suffix.lower() == ".glb":
-            head = file.read(20)
-            if head[:4] != b"glTF":
-                raise ValueError("it does not start with glTF")
-            text = file.read(int.from_bytes(head[12:16], "little"))
-        else:
-            text = file.read()
+    text = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        if text[:4] != b"glTF":
+            raise ValueError("it does not start with glTF")
+        text = text[20 : 20 + int.from_bytes(text[12:16], "little")]
     header = json.loads(text)
     if not isinstance(header, dict):
         raise ValueError("its JSON is no object")

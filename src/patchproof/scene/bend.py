@@ -23,6 +23,7 @@ from patchproof.scene.placement import (
     Placement,
     lay_card,
     placement_warnings,
+    pose_of,
     refuse_larger_than_side,
     spun,
 )
@@ -72,7 +73,9 @@ def place_bent(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg:
         return replace(rolled, family="cylinder", reason=reason)
     laid = _laid(_smooth(chart, near, size_mm), near, frame, size_mm, spin_deg)
     _refuse_gap(laid.gap_mean_mm, size_mm)
-    _refuse_stretch(laid.stretch)
+    if laid.stretch > STRETCH_LIMIT:
+        expected = f"a surface that paper follows with a stretch of at most {STRETCH_LIMIT:.0%}"
+        raise Refused(expected, f"one curved both ways, which stretches it by {laid.stretch:.1%}", _DO)
     reason = (
         f"paper that follows the surface is stretched by {laid.stretch:.2%} at most and lies {laid.gap_mean_mm:.2f} mm "
         f"off on average, where the best cylinder would stand {rolled.gap_mean_mm:.1f} mm off"
@@ -132,21 +135,23 @@ def _under(chart: Chart, near: np.ndarray, size_mm, n: int) -> np.ndarray:
 def _sampled(chart: Chart, near: np.ndarray, size_mm) -> tuple[np.ndarray, np.ndarray]:
     """(s, t) and heights of the surface where there is any."""
     h = _under(chart, near, size_mm, _FIT_NET)
-    seen = np.isfinite(h)
-    return (net(size_mm, _FIT_NET) @ chart.turn)[seen], h[seen]
+    hit = np.isfinite(h)
+    return (net(size_mm, _FIT_NET) @ chart.turn)[hit], h[hit]
 
 
 def _tangent(near: np.ndarray, frame: Frame, size_mm) -> tuple[Frame, np.ndarray]:
     """The frame turned to the surface at its origin, and the curvature matrix 2×2 there along right and up (positive
     where the surface bulges outwards): from a quadratic fitted to the inner half of what lies under the piece.
     """
+    bends = np.zeros((2, 2))
     for _ in range(2):
-        plane = _chart(frame, frame.right, 0.0, 0.0)
-        (s, t), h = (a.T for a in _sampled(plane, near, np.array(size_mm) / 2))
+        st, h = _sampled(_chart(frame, frame.right, 0.0, 0.0), near, np.array(size_mm) / 2)
+        s, t = st.T
         _, ds, dt, dss, dst, dtt = np.linalg.lstsq(np.stack([s**0, s, t, s**2, s * t, t**2], 1), h, rcond=None)[0]
         normal = frame.normal - ds * frame.right - dt * frame.up
         frame = _facing(frame, normal / np.linalg.norm(normal), frame.origin_mm)
-    return frame, -np.array([[2 * dss, dst], [dst, 2 * dtt]])
+        bends = -np.array([[2 * dss, dst], [dst, 2 * dtt]])
+    return frame, bends
 
 
 def _cylinder(near: np.ndarray, tangent: Frame, bends: np.ndarray, size_mm, spin_deg: float) -> Chart:
@@ -159,7 +164,7 @@ def _cylinder(near: np.ndarray, tangent: Frame, bends: np.ndarray, size_mm, spin
     chart = _chart(tangent, across, float(values[most]), spin_deg)
     for share in (0.5, 1.0, 1.0):  # what lies under a piece is known once the cylinder is
         st, h = _sampled(chart, near, np.array(size_mm) * share)
-        chart = _fitted(chart, chart.world(*st.T, h), tangent, size_mm, spin_deg)
+        chart = _fitted(chart, chart.world(st[:, 0], st[:, 1], h), tangent, size_mm, spin_deg)
         _refuse_overlap(chart, size_mm)
     return chart
 
@@ -187,7 +192,8 @@ def _fitted(chart: Chart, points_mm: np.ndarray, tangent: Frame, size_mm, spin_d
 
 def _smooth(chart: Chart, near: np.ndarray, size_mm) -> Smooth:
     """The chart with a polynomial fitted to the surface's heights over it."""
-    (s, t), h = (a.T for a in _sampled(chart, near, size_mm))
+    st, h = _sampled(chart, near, size_mm)
+    s, t = st.T
     scale = float(np.hypot(*size_mm)) / 2
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     basis = np.stack([(s / scale) ** i * (t / scale) ** j for i, j in powers], 1)
@@ -248,14 +254,11 @@ def _spread(surface: Smooth, frame: Frame, size_mm, spin_deg: float) -> tuple[np
     """
     middle, normal = (a[0] for a in surface.points_and_normals(np.zeros(1), np.zeros(1)))
     right, up = spun(_facing(frame, normal, middle), spin_deg)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, -up, -normal], 1)
-    pose[:3, 3] = middle - right * size_mm[0] / 2 + up * size_mm[1] / 2
     with np.errstate(all="ignore"):
         st = exponential_map(surface, net(size_mm, _PIECE_NET), right, up)
     if not (np.abs(st) < 2 * np.hypot(*size_mm)).all():
         raise Refused("a surface that paper can follow", "one that folds under the piece", _DO)
-    return pose, st
+    return pose_of(right, up, normal, middle, size_mm), st
 
 
 def _grid_faces(n: int) -> np.ndarray:
@@ -268,20 +271,14 @@ def _refuse_overlap(chart: Chart, size_mm) -> None:
     around = 2 * np.pi / max(abs(chart.curvature), 1e-9)
     wrapped = float(np.abs(chart.turn[:, 0]) @ np.array(size_mm))
     if wrapped > around:
-        raise Refused(
-            "a surface on which the piece does not overlap itself",
-            f"{wrapped:.0f} mm of piece around a best cylinder of {around:.0f} mm",
-            _DO,
-        )
+        got = f"{wrapped:.0f} mm of piece around a best cylinder of {around:.0f} mm"
+        raise Refused("a surface on which the piece does not overlap itself", got, _DO)
 
 
 def _refuse_overhang(laid: Placement) -> None:
     if laid.overhang_share > OVERHANG_LIMIT:
-        raise Refused(
-            f"a surface under at least {1 - OVERHANG_LIMIT:.0%} of a bent piece",
-            f"{1 - laid.overhang_share:.0%}",
-            _DO,
-        )
+        expected = f"a surface under at least {1 - OVERHANG_LIMIT:.0%} of a bent piece"
+        raise Refused(expected, f"{1 - laid.overhang_share:.0%}", _DO)
 
 
 def _refuse_gap(gap_mean_mm: float, size_mm) -> None:
@@ -289,14 +286,5 @@ def _refuse_gap(gap_mean_mm: float, size_mm) -> None:
         raise Refused(
             f"a surface that paper can lie on, off it by at most {GAP_LIMIT:.0%} of its shorter edge on average",
             f"an edge, bump, hole or handle that keeps it {gap_mean_mm:.1f} mm off ({gap_mean_mm / min(size_mm):.0%})",
-            _DO,
-        )
-
-
-def _refuse_stretch(stretch: float) -> None:
-    if stretch > STRETCH_LIMIT:
-        raise Refused(
-            f"a surface that paper follows with a stretch of at most {STRETCH_LIMIT:.0%}",
-            f"one curved both ways, which stretches it by {stretch:.1%}",
             _DO,
         )

@@ -33,9 +33,9 @@ class Smooth:
 
     def tangents(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives N×3 of the surface point by s and by t, on the chart's across, along and normal at that place."""
-        k, one = self.chart.curvature, np.ones(np.shape(s))
-        by_s = np.stack([1 + k * self.height(s, t), 0 * one, self.height(s, t, 1, 0)], -1)
-        return by_s, np.stack([0 * one, one, self.height(s, t, 0, 1)], -1)
+        k, none = self.chart.curvature, np.zeros(np.shape(s))
+        by_s = np.stack([1 + k * self.height(s, t), none, self.height(s, t, 1, 0)], -1)
+        return by_s, np.stack([none, none + 1, self.height(s, t, 0, 1)], -1)
 
     def points_and_normals(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points N×3 and unit normals N×3."""
@@ -76,7 +76,8 @@ def exponential_map(surface: Smooth, offsets_mm: np.ndarray, right: np.ndarray, 
 def largest_stretch(surface: Smooth, at: np.ndarray, size_mm: tuple[float, float], n: int) -> float:
     """Largest relative change of length in any direction, where an n×n net of the sheet by rows lies `at` (s, t)."""
     step = np.array(size_mm) / (n - 1)
-    by_row, by_column = np.gradient(at.reshape(n, n, 2), step[1], step[0], axis=(0, 1), edge_order=2)
+    net = at.reshape(n, n, 2)
+    by_row, by_column = (np.asarray(np.gradient(net, step[1 - axis], axis=axis, edge_order=2)) for axis in (0, 1))
     change = np.stack([by_column, by_row], -2).reshape(-1, 2, 2) @ np.stack(surface.tangents(*at.T), 1)
     return float(np.abs(np.linalg.svd(change, compute_uv=False) - 1).max())
 

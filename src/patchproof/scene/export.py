@@ -21,23 +21,25 @@ _M_FROM_MM = 1e-3
 def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path) -> None:
     """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file.
 
-    Textures stand for the whole color: base colors are not written; corner colors
-    other than 1 are, in 8 bits of linear light.
+    Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
     """
     import trimesh
+    from trimesh.exchange.gltf import export_glb
 
     scene = trimesh.Scene()
     for index, (material, texture) in enumerate(zip(mesh.materials, textures, strict=True)):
         faces = np.flatnonzero(mesh.face_material == index)
         if len(faces):
             scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
-    Path(path).write_bytes(scene.export(file_type="glb", include_normals=True))
+    Path(path).write_bytes(export_glb(scene, include_normals=True))
 
 
 def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     """Some faces as a trimesh, corners that agree in everything made one vertex."""
     import trimesh
     from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     arrays = [
         mesh.vertices[mesh.faces[faces]] * _M_FROM_MM,
@@ -48,10 +50,10 @@ def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     corners = np.concatenate([np.asarray(array, float).reshape(3 * len(faces), -1) for array in arrays], axis=1)
     corners, index = np.unique(corners, axis=0, return_inverse=True)
     position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
-    material = trimesh.visual.material.PBRMaterial(
+    material = PBRMaterial(
         name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
-    visual = trimesh.visual.TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
     if (color != 1).any():
         # trimesh writes bytes, whatever it is given
         visual.vertex_attributes["color"] = np.rint(255 * np.insert(color, 3, 1.0, axis=1)).astype(np.uint8)

@@ -97,17 +97,16 @@ def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:
         up, normal = (np.array(v, float) for v in _SIDES[patch.side])
         right = np.cross(up, normal)
         middle = (low + high) / 2 + normal * (np.abs(normal) @ (high - low)) / 2
-        origin = middle + patch.offset_mm[0] * right + patch.offset_mm[1] * up
     else:
-        nearest, normal = _nearest_surface(mesh, np.array(patch.at_mm, float))
+        middle, normal = _nearest_surface(mesh, np.array(patch.at_mm, float))
         level = np.array([0.0, 1, 0]) if abs(normal[1]) < 0.99 else np.array([0.0, 0, -1])
         right = np.cross(level, normal)
         right /= np.linalg.norm(right)
         up = np.cross(normal, right)
-        origin = nearest + patch.offset_mm[0] * right + patch.offset_mm[1] * up
+    origin = middle + patch.offset_mm[0] * right + patch.offset_mm[1] * up
     spread = mesh.vertices @ np.stack([right, up], 1)
-    extent = tuple(float(e) for e in np.ptp(spread, axis=0))
-    return Frame(right, up, normal, origin, extent)
+    wide, high = np.ptp(spread, axis=0).tolist()
+    return Frame(right, up, normal, origin, (wide, high))
 
 
 def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
@@ -126,20 +125,17 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
     right, up = spun(frame, spin_deg)
     chart = Chart(frame.origin_mm, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
     surface = heights(chart, triangles, size_mm, GRID, (-reach_mm, reach_mm))
-    seen = np.isfinite(surface)
-    if not seen.any():
+    hit = np.isfinite(surface)
+    if not hit.any():
         raise Refused("a patch that lies on the object", "no surface under it", "change offset_mm or at_mm")
     # peaks are at corners, which the net may miss
     peaks = chart.local(triangles.reshape(-1, 3))
     inside = (np.abs(peaks) <= [width / 2, height / 2, reach_mm]).all(1)
-    top = max(surface[seen].max(), peaks[inside, 2].max(initial=-np.inf))
-    gaps = top - surface[seen]
-    center = frame.origin_mm + frame.normal * (top + LIFT_MM)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, -up, -frame.normal
-    pose[:3, 3] = center - right * width / 2 + up * height / 2
+    top = max(surface[hit].max(), peaks[inside, 2].max(initial=-np.inf))
+    gaps = top - surface[hit]
+    pose = pose_of(right, up, frame.normal, frame.origin_mm + frame.normal * (top + LIFT_MM), size_mm)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    gap, overhang = float(gaps.max()), float(1 - seen.mean())
+    gap, overhang = float(gaps.max()), float(1 - hit.mean())
     return Placement(
         family="card",
         size_mm=(width, height),
@@ -155,6 +151,14 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
         reason=f"a flat card stands at most {gap:.1f} mm off the surface",
         warnings=placement_warnings(gap, overhang, size_mm),
     )
+
+
+def pose_of(right: np.ndarray, up: np.ndarray, normal: np.ndarray, middle_mm: np.ndarray, size_mm) -> np.ndarray:
+    """4×4 world from piece of a piece with its middle there."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, -up, -normal], 1)
+    pose[:3, 3] = middle_mm - right * size_mm[0] / 2 + up * size_mm[1] / 2
+    return pose
 
 
 def spun(frame: Frame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
@@ -199,6 +203,6 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     from trimesh.triangles import closest_point, normals
 
     triangles = mesh.vertices[mesh.faces]
-    found = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
-    best = int(np.argmin(((found - point) ** 2).sum(1)))
-    return found[best], normals(triangles[best : best + 1])[0][0]
+    places = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
+    best = int(np.argmin(((places - point) ** 2).sum(1)))
+    return places[best], normals(triangles[best : best + 1])[0][0]

@@ -115,7 +115,7 @@ def surface_at(triangles: np.ndarray, origin_mm: np.ndarray, axes: np.ndarray) -
 def _visits(chart: Chart, triangles: np.ndarray, size_mm, n: int):
     """Which net points each triangle may lie over: (triangle, first column and row, columns, points) of every box."""
     local = chart.local(triangles)[..., :2]
-    shifts = [0.0]
+    shifts, holds = [0.0], np.zeros(len(triangles), bool)
     if chart.curvature:
         around = 2 * np.pi / abs(chart.curvature)
         local[..., 0] -= around * np.round((local[..., 0] - local[:, :1, 0]) / around)

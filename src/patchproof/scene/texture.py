@@ -24,7 +24,7 @@ from patchproof.strict import Refused, expand, nearest
 
 TEXELS = 1024  # side of a texture that has to be made: 0.7 mm per texel over a cube of 300 mm
 GUTTER_TEXELS = 1.5  # every texel that a face touches and one more: what bilinear look-ups within the face can read
-GREY = 128  # sRGB 0.5
+GRAY = 128  # sRGB 0.5
 _WORTH_SAYING = 0.05  # share of the surface
 # a texel that stands for this many times its even share of the surface belongs to a palette, not to a picture
 _PALETTE = 16
@@ -72,12 +72,9 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
         masks = tuple(mask & _stretched(image, mask.shape) for mask in masks)
     if not any(mask.any() for mask in masks):
         raise Refused("a mask that is white on some face", "none of that", "compare it with the texture coordinates")
-    textures = tuple(material.texture_srgb for material in mesh.materials)
-    start = textures
+    start = tuple(_texture(mesh, i) for i in range(len(masks)))
     if patch.start == "grey":
-        start = tuple(
-            np.where(mask[..., None], np.uint8(GREY), texture) for mask, texture in zip(masks, textures, strict=True)
-        )
+        start = tuple(np.where(mask[..., None], np.uint8(GRAY), old) for mask, old in zip(masks, start, strict=True))
     return Canvas(mesh, start, masks, (*warnings, *_doubts(mesh, chosen, masks)))
 
 
@@ -99,7 +96,7 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
     """The face numbers of a text file: one number, or a range a-b with both ends, per line; # starts a comment."""
     if not path.is_file():
         raise Refused("a file of face numbers", f"no file at {path}", "check the path")
-    found = [np.zeros(0, np.int64)]
+    ranges = [np.zeros(0, np.int64)]
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.partition("#")[0].split("-")
         if not "".join(words).strip() and len(words) == 1:
@@ -111,10 +108,10 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
         if len(ends) not in (1, 2) or not 0 <= ends[0] <= ends[-1] < count:
             got = f'"{line.strip()[:40]}" in line {number} of {path.name}'
             raise Refused(f"a face number or a range a-b from 0 to {count - 1}", got, "mend that line")
-        found.append(np.arange(ends[0], ends[-1] + 1))
-    if len(found) == 1:
+        ranges.append(np.arange(ends[0], ends[-1] + 1))
+    if len(ranges) == 1:
         raise Refused("face numbers, one per line", f"none in {path.name}", "name the faces that may change")
-    return np.concatenate(found)
+    return np.concatenate(ranges)
 
 
 def _read_mask(path: Path) -> np.ndarray:
@@ -134,12 +131,12 @@ def _read_mask(path: Path) -> np.ndarray:
     return gray
 
 
-def _stretched(gray: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _stretched(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """A mask over H×W texels, averaged where it is finer: where it is light."""
     from PIL import Image
 
-    image = Image.fromarray(gray.astype(np.float32))
-    return np.asarray(image.resize(shape[::-1], Image.Resampling.BOX)) >= 128
+    image, (height, width) = Image.fromarray(gray.astype(np.float32)), shape
+    return np.asarray(image.resize((width, height), Image.Resampling.BOX)) >= 128
 
 
 def _whole_colors(mesh: Mesh, chosen: np.ndarray, texels: int) -> Mesh:
@@ -172,29 +169,34 @@ def _corners(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
     return mesh.corner_uv[faces].astype(float) * (_size(mesh, index[0]) if len(index) else 1)
 
 
+def _texture(mesh: Mesh, index: int) -> np.ndarray:
+    return np.asarray(mesh.materials[index].texture_srgb)  # every material has one by now
+
+
 def _size(mesh: Mesh, index: int) -> tuple[int, int]:
-    return mesh.materials[index].texture_srgb.shape[1::-1]
+    height, width, _ = _texture(mesh, index).shape
+    return width, height
 
 
 def _doubts(mesh: Mesh, chosen: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
     """What the user should know about the texels that may change."""
     repeated, palette, unnamed = _shares(mesh, chosen, masks)
-    found = []
+    doubts = []
     if palette > _WORTH_SAYING:
-        found.append(
+        doubts.append(
             f"{palette:.0%} of the surface that may change takes its color from a few texels (a palette texture): each"
             " such part stays of one color, and one texel recolors all of them; unwrap the object anew for a pattern"
         )
     if repeated > _WORTH_SAYING:
-        found.append(
+        doubts.append(
             f"{repeated:.0%} of the surface that may change shows texels that show at another place too (mirrored or"
             " tiled): both places get the same pattern and cannot differ; unwrap the object anew if they should"
         )
     if unnamed > 0.01:
-        found.append(f"{unnamed:.0%} of the surface changes too, although not named: it shows the same texels")
+        doubts.append(f"{unnamed:.0%} of the surface changes too, although not named: it shows the same texels")
     if (mesh.corner_color_linear[chosen] != 1).any():
-        found.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
-    return found
+        doubts.append("vertex colors go on multiplying the texture: where they are dark, it stays dark")
+    return doubts
 
 
 def _shares(mesh: Mesh, chosen: np.ndarray, masks: tuple[np.ndarray, ...]) -> tuple[float, float, float]:

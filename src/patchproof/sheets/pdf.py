@@ -166,12 +166,8 @@ def _finished(drawn: bytes, attachments: dict[str, str]) -> bytes:
                 image.ColorSpace = space
         for name, text in attachments.items():
             about = {"filename": name, "mime_type": "application/json", "description": _ATTACHED}
-            pdf.attachments[name] = pikepdf.AttachedFileSpec(  # its stub lacks the relationship
-                pdf,
-                text.encode(),
-                relationship=Name.Data,
-                **about,  # type: ignore[reportCallIssue]
-            )
+            attached: Any = pikepdf.AttachedFileSpec  # its stub lacks the relationship
+            pdf.attachments[name] = attached(pdf, text.encode(), relationship=Name.Data, **about)
         for key in ("/CreationDate", "/ModDate", "/Author", "/Subject", "/Keywords", "/Creator"):
             if key in pdf.docinfo:
                 del pdf.docinfo[key]
