@@ -18,11 +18,7 @@ import numpy as np
 
 Values = TypeVar("Values")  # what comes in, an array or a tensor, comes out
 LUMINANCE = (0.2126390, 0.7151687, 0.0721923)  # Y of sRGB's linear primaries, D65
-_XYZ_FROM_LINEAR = (
-    (0.4123908, 0.3575843, 0.1804808),
-    LUMINANCE,
-    (0.0193308, 0.1191948, 0.9505322),
-)
+_XYZ_FROM_LINEAR = ((0.4123908, 0.3575843, 0.1804808), LUMINANCE, (0.0193308, 0.1191948, 0.9505322))
 _WHITE_D65 = (0.9504559, 1.0, 1.0890578)  # the matrix's own row sums, so that sRGB white is exactly L* 100, a* b* 0
 
 _LINEAR_FROM_Z = (-0.5430160, 0.0452559, 1.1511030)  # the inverse matrix's last column, times white's Z

@@ -19,14 +19,7 @@ import cv2
 import numpy as np
 from scipy.special import stdtrit
 
-from patchproof.geometry import (
-    apply_homography,
-    fit_homography,
-    normalized,
-    plane_pose,
-    rect_corners,
-    view_angles,
-)
+from patchproof.geometry import apply_homography, fit_homography, normalized, plane_pose, rect_corners, view_angles
 from patchproof.photo.cannot import CannotJudge
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)

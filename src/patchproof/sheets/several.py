@@ -26,14 +26,7 @@ from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import Piece, hash_order, moved_marker, sheet_id
 from patchproof.sheets.rects import PointMm, moved, size_text
 from patchproof.sheets.template import Template
-from patchproof.sheets.write import (
-    check_pixels,
-    manifest_paths,
-    page_manifest,
-    pdf_name,
-    printed_design,
-    save_sheets,
-)
+from patchproof.sheets.write import check_pixels, manifest_paths, page_manifest, pdf_name, printed_design, save_sheets
 from patchproof.strict import Refused
 
 
@@ -106,12 +99,5 @@ def _manifest(
     mine = replace(page, markers=(*own, *others), swatches=(*chart, *frame))
     printed = printed_design(design.design_srgb8, page.designs_mm[index])
     return page_manifest(
-        mine,
-        template,
-        page.cuts_mm[index],
-        design.sheet_id,
-        design.kind,
-        design.settings,
-        printed,
-        design.promise,
+        mine, template, page.cuts_mm[index], design.sheet_id, design.kind, design.settings, printed, design.promise
     ).changed(page_code=code)

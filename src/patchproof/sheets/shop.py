@@ -107,10 +107,7 @@ def _placed(page) -> Iterator[tuple[str, tuple[float, float]]]:
         elif word == "Do":
             yield (
                 str(operands[0]),
-                (
-                    (matrix.a**2 + matrix.b**2) ** 0.5 * _MM,
-                    (matrix.c**2 + matrix.d**2) ** 0.5 * _MM,
-                ),
+                ((matrix.a**2 + matrix.b**2) ** 0.5 * _MM, (matrix.c**2 + matrix.d**2) ** 0.5 * _MM),
             )
 
 

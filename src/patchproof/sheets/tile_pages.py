@@ -36,13 +36,7 @@ class TiledPages:
 
 
 def tile_pages(
-    template: Template,
-    grid: TileGrid,
-    piece: Piece,
-    sheet_id: str,
-    kind: str,
-    qr_text: str,
-    design: np.ndarray | None,
+    template: Template, grid: TileGrid, piece: Piece, sheet_id: str, kind: str, qr_text: str, design: np.ndarray | None
 ) -> TiledPages:
     """Page 1 and the tiles' pages, proved apart each; `grid` is the template's own."""
     tiles, fixed = plan_tiles(grid, piece), len(piece.markers)

@@ -17,15 +17,7 @@ import numpy as np
 
 from patchproof.output import write_together
 from patchproof.sheets.layout import PageLayout
-from patchproof.sheets.manifest import (
-    Design,
-    Manifest,
-    Promise,
-    Swatch,
-    design_sha256,
-    dump_manifest,
-    png_base64,
-)
+from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256, dump_manifest, png_base64
 from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
 from patchproof.sheets.piece import Piece, printed
