@@ -17,8 +17,8 @@ from patchproof.evidence.surface import surface_of
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.label import label_of, read_label
 from patchproof.photo.read import Photo
+from patchproof.sheets.blank import chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
-from patchproof.sheets.chart_page import chart_sheet
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.page import largest_piece_mm

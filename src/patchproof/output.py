@@ -39,16 +39,12 @@ def check_folder(out: Path, own: tuple[str, ...], overwrite: bool = False) -> No
         raise Refused("a folder to write to", f"the file {out}", "choose another --out")
     names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
     if names and not overwrite:
-        raise Refused(
-            "an empty or new folder", f"{out} with {len(names)} files", "choose another --out or add --overwrite"
-        )
+        got = f"{out} with {len(names)} files"
+        raise Refused("an empty or new folder", got, "choose another --out or add --overwrite")
     strange = [name for name in names if not any(fnmatch(name, pattern) for pattern in own)]
     if strange:
-        raise Refused(
-            f"a folder with this command's own output only ({', '.join(own)})",
-            f"{out} with {strange[0]}",
-            "choose another --out",
-        )
+        expected = f"a folder with this command's own output only ({', '.join(own)})"
+        raise Refused(expected, f"{out} with {strange[0]}", "choose another --out")
 
 
 def check_file(path: Path, overwrite: bool = False) -> None:
@@ -72,9 +68,8 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
         write(part)
         os.replace(part, path)
     except OSError as error:
-        raise Refused(
-            "a file that can be written", f"{path} ({error.strerror or error})", "make room or choose another --out"
-        ) from error
+        got = f"{path} ({error.strerror or error})"
+        raise Refused("a file that can be written", got, "make room or choose another --out") from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -77,9 +77,8 @@ def see_boards(
             left.append(LeftOut(path.name, cannot.advice))
         progress(number, len(paths))
     if not views:
-        raise Refused(
-            f"photographs of the board {board.sheet_id}", f"{len(paths)} without it", "name the board with --board"
-        )
+        got = f"{len(paths)} without it"
+        raise Refused(f"photographs of the board {board.sheet_id}", got, "name the board with --board")
     common = Counter(states).most_common(1)[0][0]
     kept = []
     for view, state in zip(views, states, strict=True):

@@ -52,26 +52,26 @@ def find_sheet(
     The search ends when every one of `expected` is found, or shown to be out of the picture or covered.
     """
     printed = printed_markers(dictionary)
-    seen: dict[int, list[np.ndarray]] = {}
-    box, found = whole(srgb), MarkersInView({}, (), ())
+    detections: dict[int, list[np.ndarray]] = {}
+    box, view = whole(srgb), MarkersInView({}, (), ())
     for level in levels(srgb, box, coarsest_px):
-        before = set(seen)
-        look(srgb, box, level, printed, seen)
-        if seen.keys() != before:
-            found = complete(srgb, fitted(srgb, seen, set(corners_mm), printed), corners_mm, dictionary)
-        wanted = expected - found.markers.keys()
-        if wanted and found.markers:
-            wanted, box = _still_wanted(srgb, wanted, found, corners_mm, level.scale)
+        before = set(detections)
+        look(srgb, box, level, printed, detections)
+        if detections.keys() != before:
+            view = complete(srgb, fitted(srgb, detections, set(corners_mm), printed), corners_mm, dictionary)
+        wanted = expected - view.markers.keys()
+        if wanted and view.markers:
+            wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
         if not wanted:
             break
-    return found
+    return view
 
 
-def _still_wanted(srgb, wanted: Set[int], found: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], Box]:
+def _still_wanted(srgb, wanted: Set[int], view: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], Box]:
     """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
-    if sum(b.fitted for b in found.markers.values()) < 2:  # one marker says too little about where the others are
+    if sum(b.fitted for b in view.markers.values()) < 2:  # one marker says too little about where the others are
         return wanted, whole(srgb)
-    quads = _predicted(srgb, found, {i: corners_mm[i] for i in wanted}, corners_mm)
+    quads = _predicted(srgb, view, {i: corners_mm[i] for i in wanted}, corners_mm)
     if quads is None:
         return wanted, whole(srgb)
     wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
@@ -85,23 +85,23 @@ def _still_wanted(srgb, wanted: Set[int], found: MarkersInView, corners_mm, scal
 
 
 def complete(
-    srgb: np.ndarray, found: MarkersInView, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
+    srgb: np.ndarray, view: MarkersInView, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
 ) -> MarkersInView:
-    """`found` with all markers of `corners_mm` that verify at their predicted places; bad fits are replaced."""
+    """`view` with all markers of `corners_mm` that verify at their predicted places; bad fits are replaced."""
     printed = printed_markers(dictionary)
     for _ in range(3):  # each round's markers predict farther ones better
-        more = _round(srgb, found, corners_mm, printed)
+        more = _round(srgb, view, corners_mm, printed)
         if not more:
             break
-        kept = {i: b for i, b in found.markers.items() if i not in more}
-        found = MarkersInView(dict(sorted((kept | more).items())), found.foreign, found.doubled)
-    return found
+        kept = {i: b for i, b in view.markers.items() if i not in more}
+        view = MarkersInView(dict(sorted((kept | more).items())), view.foreign, view.doubled)
+    return view
 
 
-def _round(srgb, found: MarkersInView, corners_mm, printed) -> dict[int, Borders]:
+def _round(srgb, view: MarkersInView, corners_mm, printed) -> dict[int, Borders]:
     """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
-    sure = {i for i, b in found.markers.items() if b.fitted}
-    predicted = _predicted(srgb, found, {i: mm for i, mm in corners_mm.items() if i not in sure}, corners_mm)
+    sure = {i for i, b in view.markers.items() if b.fitted}
+    predicted = _predicted(srgb, view, {i: mm for i, mm in corners_mm.items() if i not in sure}, corners_mm)
     if not predicted:
         return {}
     ids = sorted(predicted)
@@ -114,10 +114,10 @@ def _round(srgb, found: MarkersInView, corners_mm, printed) -> dict[int, Borders
     }
 
 
-def _predicted(srgb, found: MarkersInView, missing_mm, corners_mm) -> dict[int, np.ndarray] | None:
+def _predicted(srgb, view: MarkersInView, missing_mm, corners_mm) -> dict[int, np.ndarray] | None:
     """Where the fitted markers say that missing ones lie in the picture, by id; None where they cannot tell."""
     try:
-        px_from_mm = fit_page({i: b.corners_px for i, b in found.markers.items() if b.fitted}, corners_mm).px_from_mm
+        px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
     except (CannotJudge, np.linalg.LinAlgError):
         return None
     quads = {i: apply_homography(px_from_mm, np.asarray(mm)) for i, mm in missing_mm.items()}
@@ -149,5 +149,5 @@ def _reads(srgb: np.ndarray, borders: Borders, code: np.ndarray) -> bool:
     low, high = np.floor(centers.min(0)).astype(int) - 1, np.ceil(centers.max(0)).astype(int) + 1
     low, high = np.maximum(low, 0), np.minimum(high, [srgb.shape[1], srgb.shape[0]])
     light = luminance(np.ascontiguousarray(srgb[low[1] : high[1], low[0] : high[0]]))
-    seen = sample(light, centers - low)[inner.ravel()]
-    return float(seen.std()) > 1e-6 and float(np.corrcoef(seen, code[inner])[0, 1]) > LEAST_CORRELATION
+    cells = sample(light, centers - low)[inner.ravel()]
+    return float(cells.std()) > 1e-6 and float(np.corrcoef(cells, code[inner])[0, 1]) > LEAST_CORRELATION

@@ -66,22 +66,22 @@ def find_markers(
     every one of a set in `or_all_of`.
     """
     printed = printed_markers(dictionary)
-    seen: dict[int, list[np.ndarray]] = {}
+    detections: dict[int, list[np.ndarray]] = {}
     for level in levels(srgb, whole(srgb)):
-        look(srgb, whole(srgb), level, printed, seen)
-        if any(wanted <= seen.keys() for wanted in (expected, *or_all_of)):
+        look(srgb, whole(srgb), level, printed, detections)
+        if any(wanted <= detections.keys() for wanted in (expected, *or_all_of)):
             break
-    return fitted(srgb, seen, set(expected) | set(also), printed)
+    return fitted(srgb, detections, set(expected) | set(also), printed)
 
 
-def fitted(srgb: np.ndarray, seen: dict[int, list[np.ndarray]], ours: Set[int], printed) -> MarkersInView:
-    """What was `seen` with borders fitted in the full photograph."""
-    known = sorted(seen.keys() & ours)
-    rough = np.array([seen[marker_id][0] for marker_id in known]).reshape(-1, 4, 2)
+def fitted(srgb: np.ndarray, detections: dict[int, list[np.ndarray]], ours: Set[int], printed) -> MarkersInView:
+    """`detections` with borders fitted in the full photograph."""
+    known = sorted(detections.keys() & ours)
+    rough = np.array([detections[marker_id][0] for marker_id in known]).reshape(-1, 4, 2)
     borders = refine(srgb, rough, cells_of(printed, known)) if known else []
     markers = {i: b for i, b in zip(known, borders, strict=True) if possible(b.corners_px)}
-    foreign = tuple(sorted(seen.keys() - set(known)))
-    return MarkersInView(markers, foreign, tuple(i for i in known if len(seen[i]) > 1))
+    foreign = tuple(sorted(detections.keys() - set(known)))
+    return MarkersInView(markers, foreign, tuple(i for i in known if len(detections[i]) > 1))
 
 
 def printed_markers(dictionary: str):
@@ -134,8 +134,8 @@ def levels(srgb: np.ndarray, box: Box, coarsest_px: int = COARSEST_PX) -> Iterat
             yield Level(2.0, picture)
 
 
-def look(srgb: np.ndarray, box: Box, level: Level, printed, seen: dict[int, list[np.ndarray]]) -> None:
-    """Add to `seen` the corners, in the full photograph's pixels, of what one level shows of a part of it."""
+def look(srgb: np.ndarray, box: Box, level: Level, printed, detections: dict[int, list[np.ndarray]]) -> None:
+    """Add to `detections` the corners, in the full photograph's pixels, of what one level shows of a part of it."""
     x0, y0, x1, y1 = box
     if (x1 - x0) * (y1 - y0) * level.scale**2 > LARGEST_LEVEL_PX:
         return
@@ -148,7 +148,7 @@ def look(srgb: np.ndarray, box: Box, level: Level, printed, seen: dict[int, list
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
     to_full = np.array([(x1 - x0) / size[0], (y1 - y0) / size[1]])
     for marker_id, quad in _detect(picture, printed, level.scale * max(srgb.shape)):
-        _add(seen, marker_id, quad * to_full + [x0, y0])
+        _add(detections, marker_id, quad * to_full + [x0, y0])
 
 
 def light_picture(srgb: np.ndarray) -> np.ndarray:
@@ -197,9 +197,9 @@ def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int
             yield int(marker_id), quad
 
 
-def _add(seen: dict[int, list[np.ndarray]], marker_id: int, corners: np.ndarray) -> None:
+def _add(detections: dict[int, list[np.ndarray]], marker_id: int, corners: np.ndarray) -> None:
     """Remember one detection; the same marker seen again at another level is not a second one."""
-    others = seen.setdefault(marker_id, [])
+    others = detections.setdefault(marker_id, [])
     size = np.linalg.norm(corners[2] - corners[0])
     if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > 0.5 * size for other in others):
         others.append(corners)

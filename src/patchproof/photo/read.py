@@ -50,9 +50,8 @@ def read_photo(path: str | Path) -> Photo:
             with Image.open(path, formats=readable_formats()) as image:
                 pixels = image.width * image.height
                 if pixels > LARGEST_PX:
-                    raise _unreadable(
-                        f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX
-                    )
+                    advice = f"{pixels / 1e6:.0f} megapixels are too many: save it smaller"
+                    raise _unreadable(advice, pixels, LARGEST_PX)
                 focal_35mm = _focal_35mm(image)
                 # turning and converting copy the picture, which for most is not needed and takes as long as decoding
                 turned = image.getexif().get(_ORIENTATION, 1) != 1
@@ -75,9 +74,8 @@ def list_photos(folder: str | Path) -> list[Path]:
         raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
     paths = pictures_in(folder)
     if not paths:
-        raise Refused(
-            f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}", "none", "copy the photographs there"
-        )
+        expected = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}"
+        raise Refused(expected, "none", "copy the photographs there")
     return paths
 
 

@@ -20,9 +20,8 @@ from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import Scene, build_scene
-from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
-from patchproof.sheets.chart_page import chart_sheet
 from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.sheets.piece import MODULES, control_design, lay_out_piece
 from patchproof.sheets.plan_page import PlanPage, edges_mm

@@ -179,20 +179,17 @@ def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, exten
     width, height = size_mm
     across, along = c * width + s * height, s * width + c * height
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
-        raise Refused(
-            f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)",
-            f"{across:.0f} × {along:.0f} mm with its frame of markers",
-            "make the patch smaller or choose a larger side",
-        )
+        expected = f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)"
+        got = f"{across:.0f} × {along:.0f} mm with its frame of markers"
+        raise Refused(expected, got, "make the patch smaller or choose a larger side")
 
 
 def placement_warnings(gap: float, overhang: float, size_mm) -> tuple[str, ...]:
     """What a user should hear about a gap in mm and an overhang as a share."""
     notes = []
     if gap > WARN_GAP_SHARE * min(size_mm):
-        notes.append(
-            f"the piece stands up to {gap:.0f} mm ({gap / min(size_mm):.0%} of its shorter edge) off the surface"
-        )
+        share = f"{gap / min(size_mm):.0%} of its shorter edge"
+        notes.append(f"the piece stands up to {gap:.0f} mm ({share}) off the surface")
     if overhang > WARN_OVERHANG_SHARE:
         notes.append(f"{overhang:.0%} of the piece overhangs the object")
     return tuple(notes)

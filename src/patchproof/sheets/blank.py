@@ -1,9 +1,10 @@
-"""Blank sheets: a page whose piece carries markers and swatches but no design, printed before there is a scene.
+"""Pages without a design, printed before there is a run: a blank piece, or a color chart alone.
 
-In: a template with a [blank] table. Out: BLANK.pdf and BLANK.json. Photographs of the object with this piece on it show
-where a design of the same size would lie and what light falls on it; that is all that a photographed scene needs. The
-sheet id is a hash of the template, so equal templates give equal pages. The manifest carries no design, but its cut
-line and markers say all about the piece: `blank_piece_mm` reads its two sizes back.
+In: a template. Out: a PDF and its JSON; the sheet id is a hash of the template, so equal templates give equal pages.
+A template with a [blank] table has a piece with markers and swatches: photographs of the object with it show where a
+design of the same size would lie and what light falls on it, all that a photographed scene needs. Its cut line and
+markers say all about the piece: `blank_piece_mm` reads its two sizes back. A template without a place for a piece is a
+chart, printed to learn what a printer does to colors; nothing is cut, but its `cut_mm` is what photographs are to show.
 """
 
 from __future__ import annotations
@@ -11,40 +12,56 @@ from __future__ import annotations
 from pathlib import Path
 
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.piece import frame_mm, lay_out_piece, sheet_id
-from patchproof.sheets.template import load_template, template_names
-from patchproof.sheets.write import write_sheet
+from patchproof.sheets.page import lay_out_parts
+from patchproof.sheets.pdf import Printed
+from patchproof.sheets.piece import frame_mm, lay_out_piece, marker_ids, sheet_id
+from patchproof.sheets.template import Template, load_template, template_names
+from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets, write_sheet
 from patchproof.strict import Refused
+
+BLANK, CHART = "blank", "chart"
 
 
 def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     """Write the blank page of a template (a shipped one's name, or a TOML file) and its manifest beside it."""
     page = load_template(template)
     if page.blank is None:
-        raise Refused(
-            "a template with a [blank] table for a page without a design",
-            f"{template}",
-            f"use one of: {', '.join(template_names('blank'))}, or name the run whose design belongs on the page",
-        )
+        do = f"use one of: {', '.join(template_names(BLANK))}, or name the run whose design belongs on the page"
+        raise Refused("a template with a [blank] table for a page without a design", f"{template}", do)
     identity = sheet_id({"template": page.model_dump(mode="json")}, 0)
     return write_sheet(
         pdf_path,
         template=page,
-        piece=lay_out_piece(page.blank.design_mm, page.blank.marker_mm, identity, "blank"),
+        piece=lay_out_piece(page.blank.design_mm, page.blank.marker_mm, identity, BLANK),
         sheet_id=identity,
-        kind="blank",
+        kind=BLANK,
         design_srgb8=None,
         promise=None,
-        settings={"blank": page.blank.model_dump(mode="json")},
+        settings={BLANK: page.blank.model_dump(mode="json")},
     )
+
+
+def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
+    """Write the chart's page and its manifest beside it."""
+    pdf_path = pdf_name(pdf_path)
+    identity = sheet_id({"template": template.model_dump(mode="json")}, 0)
+    ids = marker_ids(identity, BLANK, len(template.marker.corners_mm))  # a chart has an id of its own, so no kind
+    grid = template.chart
+    words = {"sheet_id": identity, "kind": CHART, "swatches": str(grid.columns * grid.rows)}
+    page = lay_out_parts(template, [], ids, qr_text(identity, CHART, None), words)
+    pitch = grid.swatch_mm + grid.gap_mm
+    width, height = (round(count * pitch - grid.gap_mm, 6) for count in (grid.columns, grid.rows))
+    cut_mm = (*grid.corner_mm, width, height)
+    manifest = page_manifest(page, template, cut_mm, identity, CHART, {CHART: grid.model_dump(mode="json")})
+    save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
+    return manifest
 
 
 def blank_piece_mm(manifest: Manifest) -> tuple[tuple[float, float], float]:
     """(design's width and height, marker size) of a blank sheet, from its cut line and the first marker in it."""
-    if manifest.kind != "blank":
-        raise Refused(
-            "the manifest of a blank sheet", f'one of kind "{manifest.kind}"', "name the JSON beside BLANK.pdf"
-        )
+    if manifest.kind != BLANK:
+        got = f'one of kind "{manifest.kind}"'
+        raise Refused("the manifest of a blank sheet", got, "name the JSON beside BLANK.pdf")
     (x0, _), (x1, _) = manifest.markers[0].corners_mm[:2]  # the piece's markers come first
     marker_mm = round(x1 - x0, 4)
     width, height = (round(side - 2 * frame_mm(marker_mm), 4) for side in manifest.cut_mm[2:])

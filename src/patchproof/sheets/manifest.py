@@ -47,9 +47,8 @@ class Design(Strict):
                 raise ValueError("size")
             pixels = np.asarray(image.convert("RGB"))
         except Exception as error:
-            raise Refused(
-                "the design's pixels in the manifest", "none that can be read", "make the sheet again"
-            ) from error
+            expected = "the design's pixels in the manifest"
+            raise Refused(expected, "none that can be read", "make the sheet again") from error
         if design_sha256(pixels) != self.sha256:
             raise Refused("the design that the manifest names", "other pixels", "make the sheet again")
         return pixels
