@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
+MM_PER_INCH = 25.4
+
 
 def orbit(azimuth_deg, elevation_deg, forward, up=(0.0, 1.0, 0.0)) -> np.ndarray:
     """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to its right when

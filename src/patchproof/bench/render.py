@@ -8,12 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -26,10 +23,11 @@ from patchproof.channel.camera import encoded
 from patchproof.goal import Goal
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import from_pixels
+from patchproof.output import image_pixels
 from patchproof.render.photograph import expose, shade
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import see
-from patchproof.reprints.reprint import take_photo
+from patchproof.reprints.hung_sheet import take_photo
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 
@@ -100,12 +98,10 @@ def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -
         return classifier.confidence(classifier.logits(picture), indices).numpy()
 
     truth = []
-    with torch.no_grad(), TemporaryDirectory() as folder:
+    with torch.no_grad():
         for i in range(views):
-            path = Path(folder) / f"{i}.jpg"
-            take_photo(problem.stage, shown, conditions[i : i + 1], path)
-            with Image.open(path) as image:
-                truth.append(photographed(from_pixels(np.asarray(image))[None])[0])
+            photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
+            truth.append(photographed(from_pixels(photo)[None])[0])
             on_stage("photographs", i + 1, views)
 
     def pictures(side: int, picture: PiecePicture, part: Conditions) -> Tensor:

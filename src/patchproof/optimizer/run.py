@@ -22,6 +22,7 @@ import torch
 from PIL import Image
 
 import patchproof
+from patchproof.color import codes_of
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, promise_from, try_out
@@ -254,7 +255,7 @@ def _placement(scene: Scene) -> dict[str, Any] | None:
 
 def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:
     """The step's training views side by side."""
-    pixels = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+    pixels = codes_of(pictures).permute(0, 2, 3, 1).cpu().numpy()
     rows = -(-len(pixels) // columns)
     count, height, width, _ = pixels.shape
     blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)

@@ -9,7 +9,7 @@ Left out on purpose: what lies in front of the piece (a hand, a handle); the new
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
@@ -37,6 +37,9 @@ class FlatScene(Protocol):
     warnings: tuple[str, ...]
     unreadable_share: float
     photo_px: tuple[int, int]
+
+    def with_template(self, name: str) -> FlatScene:
+        """The scene for a page of another template."""
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
@@ -167,20 +170,23 @@ def pick(choice: np.ndarray, count: int) -> np.ndarray:
     return np.minimum((choice * count).astype(np.int64), count - 1)
 
 
-def with_unreadable_share(scene):
-    """The scene with the share of its views in which a module of the piece's markers is under `PX_PER_MODULE` along its
-    foreshortened side, and a warning where that is more than one in twenty.
+def unreadable_share(scene: FlatScene) -> float:
+    """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE` along its foreshortened
+    side.
     """
     small = []
     for homography in scene.piece_homographies(scene.draw("select", VIEWS_TRIED, 0), scene.photo_px):
         mean, tilt_deg = local_scale(homography, np.array(scene.piece.size_mm) / 2)
         small.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) * scene.piece.module_mm)
-    share = float((np.array(small) < PX_PER_MODULE * 0.999).mean())
-    warnings = scene.warnings
-    if share > 1 - READABLE_SHARE:
-        marker_mm = scene.piece.module_mm * MODULES
-        warnings += (f"markers of {marker_mm:.1f} mm will be unreadable in {share:.0%} of the views",)
-    return replace(scene, unreadable_share=share, warnings=warnings)
+    return float((np.array(small) < PX_PER_MODULE * 0.999).mean())
+
+
+def unreadable_warning(scene: FlatScene) -> tuple[str, ...]:
+    """A warning where more than one view in twenty is unreadable."""
+    if scene.unreadable_share <= 1 - READABLE_SHARE:
+        return ()
+    marker_mm = scene.piece.module_mm * MODULES
+    return (f"markers of {marker_mm:.1f} mm will be unreadable in {scene.unreadable_share:.0%} of the views",)
 
 
 def closest_px_per_mm(scene: FlatScene, size_px: tuple[int, int]) -> float:

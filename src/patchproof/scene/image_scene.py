@@ -17,6 +17,7 @@ from __future__ import annotations
 import csv
 import hashlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -58,8 +59,25 @@ class ImageScene:
     sheet_id: str
     piece: Piece
     images: tuple[flat.Picture, ...]
-    warnings: tuple[str, ...]
-    unreadable_share: float = 0.0
+    notes: tuple[str, ...]
+
+    def with_template(self, name: str) -> ImageScene:
+        """The scene for a page of another template: its sheet id and the piece's frame anew."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        identity = sheet_id(identifying(settings), self.seed)
+        return replace(self, settings=settings, sheet_id=identity, piece=_piece(settings, identity))
+
+    @cached_property
+    def unreadable_share(self) -> float:
+        """The share of the views in which markers are too small to be read."""
+        return flat.unreadable_share(self)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader should know before anything is optimized."""
+        return (*self.notes, *flat.unreadable_warning(self))
 
     @property
     def photo_px(self) -> tuple[int, int]:
@@ -151,7 +169,7 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
     if len(images) < SPLIT_FROM:
         warnings.append(f"the promise is made on the same {len(images)} images that the patch is optimized on")
-    return flat.with_unreadable_share(ImageScene(settings, base, seed, identity, piece, images, tuple(warnings)))
+    return ImageScene(settings, base, seed, identity, piece, images, tuple(warnings))
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:

@@ -8,7 +8,7 @@ piece lies, and the camera of every drawn view. Where the object's own texture i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,11 +50,36 @@ class MeshScene:
     unreadable_share: float  # of the views in which a marker's module is under PX_PER_MODULE
     warnings: tuple[str, ...]
     canvas: Canvas | None = None  # what of the object's own texture may change
-    camera: lens.Camera | None = field(default=None)  # a calibrated one
+    camera: lens.Camera | None = None  # a calibrated one
+
+    def with_template(self, name: str) -> MeshScene:
+        """The scene for a page of another template: its sheet id, the piece's frame and where the piece lies anew."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        scene = replace(self, settings=settings, sheet_id=sheet_id(identifying(settings), self.seed))
+        return scene if scene.canvas is not None else _with_piece(scene)
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
         return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+
+    @property
+    def placed(self) -> Placement:
+        """Where the piece lies; refused where there is only the object."""
+        if self.placement is None:
+            raise Refused("a scene with a patch", "one of the object's own texture", 'leave patch.kind out, or "patch"')
+        return self.placement
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
+        return self.placed.is_flat and not (self.camera is not None and self.camera.bends)
+
+    @property
+    def length_mm(self) -> float:
+        """The object's longest extent."""
+        return float(np.ptp(self.mesh.vertices, axis=0).max())
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -113,26 +138,22 @@ def load_mesh_scene(settings: SceneSettings, base: Path, seed: int, identity: st
     frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings), seed)
     backgrounds = load_backgrounds(settings.background, base)
     calibrated = None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px)
-    ground = {"settings": settings, "base": base, "seed": seed, "frame": frame, "backgrounds": backgrounds}
-    ground |= {"sheet_id": identity, "camera": calibrated}
+    canvas, warnings = None, mesh.warnings
     if settings.patch.kind != "patch":
         canvas = texture_canvas(mesh, settings.patch, base)
-        notes = (*mesh.warnings, *canvas.warnings)
-        return MeshScene(
-            mesh=canvas.mesh, placement=None, piece=None, unreadable_share=0.0, warnings=notes, canvas=canvas, **ground
-        )
-    piece, placement, unreadable, notes = _hang(settings, mesh, frame, identity, calibrated)
-    notes = (*mesh.warnings, *placement.warnings, *notes)
-    return MeshScene(mesh=mesh, placement=placement, piece=piece, unreadable_share=unreadable, warnings=notes, **ground)
+        mesh, warnings = canvas.mesh, (*warnings, *canvas.warnings)
+    scene = MeshScene(
+        settings, base, seed, mesh, frame, None, None, backgrounds, identity, 0.0, warnings, canvas, calibrated
+    )
+    return scene if canvas is not None else _with_piece(scene)
 
 
-def _hang(
-    settings: SceneSettings, mesh: Mesh, frame: Frame, identity: str, camera
-) -> tuple[Piece, Placement, float, tuple[str, ...]]:
-    """The piece with markers as large as the views need, and where it lies."""
+def _with_piece(scene: MeshScene) -> MeshScene:
+    """The scene with its piece, whose markers are as large as the views need, and where it lies."""
+    settings, mesh, frame = scene.settings, scene.mesh, scene.frame
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
     design_mm = (patch.width_mm, patch.height_mm)
-    scales = _smallest_scales(settings, mesh, frame, place(mesh, frame, design_mm, patch.spin_deg), camera)
+    scales = _smallest_scales(scene, place(mesh, frame, design_mm, patch.spin_deg))
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
@@ -140,12 +161,13 @@ def _hang(
     page_mm = largest_piece_mm(template)
     largest_mm = page_mm if patch.bend else tuple(min(a, b) for a, b in zip(frame.extent_mm, page_mm, strict=True))
     marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
-    piece = lay_out_piece(design_mm, marker_mm, identity, "design")
+    piece = lay_out_piece(design_mm, marker_mm, scene.sheet_id, "design")
     if template.tiles is not None:
         plan_tiles(template, piece)  # refuses what no sheet could be made of, before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
     placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
-    return piece, placement, unreadable, _unreadable_warning(unreadable, marker_mm)
+    warnings = (*mesh.warnings, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
+    return replace(scene, placement=placement, piece=piece, unreadable_share=unreadable, warnings=warnings)
 
 
 def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) -> MeshScene:
@@ -165,15 +187,11 @@ def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, co
     return geometry.look_at(eyes, targets, conditions.roll_deg, frame.up)
 
 
-def _smallest_scales(settings: SceneSettings, mesh: Mesh, frame: Frame, card: Placement, camera) -> np.ndarray:
+def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
-    conditions = draw(settings, "select", _VIEWS_TRIED, 0)
-    poses = camera_poses(settings, mesh, frame, card.center_mm, conditions)
-    photo_px = settings.camera.photo_px
-    matrix = (
-        geometry.intrinsics(settings.view.fov_deg, photo_px) if camera is None else lens.matrix_px(camera, photo_px)
-    )
-    scales = []
+    conditions = scene.draw("select", _VIEWS_TRIED, 0)
+    poses = camera_poses(scene.settings, scene.mesh, scene.frame, card.center_mm, conditions)
+    matrix, scales = scene.matrix_px(scene.settings.camera.photo_px), []
     for pose in poses:
         eye = -pose[:3, :3].T @ pose[:3, 3]
         if (eye - card.center_mm) @ card.normal <= 0:

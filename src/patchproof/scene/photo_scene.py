@@ -17,7 +17,8 @@ code that a judged photograph would get.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_piece_mm
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.piece import Piece, lay_out_piece, sheet_id
+from patchproof.sheets.piece import Piece, lay_out_piece, sheet_id, with_ids
 from patchproof.sheets.template import load_template
 from patchproof.strict import Refused, expand
 
@@ -68,8 +69,27 @@ class PhotoScene:
     sheet_id: str
     piece: Piece
     photos: tuple[Seen, ...]
-    warnings: tuple[str, ...]
-    unreadable_share: float = 0.0
+    notes: tuple[str, ...]
+    known: dict[str, str]  # which blank and which photographs: a part of the sheet id
+
+    def with_template(self, name: str) -> PhotoScene:
+        """The scene for a page of another template: its sheet id and the markers' own anew, nothing moved."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        _refuse_larger_than_page(settings, self.piece)
+        identity = sheet_id(identifying(settings) | self.known, self.seed)
+        return replace(self, settings=settings, sheet_id=identity, piece=with_ids(self.piece, identity, "design"))
+
+    @cached_property
+    def unreadable_share(self) -> float:
+        """The share of the views in which markers are too small to be read."""
+        return flat.unreadable_share(self)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader should know before anything is optimized."""
+        return (*self.notes, *flat.unreadable_warning(self))
 
     @property
     def photo_px(self) -> tuple[int, int]:
@@ -156,7 +176,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
             warnings.append(
                 f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
             )
-    return flat.with_unreadable_share(PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings)))
+    return PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings), known)
 
 
 def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> Seen:
@@ -241,8 +261,7 @@ def _with_size(settings: SceneSettings, design_mm: tuple[float, float]) -> Scene
             f"{given[0]:g} × {given[1]:g} mm",
             "leave out width_mm and height_mm, or print a blank of that size",
         )
-    patch = patch.model_copy(update={"width_mm": design_mm[0], "height_mm": design_mm[1]})
-    return settings.model_copy(update={"patch": patch})
+    return settings.changed(patch={"width_mm": design_mm[0], "height_mm": design_mm[1]})
 
 
 def _refuse_larger_than_page(settings: SceneSettings, piece: Piece) -> None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.geometry import MM_PER_INCH
 from patchproof.sheets.fonts import font_name
 from patchproof.sheets.page import CUT_LINE_MM, PageLayout
 from patchproof.sheets.piece import marker_rects_mm
@@ -25,7 +26,7 @@ from patchproof.sheets.swatches import RectMm, Srgb
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
-POINTS_PER_MM = 72 / 25.4
+POINTS_PER_MM = 72 / MM_PER_INCH
 ATTACHMENT = "sheet.json"
 
 
