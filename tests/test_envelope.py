@@ -98,7 +98,7 @@ def test_hidden_corners_cover_their_share_of_the_piece(world, quarters):
 
 def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world):
     assert torch.equal(piece_at(world, {"mismatch": 0.0}, 0).srgb, piece_at(world, {}, 0).srgb)
-    other = world.other.apply(world.sent)[0].permute(1, 2, 0)
+    other = world.other.apply(world.sheet.sent)[0].permute(1, 2, 0)
     assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
 
 
