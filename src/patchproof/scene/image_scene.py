@@ -17,7 +17,6 @@ from __future__ import annotations
 import csv
 import hashlib
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +24,8 @@ import numpy as np
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
-from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.page import largest_piece_mm
 from patchproof.sheets.piece import (
@@ -50,7 +49,7 @@ _ERASED_CELLS = 224  # random values per side of the centered square: one a pixe
 
 
 @dataclass(frozen=True)
-class ImageScene:
+class ImageScene(flat.FlatScene):
     """A `FlatScene` whose base pictures are images of the target's class, in an order that their names decide."""
 
     settings: SceneSettings
@@ -69,26 +68,11 @@ class ImageScene:
         identity = sheet_id(identifying(settings), self.seed)
         return replace(self, settings=settings, sheet_id=identity, piece=_piece(settings, identity))
 
-    @cached_property
-    def unreadable_share(self) -> float:
-        """The share of the views in which markers are too small to be read."""
-        return flat.unreadable_share(self)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a reader should know before anything is optimized."""
-        return (*self.notes, *flat.unreadable_warning(self))
-
-    @property
-    def photo_px(self) -> tuple[int, int]:
-        """Size that images are brought to."""
-        return self.settings.camera.photo_px
-
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams: `background[:, 0]` stays in that stream's half of the images, and
         `background[:, 4]` is 1, which erases nothing, in all but training.
         """
-        drawn = draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+        drawn = super().draw(stream, n, seed, start)
         background = drawn.background.copy()
         if len(self.images) >= SPLIT_FROM:
             middle = (len(self.images) // 2) / len(self.images)
@@ -137,22 +121,6 @@ class ImageScene:
     def piece_noise(self, conditions: Conditions) -> np.ndarray:
         """No noise: N zeros."""
         return np.zeros(len(conditions))
-
-    def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
-
-    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of the piece in the closest view."""
-        return flat.closest_px_per_mm(self, size_px)
-
-    def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle."""
-        return flat.white_light(self, conditions)
-
-    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N NaN: nobody knows where the camera stood."""
-        return np.full(len(conditions), np.nan)
 
 
 def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> ImageScene:

@@ -79,7 +79,9 @@ class MeshScene:
     @property
     def length_mm(self) -> float:
         """The object's longest extent."""
-        return float(np.ptp(self.mesh.vertices, axis=0).max())
+        if self.settings.object.length_mm is None:
+            raise ValueError("a mesh has a length")
+        return self.settings.object.length_mm
 
     @property
     def middle_mm(self) -> np.ndarray:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +29,8 @@ from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.scene import flat
-from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.conditions import Conditions
 from patchproof.scene.paper_light import PaperLight, paper_light
-from patchproof.scene.resolution import design_grid
 from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_piece_mm
 from patchproof.sheets.manifest import Manifest, load_manifest
@@ -60,7 +58,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class PhotoScene:
+class PhotoScene(flat.FlatScene):
     """A `FlatScene` whose base pictures are photographs of the object with a blank sheet on it."""
 
     settings: SceneSettings
@@ -80,25 +78,6 @@ class PhotoScene:
         _refuse_larger_than_page(settings, self.piece)
         identity = sheet_id(identifying(settings) | self.known, self.seed)
         return replace(self, settings=settings, sheet_id=identity, piece=with_ids(self.piece, identity, "design"))
-
-    @cached_property
-    def unreadable_share(self) -> float:
-        """The share of the views in which markers are too small to be read."""
-        return flat.unreadable_share(self)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a reader should know before anything is optimized."""
-        return (*self.notes, *flat.unreadable_warning(self))
-
-    @property
-    def photo_px(self) -> tuple[int, int]:
-        """Size of the photographs that the scene makes."""
-        return self.settings.camera.photo_px
-
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
-        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
-        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimetres to pixels."""
@@ -124,22 +103,6 @@ class PhotoScene:
     def piece_noise(self, conditions: Conditions) -> np.ndarray:
         """N standard deviations at white, in linear light of the whole photograph."""
         return np.array([photo.light.noise for photo in self._chosen(conditions)])
-
-    def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
-
-    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of the piece in the closest view."""
-        return flat.closest_px_per_mm(self, size_px)
-
-    def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle."""
-        return flat.white_light(self, conditions)
-
-    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N NaN: nobody knows where the camera stood."""
-        return np.full(len(conditions), np.nan)
 
     def _chosen(self, conditions: Conditions) -> list[Seen]:
         return [self.photos[i] for i in flat.pick(conditions.background[:, 0], len(self.photos))]

@@ -167,7 +167,9 @@ def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
     sheet, own_px = hang_own(made, photo_px), made.scene.settings.camera.photo_px
     manifest = _at_size(sheet.manifest, made.promise, photo_px or own_px, own_px)
     model = load_classifier(made.promise.models[0].name, made.scene.base)
-    return _Hall(sheet, manifest, model, target_indices(model, manifest), made.promise.target.goal.sign, photo_px or own_px)
+    return _Hall(
+        sheet, manifest, model, target_indices(model, manifest), made.promise.target.goal.sign, photo_px or own_px
+    )
 
 
 def _at_size(manifest: Manifest, promise: Promise, photo_px: tuple[int, int], own_px: tuple[int, int]) -> Manifest:

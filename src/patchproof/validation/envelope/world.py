@@ -3,8 +3,7 @@
 In: a run and points (values of axes). Out: per point and condition whether the target was recognized, and the codes and
 corner errors of full photographs. The piece comes from the sheet's PDF, as in `reprint`. Recognition is judged at the
 promise's resolution, except where JPEG is varied: that is met at full size or not at all. Of a photograph that is to be
-measured only the window around the piece is rendered, at full resolution: the rest costs most and shows no markers.
-Left out on purpose: what else in a photograph might look like a marker.
+measured only the window around the piece is rendered (see `window`).
 """
 
 from __future__ import annotations
@@ -35,14 +34,13 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Seen, relit, see
 from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of, seen_at
-from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import Scene
 from patchproof.strict import Refused
 from patchproof.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
+from patchproof.validation.envelope.window import Frame, on_plain_ground, window
 
-_MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
 _TAPE_SRGB = 0.45  # what hides a corner
 
 
@@ -122,7 +120,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
             every = np.arange(first, len(conditions), 4)
             size = 1 if as_file else CHUNK
             for rows in (every[i : i + size] for i in range(0, len(every), size)):
-                views = _Views(world, conditions[rows], first, lambda point, _: _Frame(stages.at(point), (side, side)))
+                views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
                 for i in _by_cost(points):
                     pictures = views.at(points[i]) if not as_file else from_pixels(views.file(points[i])[0])[None]
                     out[i, rows] = _judge(world.problem, pictures)
@@ -135,12 +133,11 @@ def measured(world: World, points: Sequence[Point], conditions: Conditions) -> l
     stages = _Stages(world)
     with torch.inference_mode():
         for n in range(len(conditions)):
-            frame = lambda point, drawn: _window(world, stages.at(point), drawn)  # noqa: E731
-            views = _Views(world, conditions[[n]], n % 4, frame)
+            views = _Views(world, conditions[[n]], n % 4, lambda point, drawn: window(stages.at(point), drawn))
             for i in _by_cost(points):
                 srgb, origin_px = views.file(points[i])
                 if "curl" in points[i]:  # the middle of the picture says how rolled paper is seen
-                    srgb, origin_px = _on_plain_ground(srgb, origin_px, world.scene.settings.camera.photo_px), (0, 0)
+                    srgb, origin_px = on_plain_ground(srgb, origin_px, world.scene.settings.camera.photo_px), (0, 0)
                 drawn = conditions_at(world.scene, conditions[[n]], points[i])
                 out[i].append(_measurement(world, stages.at(points[i]).scene, drawn, srgb, origin_px))
     return out
@@ -159,19 +156,10 @@ class _Stages:
         return self._kept[key]
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """What is rendered: pictures of `size_px`, whose corner lies at `origin_px` of the photograph."""
-
-    stage: Stage
-    size_px: tuple[int, int]
-    origin_px: tuple[int, int] = (0, 0)
-
-
 class _Views:
     """Views of some conditions at one point after another; what consecutive points share is computed once."""
 
-    def __init__(self, world: World, drawn: Conditions, first: int, frame_of: Callable[[Point, Conditions], _Frame]):
+    def __init__(self, world: World, drawn: Conditions, first: int, frame_of: Callable[[Point, Conditions], Frame]):
         self._world, self._drawn, self._first, self._frame_of = world, drawn, first, frame_of
         self._kept: tuple[tuple, Seen] | None = None
         self._picture: tuple[Point, Tensor] | None = None
@@ -198,69 +186,6 @@ class _Views:
             self._picture = rest, self.at(rest, jpeg=False)
         drawn = conditions_at(self._world.scene, self._drawn, point)
         return image_pixels(jpeg_of(self._picture[1], drawn)), self._origin_px
-
-
-@dataclass(frozen=True)
-class WindowScene(MeshScene):
-    """A scene whose camera sees a part of the picture, at the same scale; its `photo_px` is the part's size."""
-
-    whole_px: tuple[int, int] = (0, 0)
-    origin_px: tuple[int, int] = (0, 0)
-
-    def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
-        """The whole picture's matrix, counted from the window's corner."""
-        matrix = super().matrix_px(self.whole_px).copy()
-        matrix[:2, 2] -= self.origin_px
-        return matrix
-
-
-@dataclass(frozen=True)
-class _WindowBackgrounds:
-    """The window's part of the whole picture's background."""
-
-    whole: Backgrounds
-    whole_px: tuple[int, int]
-    origin_px: tuple[int, int]
-
-    def picture(self, choice: np.ndarray, photo_px, size_px) -> np.ndarray:
-        x, y = self.origin_px
-        return self.whole.picture(choice, self.whole_px, self.whole_px)[y : y + size_px[1], x : x + size_px[0]]
-
-
-def _seen_through(stage: Stage, scene: MeshScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
-    """The stage as a camera sees it that shows a window of the photograph only."""
-    whole_px = scene.settings.camera.photo_px
-    parts = {field.name: getattr(scene, field.name) for field in fields(MeshScene)}
-    parts["settings"] = scene.settings.changed(camera={"photo_px": size_px})
-    parts["backgrounds"] = _WindowBackgrounds(scene.backgrounds, whole_px, origin_px)
-    return replace(stage, scene=WindowScene(**parts, whole_px=whole_px, origin_px=origin_px))
-
-
-def _window(world: World, stage: Stage, conditions: Conditions) -> _Frame:
-    """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
-    scene, whole_px = stage.scene, world.scene.settings.camera.photo_px
-    everything = _Frame(stage, whole_px)
-    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.vignetting.any():
-        return everything
-    edge = np.linspace(0, 1, 9)
-    grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placed.size_mm
-    points = seen_at(scene, conditions, grid)
-    if not np.isfinite(points).all():
-        return everything
-    margin = _MARGIN_SHARE * np.ptp(points, axis=0).max() + _MARGIN_PX
-    low = np.clip(np.floor((points.min(0) - margin) / _BLOCK) * _BLOCK, 0, None).astype(int)
-    high = np.minimum(np.ceil((points.max(0) + margin) / _BLOCK).astype(int) * _BLOCK, whole_px)
-    if (high - low < 64).any():  # outside of the picture, almost
-        return everything
-    (left, top), (width, height) = low.tolist(), (high - low).tolist()
-    return _Frame(_seen_through(stage, scene, (left, top), (width, height)), (width, height), (left, top))
-
-
-def _on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
-    """A photograph that shows `part` at `origin_px` and nothing else."""
-    srgb, (x, y) = np.full((whole_px[1], whole_px[0], 3), np.median(part, (0, 1)).astype(np.uint8)), origin_px
-    srgb[y : y + part.shape[0], x : x + part.shape[1]] = part
-    return srgb
 
 
 def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px) -> Measurement:
