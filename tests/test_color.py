@@ -7,9 +7,11 @@ import torch
 from patchproof.color import (
     LUMINANCE,
     ciede2000,
+    codes_of,
     lab_from_linear,
     lab_from_srgb,
     linear_from_srgb,
+    photo_codes_of,
     srgb_from_linear,
 )
 
@@ -125,3 +127,14 @@ def test_single_precision_is_good_enough():
     exact = ciede2000(*lab_from_srgb(srgb))
     single = ciede2000(*lab_from_srgb(torch.tensor(srgb, dtype=torch.float32))).numpy()
     np.testing.assert_allclose(single, exact, atol=2e-3)
+
+
+def test_codes_are_the_nearest_and_the_two_ways_differ_in_halves_alone():
+    halves = np.array([-1.0, 0.5 / 255, 1.5 / 255, 126.5 / 255, 254.5 / 255, 2.0])
+    assert codes_of(halves).tolist() == [0, 0, 2, 126, 254, 255]
+    assert photo_codes_of(halves).tolist() == [0, 1, 2, 127, 255, 255]
+    values = np.random.default_rng(0).random((64, 64, 3))
+    assert np.array_equal(codes_of(values), photo_codes_of(values))
+    assert np.array_equal(codes_of(torch.tensor(values)).numpy(), codes_of(values))
+    every = np.arange(256)
+    assert np.array_equal(codes_of(every / 255), every) and np.array_equal(photo_codes_of(every / 255), every)

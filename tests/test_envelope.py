@@ -17,9 +17,9 @@ from patchproof.strict import Refused
 from patchproof.study.study import run_study
 from patchproof.validation.envelope.axes import AXES, conditions_at, placed_at
 from patchproof.validation.envelope.sweeps import EnvelopeSettings, cells
+from patchproof.validation.envelope.window import window
 from patchproof.validation.envelope.world import (
     _Stages,
-    _window,
     measured,
     open_world,
     piece_at,
@@ -98,14 +98,14 @@ def test_hidden_corners_cover_their_share_of_the_piece(world, quarters):
 
 def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world):
     assert torch.equal(piece_at(world, {"mismatch": 0.0}, 0).srgb, piece_at(world, {}, 0).srgb)
-    other = world.other.apply(world.sent)[0].permute(1, 2, 0)
+    other = world.other.apply(world.sheet.sent)[0].permute(1, 2, 0)
     assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
 
 
 def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
     one = with_values(drawn[:1], noise=0.0, blur_px=0.0)
     stage, shown = _Stages(world).at({}), piece_at(world, {}, 0)
-    frame = _window(world, stage, one)
+    frame = window(stage, one)
     (x, y), (width, height) = frame.origin_px, frame.size_px
     assert width * height < 800 * 600 / 2 and x % 16 == y % 16 == 0
     whole = photograph(stage, shown, one, (800, 600), jpeg=False)[..., y : y + height, x : x + width]

@@ -27,7 +27,7 @@ from patchproof.optimizer.run import Run, load_run
 from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprints.reprint import printed_piece, take_photo
+from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
 from patchproof.scene.conditions import with_values
 from patchproof.scene.mesh_scene import MeshScene, load_mesh_scene
 from patchproof.scene.placement import place_card
@@ -131,9 +131,10 @@ def shoot(world: MeshScene, pdf: Path | None, conditions, folder: Path) -> None:
     folder.mkdir()
     stage, piece = set_stage(world), None
     if pdf is not None:
-        piece = printed_piece(pdf, load_manifest(pdf.with_suffix(".json")), world, load_printer("coated"))
+        manifest = load_manifest(pdf.with_suffix(".json"))
+        piece = HungSheet(stage, manifest, sent_pixels(pdf, manifest, world), load_printer("coated")).piece
     for i in range(len(conditions)):
-        take_photo(stage, piece, conditions[i : i + 1], folder / f"photo_{i}.jpg")
+        (folder / f"photo_{i}.jpg").write_bytes(take_photo(stage, piece, conditions[i : i + 1]))
 
 
 def optimized(folder: Path, world: MeshScene, conditions, object_: str, patch: str, goal: str) -> Journey:

@@ -56,6 +56,16 @@ def test_indices_and_accepted_labels_count(tmp_path):
     assert len(load_image_scene(settings_of("42", target={"goal": "deceive"}), folder, 0).images) == 1
 
 
+def test_another_template_is_the_scene_made_for_it(tmp_path):
+    folder = folder_of(tmp_path)
+    scene = load_image_scene(settings_of("jeep"), folder, 0)
+    made = load_image_scene(settings_of("jeep", sheet={"template": "letter"}), folder, 0)
+    changed = scene.with_template("letter")
+    assert scene.with_template("a4") is scene and changed.images is scene.images
+    assert (changed.settings, changed.sheet_id, changed.piece) == (made.settings, made.sheet_id, made.piece)
+    assert changed.warnings == made.warnings and changed.unreadable_share == made.unreadable_share
+
+
 def test_what_is_promised_was_not_optimized_on(tmp_path):
     scene = load_image_scene(settings_of("cup", background={"erasing": 0}), folder_of(tmp_path, 2 * SPLIT_FROM), 0)
     seen = {s: numbers(scene.pictures(scene.draw(s, 128), (24, 24))) for s in ("train", "select", "promise", "reprint")}

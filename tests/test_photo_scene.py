@@ -155,11 +155,21 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 
+def test_another_template_is_the_scene_made_for_it(world, scene):
+    made = load_photo_scene(settings_of(world, sheet={"template": "letter"}), world.folder, 0)
+    changed = scene.with_template("letter")
+    assert scene.with_template("a4") is scene and changed.photos is scene.photos
+    assert (changed.settings, changed.sheet_id, changed.piece) == (made.settings, made.sheet_id, made.piece)
+    assert changed.warnings == made.warnings and np.array_equal(
+        changed.piece_light(still(scene, 3)), made.piece_light(still(scene, 3))
+    )
+
+
 def test_markers_that_a_smaller_photograph_cannot_show_are_counted(scene):
     """Modules of 19 / 7 mm at about 1.1 px per mm: near 2.5 px at 800 × 600, far below it at half the size."""
     assert scene.unreadable_share < 0.5
     far = tuple(replace(p, photo_from_piece=np.diag([0.5, 0.5, 1]) @ p.photo_from_piece) for p in scene.photos)
-    assert flat.with_unreadable_share(replace(scene, photos=far, warnings=())).unreadable_share == 1
+    assert replace(scene, photos=far).unreadable_share == 1
 
 
 def test_a_square_is_the_middle_of_the_photograph(scene):

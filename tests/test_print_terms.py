@@ -26,7 +26,7 @@ from patchproof.plan.terms import Setup, scene_terms
 from patchproof.render.photograph import expose, photograph, shade
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
-from patchproof.reprints.reprint import scaled_print
+from patchproof.reprints.hung_sheet import scaled_print
 from patchproof.scene.conditions import with_values
 from patchproof.strict import Refused
 from patchproof.study.study import run_study

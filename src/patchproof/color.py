@@ -41,6 +41,18 @@ def srgb_from_linear(linear: Values) -> Values:
     return xp.sign(linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
 
 
+def codes_of(srgb):
+    """The nearest uint8 code values of sRGB, clipped to [0, 1]; halves go to even codes."""
+    xp = _library(srgb)
+    codes = xp.round(xp.clip(srgb, 0, 1) * 255)
+    return codes.astype(np.uint8) if xp is np else codes.byte()
+
+
+def photo_codes_of(srgb: np.ndarray) -> np.ndarray:
+    """The same with halves up, as photographs have always been rounded here: they keep their bytes."""
+    return (np.clip(srgb, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def lab_from_srgb(srgb):
     """CIELAB (D65, L* 0..100) of `... × 3` sRGB values."""
     return lab_from_linear(linear_from_srgb(srgb))

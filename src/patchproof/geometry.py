@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 
 UP = (0.0, 1.0, 0.0)
 
+MM_PER_INCH = 25.4
+
 
 def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, up: ArrayLike = UP) -> np.ndarray:
     """Unit direction(s) from the object to a camera: azimuth turns about `up` from `forward`, to the right of whoever

@@ -1,4 +1,4 @@
-"""Output that replaces what was there only when it is complete.
+"""Output that replaces what was there only when it is complete, and pictures as the bytes of a file.
 
 In: where a command should write. Out: a place to write to that becomes the real one at the end. What exists is refused
 unless the user asked to overwrite it, and overwriting a folder removes only what the command itself writes: a mistyped
@@ -7,13 +7,16 @@ folder loses nothing.
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from patchproof.strict import Refused
 
@@ -93,6 +96,23 @@ def write_together(contents: dict[Path, bytes]) -> None:
         for part in waiting.values():
             if part.exists():
                 part.unlink()
+
+
+def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None = None) -> bytes:
+    """uint8 sRGB H×W×3 (or with alpha) as a "PNG" or "JPEG" file; `options` are Pillow's of that kind."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind, **(options or {}))
+    return buffer.getvalue()
+
+
+def image_pixels(content: bytes) -> np.ndarray:
+    """uint8 sRGB H×W×3 of a picture file's bytes."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(content)) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def _replace(part: Path, out: Path) -> None:

@@ -7,12 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -25,11 +22,12 @@ from patchproof.claims import student_mean
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.responses import ask
+from patchproof.output import image_pixels
 from patchproof.render.photograph import expose, shade
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import see
 from patchproof.report.tables import Table
-from patchproof.reprints.reprint import take_photo
+from patchproof.reprints.hung_sheet import take_photo
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 
@@ -102,13 +100,11 @@ def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -
         logits = classifier.logits(pictures(side, world.patch.shown(design), conditions[:8]))
         torch.autograd.grad(target_loss(logits, indices, problem.scene.settings.target.goal).mean(), design)
 
-    truth = np.zeros(views)
-    with TemporaryDirectory() as folder:
+    truth = []
+    with torch.no_grad():
         for i in range(views):
-            path = Path(folder) / f"{i}.jpg"
-            take_photo(problem.stage, shown, conditions[i : i + 1], path)
-            with Image.open(path) as image:
-                truth[i] = confidence(from_pixels(np.asarray(image))[None])[0]
+            photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
+            truth.append(confidence(from_pixels(photo)[None])[0])
             on_stage("photographs", i + 1, views)
     seconds, points, rows = timed({side: lambda side=side: step(side) for side in SIDES_PX}, rounds), [], []
     for side in SIDES_PX:

@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from patchproof.color import photo_codes_of
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import detector_settings, luminance, printed_markers
 from patchproof.photo.read import list_photos, read_photo, readable_formats
@@ -112,7 +113,7 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
     """
     dictionary = printed_markers(board.dictionary)
-    light = np.clip(luminance(srgb) * 255 + 0.5, 0, 255).astype(np.uint8)
+    light = photo_codes_of(luminance(srgb))
     quads, names, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings()).detectMarkers(light)
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:

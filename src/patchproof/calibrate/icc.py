@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table
-from patchproof.color import ciede2000, lab_from_srgb
+from patchproof.color import ciede2000, codes_of, lab_from_srgb
 from patchproof.strict import Refused
 
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
@@ -36,7 +36,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
     """The printer of a profile; `licence` and `source` go into provenance, `perceptual` is the intent towards paper."""
     data = _profile_bytes(profile_path)
     show, profile = _chain(data, profile_path.name, perceptual)
-    nodes = np.round(node_colors() * 255).astype(np.uint8)
+    nodes = codes_of(node_colors())
     lut = show(nodes)
     white = lut[-1, -1, -1]
     if white.min() < 250:  # relative to its medium, paper is white by definition, up to a profile's own rounding

@@ -191,6 +191,7 @@ def reprint(
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
+    from patchproof.reprints.hung_sheet import Hanging
     from patchproof.reprints.reprint import reprint as reprint_sheet
     from patchproof.reprints.reprint import scan
 
@@ -199,9 +200,10 @@ def reprint(
         raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
     if path_traced and scan_dpi is not None:
         raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
-    made, printed = load_run(run), {"printer": printer, "print_scale": scale, "overwrite": overwrite}
+    made = load_run(run)
+    how = Hanging(printer, scale, control.value if control else None, path_traced)
     if scan_dpi is not None:
-        truth = scan(pdf, made, n, out, scan_dpi, **printed)
+        truth = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
     else:
         with progress() as bar:
             truth = reprint_sheet(
@@ -209,13 +211,12 @@ def reprint(
                 made,
                 n,
                 out,
+                how,
                 seed=seed,
-                control=control.value if control else None,
-                path_traced=path_traced,
+                overwrite=overwrite,
                 jobs=jobs,
                 cluster=cluster,
                 on_photo=lambda done, total: bar("photograph", done, total),
-                **printed,
             )
     say(f"{len(truth)} photographs: {out}")
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb, photo_codes_of, srgb_from_linear
 from patchproof.evidence.results import Color, Geometry, SwatchSeen
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
@@ -177,4 +177,4 @@ def part_around(points_px: np.ndarray, margin_px: int, shape: tuple[int, int]) -
 
 
 def _eight_bit(linear: np.ndarray) -> np.ndarray:
-    return np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
+    return photo_codes_of(srgb_from_linear(np.clip(linear, 0, 1)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from patchproof.evidence.results import Scale
 from patchproof.evidence.surface import Surface
-from patchproof.geometry import apply_homography, rect_corners
+from patchproof.geometry import MM_PER_INCH, apply_homography, rect_corners
 
 _MOST_PERSPECTIVE = 0.005  # relative change of length between opposite sides; scanners have none
 _SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
@@ -26,7 +26,7 @@ def scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Sca
     x, y, w, h = surface.rect_mm
     ends = np.array([[x, y + h / 2], [x + w, y + h / 2], [x + w / 2, y], [x + w / 2, y + h]])
     px = apply_homography(px_from_mm, ends)
-    px_per_mm = scan_dpi / 25.4
+    px_per_mm = scan_dpi / MM_PER_INCH
     across, down = np.linalg.norm(px[1] - px[0]), np.linalg.norm(px[3] - px[2])
     scales = float(across / w / px_per_mm), float(down / h / px_per_mm)
     if perspective < _MOST_PERSPECTIVE and all(_SIZES[0] < scale < _SIZES[1] for scale in scales):

@@ -11,17 +11,16 @@ yours to test.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 
 from patchproof.experiments.turntable import contact_sheet, pictures, sides
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import judged, shown_with_controls
+from patchproof.output import image_pixels
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.study import Cell, Result, Study, short_name
 from patchproof.study.trained import (
@@ -126,10 +125,9 @@ def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawin
 
 
 def _sheet(figure, one: Result) -> None:
-    from PIL import Image
 
     axes = figure.add_subplot()
-    axes.imshow(np.asarray(Image.open(io.BytesIO((one.out / one.found[one.found["sheet"]]).read_bytes()))))
+    axes.imshow(image_pixels((one.out / one.found[one.found["sheet"]]).read_bytes()))
     kinds = ("design", *CONTROLS)
     axes.set_yticks([_SHEET_PX * (i + 0.5) for i in range(len(kinds))], kinds)
     axes.set_xticks([])

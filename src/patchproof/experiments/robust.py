@@ -9,7 +9,6 @@ Source: Pestana et al., robust designs.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.experiments.turntable import (
     attributions,
     contact_sheet,
@@ -32,6 +31,7 @@ from patchproof.experiments.turntable import (
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.promise import judged
+from patchproof.output import image_pixels
 from patchproof.report.tables import Drawing, Table
 from patchproof.settings import SceneSettings
 from patchproof.strict import validated
@@ -142,7 +142,7 @@ def _by_design(results: Sequence[Result]) -> dict[Key, list[Result]]:
 def _mean_codes(results: Sequence[Result]) -> tuple[int, int, int]:
     """The mean over designs, in light."""
     light = linear_from_srgb(np.array([one.found["color"] for one in results]) / 255).mean(0)
-    return tuple(int(code) for code in np.rint(srgb_from_linear(light) * 255))
+    return tuple(codes_of(srgb_from_linear(light)).tolist())
 
 
 def _color_row(codes: tuple[int, int, int]) -> tuple[str, int, int, int]:
@@ -226,14 +226,13 @@ def _color_grid(figure, by_design: dict[Key, list[Result]]) -> None:
 
 
 def _sheets(figure, mine: dict[tuple[str, str], Result], what: str) -> None:
-    from PIL import Image
 
     columns = _columns(mine, next(sheet[2] for sheet in _SHEETS if sheet[0] == what))
     panels = figure.subplots(math.ceil(len(mine) / columns), columns, squeeze=False).ravel()
     for axes in panels:
         axes.set_axis_off()
     for axes, ((label, network), one) in zip(panels, mine.items(), strict=False):
-        axes.imshow(np.asarray(Image.open(io.BytesIO((one.out / one.found[one.found[what]]).read_bytes()))))
+        axes.imshow(image_pixels((one.out / one.found[one.found[what]]).read_bytes()))
         axes.set_title(f"{label}, {network}", fontsize=8, loc="left", pad=2)
 
 

@@ -11,7 +11,6 @@ over conditions, of the designs that were trained: another seed's design may do 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +22,7 @@ from patchproof.claims import Estimate, rate
 from patchproof.experiments.turntable import contact_sheet, pictures, sides, three_views
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import judged, shown_with_controls
+from patchproof.output import image_pixels
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.study import Cell, Result, Study, short_name
@@ -210,14 +210,13 @@ def _heat_map(figure, by_row: dict[str, list[Result]]) -> None:
 
 
 def _sheets(figure, by_row: dict[str, list[Result]]) -> None:
-    from PIL import Image
 
     for axes, (row, cells_of_row) in zip(
         figure.subplots(len(by_row), 1, squeeze=False)[:, 0], by_row.items(), strict=True
     ):
         one = cells_of_row[0]
         content = (one.out / one.found[one.found["sheet"]]).read_bytes()
-        axes.imshow(np.asarray(Image.open(io.BytesIO(content))))
+        axes.imshow(image_pixels(content))
         axes.set_title(row, fontsize=8, loc="left", pad=2)
         axes.set_axis_off()
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from patchproof.channel.effects import EFFECT, Light, Pose, Sensor
-from patchproof.color import srgb_from_linear
+from patchproof.color import codes_of, srgb_from_linear
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose, shade
@@ -69,7 +69,7 @@ def pictures(problem: Problem, shown: Shown, conditions: Conditions, side_px: in
 def contact_sheet(rows: list[Tensor]) -> bytes:
     """Pictures N×3×S×S, one row each, as one PNG."""
     lines = [torch.cat(list(row), 2) for row in rows]
-    return png((torch.cat(lines, 1).clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy())
+    return png(codes_of(torch.cat(lines, 1)).permute(1, 2, 0).cpu().numpy())
 
 
 def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
@@ -77,8 +77,7 @@ def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tupl
     seen = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
     with torch.no_grad():
         light = shade(seen, shown).permute(0, 2, 3, 1).reshape(-1, 3)[seen.on_object.pixel]
-    codes = srgb_from_linear(light.double().mean(0)) * 255
-    return tuple(int(code) for code in codes.round().clamp(0, 255))
+    return tuple(codes_of(srgb_from_linear(light.double().mean(0))).tolist())
 
 
 def attributions(problem: Problem, before: Tensor, after: Tensor) -> Tensor:

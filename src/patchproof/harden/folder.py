@@ -11,7 +11,6 @@ in `images/`. Originals are judged in cells of their own, once per network.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -20,7 +19,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from PIL import Image
 from pydantic import BeforeValidator, Field
 
 from patchproof.claims import difference, rate
@@ -30,7 +28,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.harden.attacks import ATTACKS, right
 from patchproof.harden.harden import Method, harden, moved, squares
 from patchproof.harden.labeled import in_blocks, labeled_files, read_large_enough
-from patchproof.output import write_whole
+from patchproof.output import image_bytes, image_pixels, write_whole
 from patchproof.photo.cannot import CannotJudge
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Positive, Refused, Share, Strict, expand
@@ -264,12 +262,9 @@ def _hardened(settings, base: Path, values, said, originals) -> tuple[list[np.nd
     truth = [[values["indices"][name][photo["at"]] for photo in said] for name in variant["models"]]
     method, epsilon = variant["method"], variant["epsilon"]
     pictures = harden(originals, truth, networks, method, epsilon, settings.steps, settings.step_size)
-    files = {}
-    for photo, picture in zip(said, pictures, strict=True):
-        buffer = io.BytesIO()
-        Image.fromarray(picture).save(buffer, "PNG")
-        files[values["folder"] + photo["png"]] = buffer.getvalue()
-    return [np.asarray(Image.open(io.BytesIO(content)).convert("RGB")) for content in files.values()], files
+    both = zip(said, pictures, strict=True)
+    files = {values["folder"] + photo["png"]: image_bytes(picture, "PNG") for photo, picture in both}
+    return [image_pixels(content) for content in files.values()], files
 
 
 def _judged(settings, classifier: Classifier, pictures, truth: torch.Tensor) -> list[dict[str, bool]]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.mesh.mesh import Material, Mesh
 from patchproof.mesh.texels import coverage, face_counts, spans
 from patchproof.strict import Refused
@@ -161,7 +161,7 @@ def _baked(corners: np.ndarray, colors_linear: np.ndarray, size: tuple[int, int]
             light[row, column] = (weight[..., None] * colors_linear[face]).sum(1)
             empty[row, column] = False
     y, x = np.asarray(distance_transform_edt(empty, return_distances=False, return_indices=True))
-    return np.rint(255 * srgb_from_linear(light[y, x].clip(0, 1))).astype(np.uint8)
+    return codes_of(srgb_from_linear(light[y, x].clip(0, 1)))
 
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -6,10 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.color import codes_of
+
 
 def as_pixels(design_srgb: Tensor) -> np.ndarray:
     """A picture 3×h×w in [0, 1] as uint8 h×w×3."""
-    return (design_srgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+    return codes_of(design_srgb.detach()).permute(1, 2, 0).cpu().numpy()
 
 
 def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tensor:

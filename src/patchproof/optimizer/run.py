@@ -23,6 +23,7 @@ from PIL import Image
 
 import patchproof
 from patchproof.classifier.network import Classifier
+from patchproof.color import codes_of
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
@@ -269,7 +270,7 @@ def _placement(scene: Scene) -> dict[str, Any] | None:
 
 def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:
     """The step's training views side by side."""
-    pixels = (pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+    pixels = codes_of(pictures).permute(0, 2, 3, 1).cpu().numpy()
     rows = -(-len(pixels) // columns)
     count, height, width, _ = pixels.shape
     blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)

@@ -9,19 +9,18 @@ Left out on purpose: interactions of terms, but for one check of all that can go
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from patchproof.classifier.view import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.output import image_bytes, image_pixels
 from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
 from patchproof.render.photograph import Shown, expose, photograph
 from patchproof.render.pixels import PiecePicture
@@ -221,12 +220,9 @@ def _chunks(views: int, side_px: int) -> list[slice]:
 
 def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
     """Pictures N×3×H×W that were JPEG files in between."""
-    stored = []
-    for picture, stored_at in zip(pictures, quality, strict=True):
-        file = io.BytesIO()
-        Image.fromarray(as_pixels(picture)).save(file, "JPEG", quality=int(stored_at))
-        stored.append(from_pixels(np.asarray(Image.open(file)), pictures.device))
-    return torch.stack(stored)
+    both = zip(pictures, quality, strict=True)
+    files = [image_bytes(as_pixels(picture), "JPEG", {"quality": int(one)}) for picture, one in both]
+    return torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])
 
 
 def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:

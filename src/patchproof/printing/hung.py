@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from patchproof.channel.effects import Light, Pose
-from patchproof.color import srgb_from_linear
+from patchproof.color import photo_codes_of, srgb_from_linear
 from patchproof.geometry import rect_corners
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import piece_of
 from patchproof.settings import BackgroundSettings
 from patchproof.sheets.plan_page import Hung
 from patchproof.sheets.template import Template
@@ -33,7 +34,7 @@ ROOM = 1.06  # of the object's extent
 
 def hang(scene: MeshScene, template: Template) -> Hung:
     """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
-    frame, placement = scene.frame, scene.placement
+    frame, placement = scene.frame, scene.placed
     axes = np.stack([frame.right, -frame.up])  # millimetres right and down, from the middle of the object
 
     def flat(points: np.ndarray) -> np.ndarray:
@@ -45,7 +46,7 @@ def hang(scene: MeshScene, template: Template) -> Hung:
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
     if template.tiles is not None:
-        for tile in plan_tiles(template.tiles, scene.piece):
+        for tile in plan_tiles(template.tiles, piece_of(scene)):
             corners = flat(placement.world(rect_corners(tile.part_mm)))
             seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
             names.append((tuple(corners.mean(0)), tile.name))
@@ -63,11 +64,10 @@ def _picture(scene: MeshScene, half_mm: np.ndarray) -> np.ndarray:
     """uint8 H×W×3: the object in even light on white, spanning ± half_mm."""
     distance = AWAY * scene.length_mm
     px_per_mm = PICTURE_PX / (2 * half_mm.max())
-    size_px = tuple(int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
+    width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
     fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
-    settings = scene.settings.changed(
-        view={"fov_deg": fov, "look_at": "object"}, camera={"photo_px": size_px, "file": None}
-    )
+    view, camera = {"fov_deg": fov, "look_at": "object"}, {"photo_px": (width, height), "file": None}
+    settings = scene.settings.changed(view=view, camera=camera)
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
     plain = replace(scene, settings=settings, backgrounds=white, camera=None)
     conditions = Conditions(
@@ -80,9 +80,9 @@ def _picture(scene: MeshScene, half_mm: np.ndarray) -> np.ndarray:
         ),
     )
     with torch.no_grad():
-        light = see(set_stage(plain), None, conditions, size_px, supersample=2).bare
-    picture = srgb_from_linear(light.clamp(0, 1)).reshape(size_px[1], size_px[0], 3).cpu().numpy()
-    return (picture * 255 + 0.5).astype(np.uint8)
+        light = see(set_stage(plain), None, conditions, (width, height), supersample=2).bare
+    picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
+    return photo_codes_of(picture)
 
 
 def _sides(corners: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

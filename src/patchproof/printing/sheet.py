@@ -19,7 +19,7 @@ from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
 from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import Scene, build_scene
+from patchproof.scene.scene import Scene, piece_of
 from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.manifest import Manifest, Promise
@@ -65,31 +65,23 @@ def sheet_of_several(
 
 def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDesign, Scene, Template]:
     """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
-    scene, promise = run.scene, run.promise
-    settings = scene.settings
-    if scene.piece is None:
-        raise Refused(
-            "a run of a patch", "one of the object's own texture", "take object.glb and textures from the run"
-        )
-    if template is not None and template != settings.sheet.template:
-        settings = settings.model_copy(update={"sheet": settings.sheet.model_copy(update={"template": template})})
-        scene = build_scene(settings, scene.base, scene.seed)
-        if scene.piece.size_mm != run.scene.piece.size_mm and control is None:
-            problem = set_problem(scene)
-            promise = promise_from(problem, try_out(problem, run.design, scene.draw("promise", PROMISE_VIEWS)))
-    kind = control or "design"
-    piece = scene.piece
+    own, promise = piece_of(run.scene), run.promise
+    scene = run.scene if template is None else run.scene.with_template(template)
+    piece, kind = piece_of(scene), control or "design"
+    if piece.size_mm != own.size_mm and control is None:
+        problem = set_problem(scene)
+        promise = promise_from(problem, try_out(problem, run.design, scene.draw("promise", PROMISE_VIEWS)))
     if control is not None:
-        piece = lay_out_piece(piece.design_rect_mm[2:], scene.piece.module_mm * MODULES, scene.sheet_id, kind)
+        piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, scene.sheet_id, kind)
     one = OneDesign(
         piece=piece,
         sheet_id=scene.sheet_id,
         kind=kind,
         design_srgb8=run.design if control is None else control_design(kind, run.design, scene.sheet_id),
         promise=promise if control is None else None,
-        settings=settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]},
+        settings=scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]},
     )
-    return one, scene, load_template(settings.sheet.template)
+    return one, scene, load_template(scene.settings.sheet.template)
 
 
 def _plan(scene: Scene, template: Template, promise: Promise | None) -> PlanPage | None:
@@ -101,7 +93,7 @@ def _plan(scene: Scene, template: Template, promise: Promise | None) -> PlanPage
         placed = [
             f"Seen as you face the object's {scene.settings.patch.side} side. From the piece's cut edge to the "
             f"outermost edges of that side: {edges}.",
-            f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.placement.reason}.",
+            f"The piece is {size_text(piece_of(scene).size_mm)} mm; {scene.placed.reason}.",
         ]
         if template.tiles is not None:
             placed.append(

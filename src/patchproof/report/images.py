@@ -7,13 +7,12 @@ reports, so that two reports can be laid side by side.
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from patchproof.output import make_folder
+from patchproof.output import image_bytes, make_folder
 
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
@@ -23,12 +22,12 @@ _PNG = b"\x89PNG"
 
 def jpeg(pixels: np.ndarray) -> bytes:
     """uint8 sRGB as JPEG, for photographs."""
-    return _encoded(pixels, "JPEG", {"quality": _JPEG_QUALITY, "optimize": True})
+    return image_bytes(pixels, "JPEG", {"quality": _JPEG_QUALITY, "optimize": True})
 
 
 def png(pixels: np.ndarray) -> bytes:
     """uint8 sRGB or sRGB with alpha as PNG, for flat colors."""
-    return _encoded(pixels, "PNG", {"optimize": True})
+    return image_bytes(pixels, "PNG", {"optimize": True})
 
 
 def encoded(kinds: Mapping[str, np.ndarray]) -> dict[str, bytes]:
@@ -68,11 +67,3 @@ def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     colors[np.isnan(delta_e00), 3] = 0
     zoom = max(1, longer_px // max(delta_e00.shape))
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
-
-
-def _encoded(pixels: np.ndarray, kind: str, options: dict) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind, **options)
-    return buffer.getvalue()

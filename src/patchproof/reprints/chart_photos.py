@@ -7,7 +7,6 @@ and a lamp near the page), blur, noise, vignetting and clipping are those of `ch
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from PIL import Image
 
 from patchproof import geometry
 from patchproof.channel.camera import develop
@@ -24,7 +22,8 @@ from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.light import Lamp, Lighting, irradiance
 from patchproof.channel.tone import codes_of_light
-from patchproof.color import linear_from_srgb
+from patchproof.color import codes_of, linear_from_srgb, photo_codes_of
+from patchproof.output import image_bytes, image_pixels
 from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
 from patchproof.sheets.chart import chart_colors
@@ -81,7 +80,7 @@ def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
         where = (30 * PX_PER_MM, at * PX_PER_MM)
         cv2.putText(page, f"{line} what stands beside a chart is not white paper", where, 0, 0.9, (0, 0, 0), 2)
     for swatch in manifest.chart:
-        _fill(page, swatch.rect_mm, np.rint(np.array(swatch.srgb) * 255))
+        _fill(page, swatch.rect_mm, codes_of(np.array(swatch.srgb)))
     white = shows(np.ones((1, 3)))
     packed, index = np.unique(page.reshape(-1, 3) @ np.array([65536, 256, 1]), return_inverse=True)
     colors = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1) / 255
@@ -117,7 +116,8 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = torch.tensor(seen.transpose(2, 0, 1)[None], dtype=torch.float32)
     picture = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     codes = codes_of_light(linear_from_srgb(picture), camera)
-    return Shot(_stored(codes, int(sensor.jpeg[0])), at_middle * exposure * white_balance)
+    file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
+    return Shot(Photo(image_pixels(file), None, Path("page.jpg")), at_middle * exposure * white_balance)
 
 
 def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
@@ -163,9 +163,3 @@ def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
     soft = cv2.GaussianBlur(page, (0, 0), 0.35 * float(finer))  # a pixel's own width, before it is sampled once
     matrix = index_from_px @ px_from_mm @ mm_from_index
     return cv2.warpPerspective(soft, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))
-
-
-def _stored(codes: np.ndarray, quality: int) -> Photo:
-    file = io.BytesIO()
-    Image.fromarray((np.clip(codes, 0, 1) * 255 + 0.5).astype(np.uint8)).save(file, "JPEG", quality=quality)
-    return Photo(np.asarray(Image.open(file)), None, Path("page.jpg"))

@@ -64,14 +64,14 @@ class Inkjet:
         with black moved to the printer's own.
         """
         from scipy.interpolate import RegularGridInterpolator
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         ink = _grid(np.linspace(0, 1, 33))
         printable = lab_from_linear(self._printed(ink))
         wanted = lab_from_srgb(_grid(_NODES))
         darkest = printable[:, 0].min()
         wanted = wanted * [1 - darkest / 100, 1 + self.saturation, 1 + self.saturation] + [darkest, 0, 0]
-        away, index = cKDTree(printable).query(wanted, _NEAREST)
+        away, index = KDTree(printable).query(wanted, _NEAREST)
         weights = 1 / (away + 0.1) ** 2
         sent = (ink[index] * weights[..., None]).sum(1) / weights.sum(1, keepdims=True)
         sent[-1] = 0  # no driver prints on white

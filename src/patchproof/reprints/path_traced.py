@@ -9,13 +9,13 @@ out alike.
 
 Left out on purpose: colored light, transparency, scenes made of pictures.
 
-Source: Jakob et al., Mitsuba 3 renderer, 2022. Veach and Guibas, Optimally Combining Sampling Techniques for Monte
-Carlo Rendering, SIGGRAPH 1995, for why the surrounding light is sampled by the surface alone.
+Source: Jakob et al., Mitsuba 3 renderer, 2022.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from types import ModuleType
 
 import numpy as np
@@ -26,12 +26,13 @@ from patchproof import geometry
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light, Print
 from patchproof.channel.lens import Frame, distorted, pinhole_frame
-from patchproof.channel.light import irradiance_basis
 from patchproof.channel.printer import misregistered, vary
 from patchproof.color import linear_from_srgb
+from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage
+from patchproof.reprints.traced_light import lights
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.strict import Refused
@@ -40,12 +41,8 @@ from patchproof.strict import Refused
 PAPER_REFLECTANCE = 0.85
 LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
 APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
-LAMP_RADIUS_MM = 20.0
 PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels
 MOST_BOUNCES = 4  # of a path, the light included: paper lit by what paper lights
-_FAR = 20.0  # the directional light's distance in lengths of the object
-_SKY_PX = (64, 128)
-_SKY_WEIGHT = 1e-3  # of paths sent to a light on purpose; 0 is refused where there is no other light
 _SQUARE = 1e-4  # how far a pixel's sides may differ
 # Older ones end the whole process: they cannot compile the minimum that Dr.Jit asks for.
 _FIRST_LLVM = 17
@@ -78,26 +75,24 @@ def photograph_traced(
 
 def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
     """1×3×H×W linear light before lens distortion and sensor, of the size of the lens's frame."""
-    scene = stage.scene
-    _refuse_unfit(scene)
-    mi = mitsuba()
-    frame = _frame(stage)
+    scene, mi = _traceable(stage), mitsuba()
+    frame = _frame(stage, scene)
     box = _box(scene, conditions, frame, optics.aperture_mm)
     parts = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": MOST_BOUNCES, "hide_emitters": True},
         "sensor": _sensor(mi, scene, conditions, frame, box, optics.aperture_mm),
-        **_lights(mi, scene, conditions.light, optics.light_radius_deg),
-        **{f"object{i}": part for i, part in enumerate(_object(mi, stage))},
+        **lights(mi, scene, conditions.light, optics.light_radius_deg),
+        **{f"object{i}": part for i, part in enumerate(_object(mi, scene.mesh))},
     }
     if piece is not None:
         parts["piece"] = _piece(mi, scene, piece, conditions)
-    traced, total = mi.load_dict(parts), 0.0
+    left, top, width, height = box
+    traced, total = mi.load_dict(parts), np.zeros((height, width, 4))
     for i in range(PASSES):  # seeds of one view are its own
         seed = (int(conditions.sensor.noise_seed[0]) * PASSES + i) % 2**32
         total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
     whole = linear_from_srgb(_background(scene, conditions, frame) / 255.0)
-    left, top, width, height = box
     inside = whole[top : top + height, left : left + width]
     inside *= 1 - total[..., 3:].clip(0, 1)
     inside += total[..., :3] / PAPER_REFLECTANCE
@@ -110,8 +105,7 @@ def mitsuba() -> ModuleType:
     Refused where it is not installed.
     """
     try:
-        import drjit
-        import mitsuba as mi
+        drjit, mi = import_module("drjit"), import_module("mitsuba")
     except ImportError as error:
         raise Refused("Mitsuba 3 for path tracing", "none installed", "pip install 'patchproof[pathtrace]'") from error
     if mi.variant() is None:
@@ -126,19 +120,22 @@ def mitsuba() -> ModuleType:
     return mi
 
 
-def _refuse_unfit(scene) -> None:
+def _traceable(stage: Stage) -> MeshScene:
+    """The stage's scene; refused where Mitsuba cannot show it."""
+    scene = stage.scene
     if not isinstance(scene, MeshScene):
         raise Refused("a scene with a mesh to trace paths in", "one of pictures", "leave --path-traced out")
     matrix = scene.matrix_px(scene.settings.camera.photo_px)
     if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
         raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
+    return scene
 
 
-def _frame(stage: Stage) -> Frame:
-    size_px = stage.scene.settings.camera.photo_px
+def _frame(stage: Stage, scene: MeshScene) -> Frame:
+    size_px = scene.settings.camera.photo_px
     if stage.camera is not None:
         return pinhole_frame(stage.camera, size_px)
-    return Frame(size_px, stage.scene.matrix_px(size_px), 0, 0, 0, 0)
+    return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
 
 
 def _background(scene: MeshScene, conditions: Conditions, frame: Frame) -> np.ndarray:
@@ -193,76 +190,9 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
     }
 
 
-def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -> dict:
-    """The surroundings, a disk far away for the directional light, and a small sphere for the lamp.
-
-    An outgoing radiance of 1 is white: paper of reflectance ρ gives ρ·E/π, so that E is π where our light is 1.
-    """
-    found = {"sky": _sky(mi, light)}
-    frame, middle = scene.frame, scene.middle_mm
-    if light.directional[0] > 0:
-        toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)[0]
-        far, angle = _FAR * scene.settings.object.length_mm, np.radians(radius_deg)
-        place = mi.ScalarTransform4f().look_at(
-            (middle + far * toward).tolist(), middle.tolist(), _across(toward).tolist()
-        )
-        found["sun"] = {
-            "type": "disk",
-            "to_world": place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle))),
-            "emitter": _emitter(light.directional[0] / np.sin(angle) ** 2),
-        }
-    if light.point[0] > 0:
-        away = geometry.orbit(light.point_azimuth_deg, light.point_elevation_deg, frame.normal, frame.up)[0]
-        distance = float(light.point_distance_mm[0])
-        radius = min(LAMP_RADIUS_MM, distance / 4)
-        found["lamp"] = {
-            "type": "sphere",
-            "center": (middle + distance * away).tolist(),
-            "radius": radius,
-            "emitter": _emitter(light.point[0] * (distance / radius) ** 2),
-        }
-    return found
-
-
-def _emitter(radiance: float) -> dict:
-    return {"type": "area", "radiance": {"type": "rgb", "value": [float(radiance)] * 3}}
-
-
-def _across(direction: np.ndarray) -> np.ndarray:
-    """Any unit vector that is not along a direction."""
-    return np.eye(3)[np.abs(direction).argmin()]
-
-
-def _sky(mi: ModuleType, light: Light) -> dict:
-    """Light from all around; almost no paths are sent to it: those that surfaces scatter find it anyway."""
-    picture = np.repeat(sky_radiance(sky_directions(), light)[..., None], 3, -1).astype(np.float32)
-    return {"type": "envmap", "bitmap": mi.Bitmap(picture), "sampling_weight": _SKY_WEIGHT}
-
-
-def sky_directions() -> np.ndarray:
-    """H×W×3 unit directions of the pixels of Mitsuba's pictures of the surroundings: latitude by longitude, y up."""
-    height, width = _SKY_PX
-    theta, phi = (np.arange(height) + 0.5) / height * np.pi, (np.arange(width) + 0.5) / width * 2 * np.pi
-    level, up = np.sin(theta)[:, None], np.cos(theta)[:, None] * np.ones(width)
-    return np.stack([level * np.sin(phi), up, -level * np.cos(phi)], -1)
-
-
-def sky_radiance(toward: np.ndarray, light: Light) -> np.ndarray:
-    """Radiance of the surroundings in directions ...×3, whose irradiance is `channel.light`'s ambient light.
-
-    A surface sees first orders with 2/3 and second with 1/4 of the weight of an even light (A1/π and A2/π in
-    Ramamoorthi and Hanrahan, 2001). Light that would be negative is 0 here by direction, there by surface.
-    """
-    ambient, even = light.ambient[0], np.ones(toward.shape[:-1])
-    if not light.sh2.any():
-        return ambient * even
-    basis = irradiance_basis(torch.tensor(toward)).numpy() / np.repeat([2 / 3, 1 / 4], [3, 5])
-    return (ambient * (even + light.sh2[0] * basis @ light.sh2_coefficients[0])).clip(0)
-
-
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
     """The printed piece as large as it came out of the printer, plain paper on its back."""
-    placement = scene.placement
+    placement = scene.placed
     scale = geometry.scaled_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
     printed = _printed(picture, placement.size_mm, conditions.print)
@@ -293,9 +223,9 @@ def _glossy(diffuse: dict, light: Light) -> dict:
     return {"type": "blendbsdf", "weight": float(light.gloss[0] * PAPER_REFLECTANCE), "a": diffuse, "b": mirror}
 
 
-def _object(mi: ModuleType, stage: Stage) -> list:
+def _object(mi: ModuleType, mesh: Mesh) -> list:
     """One Mitsuba mesh per material, its corners apart: they have normals and texture coordinates of their own."""
-    mesh, found = stage.scene.mesh, []
+    found = []
     for number, material in enumerate(mesh.materials):
         faces = mesh.face_material == number
         count = int(faces.sum())

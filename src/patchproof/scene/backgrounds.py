@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from patchproof.color import codes_of
 from patchproof.settings import BackgroundSettings
 from patchproof.strict import Refused, expand
 
@@ -68,7 +69,7 @@ class Backgrounds:
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     """The scene's backgrounds; refused where the folder is missing, empty, or holds a picture that cannot be read."""
     if settings.images is None:
-        plain = np.round(np.array(settings.color or _PLAIN) * 255).astype(np.uint8)
+        plain = codes_of(np.array(settings.color or _PLAIN))
         return Backgrounds((plain.reshape(1, 1, 3),))
     folder = Path(expand(settings.images, base))
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from patchproof.color import codes_of
 from patchproof.mesh.mesh import Mesh
 
 _M_FROM_MM = 1e-3
@@ -56,5 +57,5 @@ def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
     if (color != 1).any():
         # trimesh writes bytes, whatever it is given
-        visual.vertex_attributes["color"] = np.rint(255 * np.insert(color, 3, 1.0, axis=1)).astype(np.uint8)
+        visual.vertex_attributes["color"] = codes_of(np.insert(color, 3, 1.0, axis=1))
     return trimesh.Trimesh(position, index.reshape(-1, 3), vertex_normals=normal, visual=visual, process=False)

@@ -9,7 +9,8 @@ Left out on purpose: what lies in front of the piece (a hand, a handle); the new
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from abc import abstractmethod
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
@@ -17,8 +18,8 @@ from typing import Protocol
 import numpy as np
 
 from patchproof.geometry import local_scale, scaled_about
-from patchproof.scene.conditions import Conditions
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
 from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import MODULES, Piece
 from patchproof.strict import Refused
@@ -34,41 +35,80 @@ class FlatScene(Protocol):
     seed: int
     sheet_id: str
     piece: Piece
-    warnings: tuple[str, ...]
-    unreadable_share: float
-    photo_px: tuple[int, int]
+    notes: tuple[str, ...]  # warnings of what was read
 
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
-        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
+    @abstractmethod
+    def with_template(self, name: str) -> FlatScene:
+        """The scene for a page of another template."""
 
+    @abstractmethod
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimetres to pixels."""
 
+    @abstractmethod
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×H×W×3 uint8 sRGB: what the views show without the new piece, before exposure and the camera's effects."""
 
+    @abstractmethod
     def piece_light(self, conditions: Conditions) -> np.ndarray:
         """N×3×6: linear light of white paper is coefficients · [1, u, v, u², uv, v²], u and v from -1 to 1 over the
         piece, right and down.
         """
 
+    @abstractmethod
     def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
         """N Gaussian sigmas of the base pictures' own blur, in pixels of the whole photograph."""
 
+    @abstractmethod
     def piece_noise(self, conditions: Conditions) -> np.ndarray:
         """N standard deviations of the base pictures' own noise, at white, in linear light of the whole photograph."""
 
+    @property
+    def photo_px(self) -> tuple[int, int]:
+        """Size of the photographs that the scene makes."""
+        return self.settings.camera.photo_px
+
+    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
+        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
+        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
         """N NaN: a picture without a known camera does not say from where it was taken."""
+        return np.full(len(conditions), np.nan)
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle."""
+        """N: the light on white paper at the piece's middle, mean of the channels."""
+        return self.piece_light(conditions)[:, :, 0].mean(1)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
         """Pixels per millimetre of the piece in the closest view."""
+        homographies = self.piece_homographies(self.draw("select", VIEWS_TRIED, 0), size_px)
+        middle = np.array(self.piece.size_mm) / 2
+        return max(float(local_scale(homography, middle)[0]) for homography in homographies)
 
     def design_px(self, network_px: int) -> tuple[int, int]:
         """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
+        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
+
+    @cached_property
+    def unreadable_share(self) -> float:
+        """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE` along its
+        foreshortened side.
+        """
+        small = []
+        for homography in self.piece_homographies(self.draw("select", VIEWS_TRIED, 0), self.photo_px):
+            mean, tilt_deg = local_scale(homography, np.array(self.piece.size_mm) / 2)
+            small.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) * self.piece.module_mm)
+        return float((np.array(small) < PX_PER_MODULE * 0.999).mean())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader should know, also where more than one view in twenty shows markers that cannot be read."""
+        if self.unreadable_share <= 1 - READABLE_SHARE:
+            return self.notes
+        marker_mm = self.piece.module_mm * MODULES
+        warning = f"markers of {marker_mm:.1f} mm will be unreadable in {self.unreadable_share:.0%} of the views"
+        return (*self.notes, warning)
 
 
 @dataclass(frozen=True)
@@ -165,34 +205,6 @@ def show(
 def pick(choice: np.ndarray, count: int) -> np.ndarray:
     """Indices below `count` of numbers in [0, 1)."""
     return np.minimum((choice * count).astype(np.int64), count - 1)
-
-
-def with_unreadable_share(scene):
-    """The scene with the share of its views in which a module of the piece's markers is under `PX_PER_MODULE` along its
-    foreshortened side, and a warning where that is more than one in twenty.
-    """
-    small = []
-    for homography in scene.piece_homographies(scene.draw("select", VIEWS_TRIED, 0), scene.photo_px):
-        mean, tilt_deg = local_scale(homography, np.array(scene.piece.size_mm) / 2)
-        small.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) * scene.piece.module_mm)
-    share = float((np.array(small) < PX_PER_MODULE * 0.999).mean())
-    warnings = scene.warnings
-    if share > 1 - READABLE_SHARE:
-        marker_mm = scene.piece.module_mm * MODULES
-        warnings += (f"markers of {marker_mm:.1f} mm will be unreadable in {share:.0%} of the views",)
-    return replace(scene, unreadable_share=share, warnings=warnings)
-
-
-def closest_px_per_mm(scene: FlatScene, size_px: tuple[int, int]) -> float:
-    """Pixels per millimetre of the piece in the closest view."""
-    homographies = scene.piece_homographies(scene.draw("select", VIEWS_TRIED, 0), size_px)
-    middle = np.array(scene.piece.size_mm) / 2
-    return max(float(local_scale(homography, middle)[0]) for homography in homographies)
-
-
-def white_light(scene: FlatScene, conditions: Conditions) -> np.ndarray:
-    """N: the light on white paper at the piece's middle, mean of the channels."""
-    return scene.piece_light(conditions)[:, :, 0].mean(1)
 
 
 def refuse_bending(settings: SceneSettings) -> None:

@@ -25,8 +25,8 @@ import numpy as np
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
-from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.page import largest_piece_mm
 from patchproof.sheets.piece import (
@@ -50,7 +50,7 @@ _ERASED_CELLS = 224  # random values per side of the centered square: one a pixe
 
 
 @dataclass(frozen=True)
-class ImageScene:
+class ImageScene(flat.FlatScene):
     """A `FlatScene` whose base pictures are images of the target's class, in an order that their names decide."""
 
     settings: SceneSettings
@@ -59,20 +59,22 @@ class ImageScene:
     sheet_id: str
     piece: Piece
     images: tuple[flat.Picture, ...]
-    warnings: tuple[str, ...]
-    unreadable_share: float = 0.0
+    notes: tuple[str, ...]
     given_glb: ClassVar[bytes | None] = None
 
-    @property
-    def photo_px(self) -> tuple[int, int]:
-        """Size that images are brought to."""
-        return self.settings.camera.photo_px
+    def with_template(self, name: str) -> ImageScene:
+        """The scene for a page of another template: its sheet id and the piece's frame anew."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        identity = sheet_id(identifying(settings), self.seed)
+        return replace(self, settings=settings, sheet_id=identity, piece=_piece(settings, identity))
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams: `background[:, 0]` stays in that stream's half of the images, and
         `background[:, 4]` is 1, which erases nothing, in all but training.
         """
-        drawn = draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+        drawn = super().draw(stream, n, seed, start)
         background = drawn.pose.background.copy()
         if len(self.images) >= SPLIT_FROM:
             middle = (len(self.images) // 2) / len(self.images)
@@ -122,22 +124,6 @@ class ImageScene:
         """No noise: N zeros."""
         return np.zeros(len(conditions))
 
-    def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
-
-    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of the piece in the closest view."""
-        return flat.closest_px_per_mm(self, size_px)
-
-    def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle."""
-        return flat.white_light(self, conditions)
-
-    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N NaN: nobody knows where the camera stood."""
-        return np.full(len(conditions), np.nan)
-
 
 def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> ImageScene:
     """The scene of a folder of images and their labels; images that cannot be read are warned about.
@@ -153,7 +139,7 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
     if len(images) < SPLIT_FROM:
         warnings.append(f"the promise is made on the same {len(images)} images that the patch is optimized on")
-    return flat.with_unreadable_share(ImageScene(settings, base, seed, identity, piece, images, tuple(warnings)))
+    return ImageScene(settings, base, seed, identity, piece, images, tuple(warnings))
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:

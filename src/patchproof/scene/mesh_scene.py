@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,12 +52,32 @@ class MeshScene:
     unreadable_share: float  # of the views in which a marker's module is under PX_PER_MODULE
     warnings: tuple[str, ...]
     canvas: Canvas | None = None  # what of the object's own texture may change
-    camera: lens.Camera | None = field(default=None)  # a calibrated one
+    camera: lens.Camera | None = None  # a calibrated one
     given_glb: bytes | None = None  # the mesh, where it was given in Python
+
+    def with_template(self, name: str) -> MeshScene:
+        """The scene for a page of another template: its sheet id, the piece's frame and where the piece lies anew."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        scene = replace(self, settings=settings, sheet_id=sheet_id(_identity(settings, self.given_glb), self.seed))
+        return scene if scene.canvas is not None else _with_piece(scene)
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
         return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+
+    @property
+    def placed(self) -> Placement:
+        """Where the piece lies; refused where there is only the object."""
+        if self.placement is None:
+            raise Refused("a scene with a patch", "one of the object's own texture", 'leave patch.kind out, or "patch"')
+        return self.placement
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
+        return self.placed.is_flat and not (self.camera is not None and self.camera.bends)
 
     @property
     def length_mm(self) -> float:
@@ -122,30 +142,44 @@ def load_mesh_scene(
     """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
     settings_object, camera = settings.object, settings.camera
     mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
-    own = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
-    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings) | own, seed)
+    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(_identity(settings, given_glb), seed)
     backgrounds = load_backgrounds(settings.background, base)
     calibrated = None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px)
-    ground = {"settings": settings, "base": base, "seed": seed, "frame": frame, "backgrounds": backgrounds}
-    ground |= {"sheet_id": identity, "camera": calibrated, "given_glb": given_glb}
+    canvas, warnings = None, mesh.warnings
     if settings.patch.kind != "patch":
         canvas = texture_canvas(mesh, settings.patch, base)
-        notes = (*mesh.warnings, *canvas.warnings)
-        return MeshScene(
-            mesh=canvas.mesh, placement=None, piece=None, unreadable_share=0.0, warnings=notes, canvas=canvas, **ground
-        )
-    piece, placement, unreadable, notes = _hang(settings, mesh, frame, identity, calibrated)
-    notes = (*mesh.warnings, *placement.warnings, *notes)
-    return MeshScene(mesh=mesh, placement=placement, piece=piece, unreadable_share=unreadable, warnings=notes, **ground)
+        mesh, warnings = canvas.mesh, (*warnings, *canvas.warnings)
+    scene = MeshScene(
+        settings,
+        base,
+        seed,
+        mesh,
+        frame,
+        None,
+        None,
+        backgrounds,
+        identity,
+        0.0,
+        warnings,
+        canvas,
+        calibrated,
+        given_glb,
+    )
+    return scene if canvas is not None else _with_piece(scene)
 
 
-def _hang(
-    settings: SceneSettings, mesh: Mesh, frame: Frame, identity: str, camera
-) -> tuple[Piece, Placement, float, tuple[str, ...]]:
-    """The piece with markers as large as the views need, and where it lies."""
+def _identity(settings: SceneSettings, given_glb: bytes | None) -> dict:
+    """What the sheet id is made of: the settings, and the mesh where it is in no file."""
+    own = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
+    return identifying(settings) | own
+
+
+def _with_piece(scene: MeshScene) -> MeshScene:
+    """The scene with its piece, whose markers are as large as the views need, and where it lies."""
+    settings, mesh, frame = scene.settings, scene.mesh, scene.frame
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
     design_mm = (patch.width_mm, patch.height_mm)
-    scales = _smallest_scales(settings, mesh, frame, place(mesh, frame, design_mm, patch.spin_deg), camera)
+    scales = _smallest_scales(scene, place(mesh, frame, design_mm, patch.spin_deg))
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
@@ -153,12 +187,13 @@ def _hang(
     page_mm = largest_piece_mm(template)
     largest_mm = page_mm if patch.bend else tuple(min(a, b) for a, b in zip(frame.extent_mm, page_mm, strict=True))
     marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
-    piece = lay_out_piece(design_mm, marker_mm, identity, "design")
+    piece = lay_out_piece(design_mm, marker_mm, scene.sheet_id, "design")
     if template.tiles is not None:
         plan_tiles(template.tiles, piece)  # refuses what no sheet could be made of, before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
     placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
-    return piece, placement, unreadable, _unreadable_warning(unreadable, marker_mm)
+    warnings = (*mesh.warnings, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
+    return replace(scene, placement=placement, piece=piece, unreadable_share=unreadable, warnings=warnings)
 
 
 def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) -> MeshScene:
@@ -178,15 +213,11 @@ def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, po
     return geometry.look_at(eyes, targets, pose.roll_deg, frame.up)
 
 
-def _smallest_scales(settings: SceneSettings, mesh: Mesh, frame: Frame, card: Placement, camera) -> np.ndarray:
+def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
-    conditions = draw(settings, "select", _VIEWS_TRIED, 0)
-    poses = camera_poses(settings, mesh, frame, card.center_mm, conditions.pose)
-    photo_px = settings.camera.photo_px
-    matrix = (
-        geometry.intrinsics(settings.view.fov_deg, photo_px) if camera is None else lens.matrix_px(camera, photo_px)
-    )
-    scales = []
+    conditions = scene.draw("select", _VIEWS_TRIED, 0)
+    poses = camera_poses(scene.settings, scene.mesh, scene.frame, card.center_mm, conditions.pose)
+    matrix, scales = scene.matrix_px(scene.settings.camera.photo_px), []
     for pose in poses:
         eye = -pose[:3, :3].T @ pose[:3, 3]
         if (eye - card.center_mm) @ card.normal <= 0:

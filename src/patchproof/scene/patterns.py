@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from patchproof.color import codes_of
+
 
 def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
     """P×P×3 in [0, 1]: one of the patterns in drawn colors, with some natural unevenness."""
@@ -46,7 +48,7 @@ def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
         picture = np.where(mask[..., None] == 1, stuff, picture)
     picture = picture * (1 + rng.uniform(0, 0.8) * (_gradient(rng, px).mean(2, keepdims=True) - 0.5))  # uneven light
     blur_px = float(rng.choice([0.3, 0.6, 1.0, 2.0, 3.0], p=[0.35, 0.25, 0.2, 0.1, 0.1]))
-    return codes(cv2.GaussianBlur(picture, (0, 0), blur_px))
+    return codes_of(cv2.GaussianBlur(picture, (0, 0), blur_px))
 
 
 def card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
@@ -66,11 +68,6 @@ def color(rng: np.random.Generator) -> np.ndarray:
     """3 numbers in [0, 1]: any color, more often a grayish one than a strong one."""
     strong = rng.random(3)
     return strong.mean() + (strong - strong.mean()) * rng.uniform(0, 1) ** 1.5
-
-
-def codes(picture: np.ndarray) -> np.ndarray:
-    """uint8 of [0, 1]."""
-    return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 
 
 def natural(rng: np.random.Generator, px: int) -> np.ndarray:

@@ -17,7 +17,7 @@ code that a judged photograph would get.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -30,14 +30,13 @@ from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.scene import flat
-from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.conditions import Conditions
 from patchproof.scene.paper_light import PaperLight, paper_light
-from patchproof.scene.resolution import design_grid
 from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_piece_mm
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.piece import Piece, lay_out_piece, sheet_id
+from patchproof.sheets.piece import Piece, lay_out_piece, sheet_id, with_ids
 from patchproof.sheets.template import load_template
 from patchproof.strict import Refused, expand
 
@@ -60,7 +59,7 @@ class BasePhoto:
 
 
 @dataclass(frozen=True)
-class PhotoScene:
+class PhotoScene(flat.FlatScene):
     """A `FlatScene` whose base pictures are photographs of the object with a blank sheet on it."""
 
     settings: SceneSettings
@@ -69,18 +68,18 @@ class PhotoScene:
     sheet_id: str
     piece: Piece
     photos: tuple[BasePhoto, ...]
-    warnings: tuple[str, ...]
-    unreadable_share: float = 0.0
+    notes: tuple[str, ...]
     given_glb: ClassVar[bytes | None] = None
+    known: dict[str, str]  # which blank and which photographs: a part of the sheet id
 
-    @property
-    def photo_px(self) -> tuple[int, int]:
-        """Size of the photographs that the scene makes."""
-        return self.settings.camera.photo_px
-
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
-        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
-        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+    def with_template(self, name: str) -> PhotoScene:
+        """The scene for a page of another template: its sheet id and the markers' own anew, nothing moved."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        _refuse_larger_than_page(settings, self.piece)
+        identity = sheet_id(identifying(settings) | self.known, self.seed)
+        return replace(self, settings=settings, sheet_id=identity, piece=with_ids(self.piece, identity, "design"))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimetres to pixels."""
@@ -106,22 +105,6 @@ class PhotoScene:
     def piece_noise(self, conditions: Conditions) -> np.ndarray:
         """N standard deviations at white, in linear light of the whole photograph."""
         return np.array([photo.light.noise for photo in self._chosen(conditions)])
-
-    def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
-
-    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of the piece in the closest view."""
-        return flat.closest_px_per_mm(self, size_px)
-
-    def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle."""
-        return flat.white_light(self, conditions)
-
-    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N NaN: nobody knows where the camera stood."""
-        return np.full(len(conditions), np.nan)
 
     def _chosen(self, conditions: Conditions) -> list[BasePhoto]:
         return [self.photos[i] for i in flat.pick(conditions.pose.background[:, 0], len(self.photos))]
@@ -158,7 +141,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
             warnings.append(
                 f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
             )
-    return flat.with_unreadable_share(PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings)))
+    return PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings), known)
 
 
 def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
@@ -243,8 +226,7 @@ def _with_size(settings: SceneSettings, design_mm: tuple[float, float]) -> Scene
             f"{given[0]:g} × {given[1]:g} mm",
             "leave out width_mm and height_mm, or print a blank of that size",
         )
-    patch = patch.model_copy(update={"width_mm": design_mm[0], "height_mm": design_mm[1]})
-    return settings.model_copy(update={"patch": patch})
+    return settings.changed(patch={"width_mm": design_mm[0], "height_mm": design_mm[1]})
 
 
 def _refuse_larger_than_page(settings: SceneSettings, piece: Piece) -> None:

@@ -16,8 +16,19 @@ from patchproof.scene.image_scene import ImageScene, load_image_scene
 from patchproof.scene.mesh_scene import MeshScene, load_mesh_scene
 from patchproof.scene.photo_scene import PhotoScene, load_photo_scene
 from patchproof.settings import SceneSettings, load_scene_settings
+from patchproof.sheets.piece import Piece
+from patchproof.strict import Refused
 
 Scene = MeshScene | PhotoScene | ImageScene
+
+
+def piece_of(scene: Scene) -> Piece:
+    """The scene's printed piece; refused where there is only the object's own texture."""
+    if scene.piece is None:
+        raise Refused(
+            "a run of a patch", "one of the object's own texture", "take object.glb and textures from the run"
+        )
+    return scene.piece
 
 
 def load_scene(path: str | Path, seed: int | None = None) -> Scene:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.mesh.mesh import Material, Mesh
 from patchproof.mesh.texels import coverage, face_counts
 from patchproof.mesh.unwrap import has_place, unwrap
@@ -145,7 +145,7 @@ def _whole_colors(mesh: Mesh, chosen: np.ndarray, texels: int) -> Mesh:
     def whole(index: int, material: Material) -> Material:
         codes = np.arange(256)[:, None] / 255
         table = srgb_from_linear((linear_from_srgb(codes) * material.base_color_linear).clip(0, 1))
-        table = np.rint(255 * table).astype(np.uint8)
+        table = codes_of(table)
         texture = np.full((1, 1, 3), 255, np.uint8) if material.texture_srgb is None else material.texture_srgb
         texture = np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1)
         if texture.shape[:2] == (1, 1) and (chosen & (mesh.face_material == index)).any():

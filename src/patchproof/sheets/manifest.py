@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from patchproof.goal import Goal
+from patchproof.output import image_bytes
 from patchproof.strict import Finite, Positive, Refused, Share, Strict, validated
 
 Point = tuple[Finite, Finite]
@@ -163,11 +164,7 @@ def design_sha256(pixels: np.ndarray) -> str:
 
 def png_base64(pixels: np.ndarray) -> str:
     """uint8 H×W×3 pixels as a PNG in base64."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
-    return base64.b64encode(buffer.getvalue()).decode()
+    return base64.b64encode(image_bytes(pixels, "PNG", {"optimize": True})).decode()
 
 
 def dump_manifest(manifest: Manifest) -> str:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from patchproof.geometry import MM_PER_INCH
 from patchproof.sheets.fonts import font_name
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.page import CUT_LINE_MM
@@ -26,7 +27,7 @@ from patchproof.sheets.rects import RectMm, Srgb
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
-POINTS_PER_MM = 72 / 25.4
+POINTS_PER_MM = 72 / MM_PER_INCH
 ATTACHMENT = "sheet.json"
 _ATTACHED = "geometry and promise of this sheet"
 

@@ -15,13 +15,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
 from patchproof.sheets.swatches import frame_swatches
@@ -133,7 +133,13 @@ def lay_out_piece(design_mm: tuple[float, float], marker_mm: float, sheet_id: st
     return Piece(size, (frame, frame, w, h), markers, swatches, module)
 
 
-def marker_at(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
+def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
+    """The same piece with the marker ids of another sheet or kind."""
+    ids = marker_ids(sheet_id, kind, len(piece.markers))
+    return replace(piece, markers=tuple(replace(one, id=id_) for id_, one in zip(ids, piece.markers, strict=True)))
+
+
+def marker_at(id_: int, corner_mm: tuple[float, float], size_mm: float) -> PieceMarker:
     """A marker with its top-left corner there."""
     (x, y), side = map(float, corner_mm), float(size_mm)
     return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))
@@ -208,7 +214,7 @@ def control_design(kind: str, design: np.ndarray, sheet_id: str) -> np.ndarray:
     height, width = design.shape[:2]
     if _known(kind) == "mean":
         mean = linear_from_srgb(design.reshape(-1, 3) / 255).mean(0)
-        return np.broadcast_to(np.rint(srgb_from_linear(mean) * 255).astype(np.uint8), design.shape).copy()
+        return np.broadcast_to(codes_of(srgb_from_linear(mean)), design.shape).copy()
     if kind == "noise":
         return _noise(height, width, sheet_id)
     if kind == "shuffled":

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.geometry import MM_PER_INCH
 from patchproof.sheets.manifest import Manifest, Tile
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
 from patchproof.strict import Refused, validated
@@ -36,7 +37,7 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
 
     The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
     """
-    width, height = (max(round(side / 25.4 * dpi), 1) for side in manifest.cut_mm[2:])
+    width, height = (max(round(side / MM_PER_INCH * dpi), 1) for side in manifest.cut_mm[2:])
     if not manifest.tiles:
         page = manifest.design.page if manifest.design else 1
         return _part_pixels(pdf_path, page, manifest.cut_mm, (width, height))

@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from patchproof.geometry import MM_PER_INCH
 from patchproof.strict import Refused
 
-_MM = 25.4 / 72
+_MM = MM_PER_INCH / 72
 _LOSSLESS = {"/FlateDecode", "/LZWDecode", "/RunLengthDecode", "/ASCII85Decode", "/ASCIIHexDecode"}
 
 
@@ -83,7 +84,7 @@ def _images(pdf) -> Iterator[str]:
             image = resources.get(name)
             if image is None or image.get("/Subtype") != "/Image":
                 continue
-            ppi = min(int(image.Width) / width_mm, int(image.Height) / height_mm) * 25.4
+            ppi = min(int(image.Width) / width_mm, int(image.Height) / height_mm) * MM_PER_INCH
             yield (
                 f"Page {number}: an image of {int(image.Width)} × {int(image.Height)} pixels on {width_mm:.1f} × "
                 f"{height_mm:.1f} mm, {ppi:.0f} ppi; {_packing(image)}; {_color(image.get('/ColorSpace'))}; "

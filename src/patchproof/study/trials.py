@@ -6,7 +6,6 @@ over clusters. Nothing is drawn, chosen or kept here.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from torch import Tensor
 from patchproof.claims import LEAST_CLUSTERS, Estimate, clustered_mean
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import Problem
+from patchproof.output import image_bytes
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.study.study import Result
@@ -45,11 +45,7 @@ def logits_of(problem: Problem, shown: dict[str, Shown], conditions: Conditions)
 
 def png_of(pixels: np.ndarray) -> bytes:
     """uint8 H×W×3 as a PNG file's bytes."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG")
-    return buffer.getvalue()
+    return image_bytes(pixels, "PNG")
 
 
 def enlarged(pixels: np.ndarray, side_px: int) -> np.ndarray:

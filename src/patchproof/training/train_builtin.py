@@ -26,6 +26,7 @@ from torch import Tensor
 
 from patchproof.classifier.builtin import INPUT_PX, SmallNetwork, folded
 from patchproof.classifier.view import center_square
+from patchproof.color import codes_of
 from patchproof.mesh import primitives
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import photograph
@@ -197,7 +198,7 @@ def _views(name: str, seed: int, rng: np.random.Generator) -> Tensor:
     small = photograph(stage, None, conditions[:half], (INPUT_PX, INPUT_PX))
     large = photograph(stage, None, conditions[half:], (PHOTO_PX, PHOTO_PX))
     both = torch.cat([small, center_square(large, INPUT_PX)])
-    return (both.clamp(0, 1) * 255).round().to(torch.uint8)
+    return codes_of(both)
 
 
 def _settings(rng: np.random.Generator) -> SceneSettings:
@@ -241,11 +242,11 @@ def dressed(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     for material in mesh.materials:
         if kind == "worn":
             worn = np.clip(0.8 + 0.25 * (patterns.texture(rng).mean(2, keepdims=True) - 0.5), 0, 1).repeat(3, 2)
-            material = dataclasses.replace(material, texture_srgb=patterns.codes(worn))
+            material = dataclasses.replace(material, texture_srgb=codes_of(worn))
         if kind == "drawn" or (kind == "mixed" and rng.random() < 0.4):
             plain = rng.random() < 0.4
             color = tuple(rng.uniform(0.02, 0.9, 3)) if plain else (1.0, 1.0, 1.0)
-            drawn = None if plain else patterns.codes(patterns.texture(rng))
+            drawn = None if plain else codes_of(patterns.texture(rng))
             material = dataclasses.replace(material, base_color_linear=color, texture_srgb=drawn)
         materials.append(material)
     return dataclasses.replace(mesh, materials=tuple(materials))

@@ -8,21 +8,36 @@ read here. In a share of the photographs a card of drawn size, place and color h
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
+import torch
 from pydantic import Field
 
 from patchproof.claims import Estimate, rate
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import surface_of
 from patchproof.geometry import apply_homography, local_scale, rect_corners
+from patchproof.output import image_pixels
+from patchproof.photo.read import Photo
+from patchproof.render.photograph import photograph
+from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
+from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pixels
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import load_scene, piece_of
+from patchproof.sheets.piece import control_design
+from patchproof.sheets.template import load_template
+from patchproof.sheets.write import write_sheet
 from patchproof.strict import Refused, Share, Strict
 from patchproof.study.study import Cell, Result, Study
 
@@ -64,121 +79,78 @@ def cells(settings: DetectionSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """What was photographed and what was found: see `_Hall` for the sheet, and `_compared` for the errors."""
-    hall, number = _hall(str(base / settings.scene), settings.seed), cell.values["number"]
-    conditions = hall.scene.draw("reprint", 1, settings.seed, number)
+    """What was photographed, what was made of it and, where there is a homography, the design's corner errors."""
+    (sheet, scene), number = _hung(str(base / settings.scene), settings.seed), cell.values["number"]
+    surface = surface_of(sheet.manifest)
+    conditions = scene.draw("reprint", 1, settings.seed, number)
     rng = np.random.default_rng([settings.seed, number])
-    truth = hall.truth(conditions)
-    quad = rng.random() < settings.hidden and _card(rng, apply_homography(truth, rect_corners(hall.cut_mm)))
-    srgb, focal_px, share = hall.photograph(conditions, truth, None if quad is False else quad, rng)
-    px_per_mm, tilt_deg = local_scale(truth, hall.surface.center_mm)
-    taken = {
+    truth = sheet.px_from_page(conditions)
+    srgb, hidden = _photographed(sheet, conditions, truth, rng, rng.random() < settings.hidden)
+    photo = Photo(srgb, float(scene.matrix_px(scene.settings.camera.photo_px)[0, 0]), Path("photo.jpg"))
+    entry = measure(view_of(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
+    geometry = entry.geometry
+    px_per_mm, tilt_deg = local_scale(truth, surface.center_mm)
+    found = {
         "tilt_deg": tilt_deg,
-        "module_px": px_per_mm * hall.module_mm,
+        "module_px": px_per_mm * piece_of(scene).module_mm,
         "blur_px": float(conditions.sensor.blur_px[0]),
         "noise": float(conditions.sensor.noise[0]),
         "jpeg": int(conditions.sensor.jpeg[0]),
-        "hidden": share,
+        "hidden": hidden,
+        "status": entry.status,
+        "code": entry.code,
+        "markers": entry.markers_found,
+        "light": geometry and geometry.contrast,
+        "error_mm": None,
+        "error_px": None,
+        "uncertainty_mm": geometry and geometry.corner_uncertainty_mm,
     }
-    return taken | hall.found(srgb, focal_px, truth)
+    if geometry is None or geometry.homography_px_from_mm is None:
+        return found
+    homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(surface.rect_mm)
+    true_px = apply_homography(truth, corners)
+    off_px = apply_homography(homography, corners) - true_px
+    off_mm = apply_homography(np.linalg.inv(homography), true_px) - corners
+    errors_px = np.linalg.norm(off_px, axis=1).tolist()
+    return found | {"error_mm": float(np.linalg.norm(off_mm, axis=1).max()), "error_px": errors_px}
 
 
-@dataclass(frozen=True)
-class _Hall:
-    """A scene with its printed sheet, ready to be photographed."""
-
-    scene: Any
-    stage: Any
-    piece: Any
-    manifest: Any
-    surface: Any
-    module_mm: float
-
-    @property
-    def cut_mm(self) -> tuple[float, float, float, float]:
-        return self.manifest.cut_mm
-
-    def truth(self, conditions) -> np.ndarray:
-        """3×3 from page millimetres to pixels."""
-        x, y, *_ = self.cut_mm
-        to_piece = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
-        return self.scene.piece_homographies(conditions, self.scene.settings.camera.photo_px)[0] @ to_piece
-
-    def photograph(self, conditions, truth, quad, rng):
-        """(uint8 pixels as read back from the JPEG, focal length, share of the piece behind the card)."""
-        import torch
-        from PIL import Image
-
-        from patchproof.render.photograph import photograph
-
-        photo_px = self.scene.settings.camera.photo_px
-        with torch.no_grad():
-            picture = photograph(self.stage, self.piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0).numpy()
-        share = 0.0
-        if quad is not None:
-            cover = _filled(quad, picture.shape[:2])
-            piece = _filled(apply_homography(truth, rect_corners(self.cut_mm)), picture.shape[:2])
-            share = float((cover * piece).sum() / max(piece.sum(), 1))
-            picture = picture + cover[..., None] * (rng.uniform(0.05, 0.8, 3).astype(np.float32) - picture)
-        buffer = io.BytesIO()
-        pixels = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=int(conditions.sensor.jpeg[0]))
-        return np.asarray(Image.open(buffer).convert("RGB")), self.scene.matrix_px(photo_px)[0, 0], share
-
-    def found(self, srgb, focal_px, truth) -> dict[str, Any]:
-        """The entry's figures and, where there is a homography, the design's corner errors."""
-        from patchproof.evidence.camera import view_of
-        from patchproof.evidence.measure import measure
-        from patchproof.evidence.ranges import promised_ranges
-        from patchproof.photo.read import Photo
-
-        view = view_of(Photo(srgb, focal_px, Path("photo.jpg")), None)
-        entry = measure(view, "photo.jpg", self.surface, None, promised_ranges(())).entry
-        geometry = entry.geometry
-        said = {"status": entry.status, "code": entry.code, "markers": entry.markers_found}
-        said |= {"light": geometry and geometry.contrast, "error_mm": None, "error_px": None}
-        said |= {"uncertainty_mm": geometry and geometry.corner_uncertainty_mm}
-        if geometry is None or geometry.homography_px_from_mm is None:
-            return said
-        homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(self.surface.rect_mm)
-        off_px = apply_homography(homography, corners) - apply_homography(truth, corners)
-        off_mm = apply_homography(np.linalg.inv(homography), apply_homography(truth, corners)) - corners
-        return said | {
-            "error_mm": float(np.linalg.norm(off_mm, axis=1).max()),
-            "error_px": np.linalg.norm(off_px, axis=1).tolist(),
-        }
+def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
+    """uint8 pixels as read back from the JPEG, and the share of the piece behind a card, where one hides it."""
+    photo_px, share = sheet.scene.settings.camera.photo_px, 0.0
+    with torch.no_grad():
+        picture = photograph(sheet.stage, sheet.piece, conditions, photo_px, jpeg=False)
+    if hide:
+        piece_px = apply_homography(truth, rect_corners(sheet.manifest.cut_mm))
+        cover, piece = (_filled(quad, photo_px) for quad in (_card(rng, piece_px), piece_px))
+        share = float((cover * piece).sum() / max(piece.sum(), 1))
+        card = torch.from_numpy(rng.uniform(0.05, 0.8, 3).astype(np.float32))[:, None, None]
+        picture = picture + torch.from_numpy(cover) * (card - picture)
+    return image_pixels(jpeg_of(picture, conditions)), share
 
 
 @lru_cache(maxsize=1)
-def _hall(scene_path: str, seed: int) -> _Hall:
-    from patchproof.evidence.surface import surface_of
-    from patchproof.render.stage import set_stage
-    from patchproof.reprints.reprint import load_printer, printed_piece
-    from patchproof.scene.mesh_scene import MeshScene
-    from patchproof.scene.scene import load_scene
-    from patchproof.sheets.piece import control_design
-    from patchproof.sheets.template import load_template
-    from patchproof.sheets.write import write_sheet
-
+def _hung(scene_path: str, seed: int) -> tuple[HungSheet, MeshScene]:
+    """The scene's sheet with noise on it, hung up in the scene."""
     scene = load_scene(scene_path, seed)
-    if not isinstance(scene, MeshScene) or scene.piece is None or not scene.placement.is_flat:
+    if not isinstance(scene, MeshScene) or scene.piece is None or not scene.is_flat:
         raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
-    blank = np.zeros((240, round(240 * scene.piece.design_rect_mm[2] / scene.piece.design_rect_mm[3]), 3), np.uint8)
+    piece = scene.piece
+    blank = np.zeros((240, round(240 * piece.design_rect_mm[2] / piece.design_rect_mm[3]), 3), np.uint8)
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"
         manifest = write_sheet(
             pdf,
             template=load_template(scene.settings.sheet.template),
-            piece=scene.piece,
+            piece=piece,
             sheet_id=scene.sheet_id,
             kind="design",
             design_srgb8=control_design("noise", blank, scene.sheet_id),
             promise=None,
             settings={},
         )
-        printer = load_printer(scene.settings.printer.profile, scene.base)
-        piece = printed_piece(pdf, manifest, scene, printer)
-    return _Hall(scene, set_stage(scene), piece, manifest, surface_of(manifest), scene.piece.module_mm)
+        sent = sent_pixels(pdf, manifest, scene)
+    return HungSheet(set_stage(scene), manifest, sent, AS_MADE.printer_for(scene)), scene
 
 
 def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
@@ -191,11 +163,9 @@ def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
     return top + v * (bottom - top) + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ turn.T
 
 
-def _filled(quad: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
-    import cv2
-
-    mask = np.zeros(shape, np.uint8)
+    mask = np.zeros((size_px[1], size_px[0]), np.uint8)
     points = np.clip((quad - 0.5) * 16, -1e6, 1e6).round().astype(np.int32)
     cv2.fillConvexPoly(mask, points, 255, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / 255
@@ -207,13 +177,13 @@ def tables(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[T
     return (_bounds(found), _by_quantity(found), _codes(found))
 
 
-def within_bounds(found: dict) -> bool:
+def within_bounds(found: Mapping) -> bool:
     """Whether the bounds on errors are claimed for a photograph: measured, and taken at usual tilt and blur."""
     usual = found["tilt_deg"] <= MEASURABLE_TILT_DEG and found["blur_px"] <= MEASURABLE_BLUR_PX
     return usual and found["status"] == "measured" and found["error_mm"] is not None
 
 
-def _bounds(found: Sequence[dict]) -> Table:
+def _bounds(found: Sequence[Mapping]) -> Table:
     usual = [f for f in found if f["tilt_deg"] <= MEASURABLE_TILT_DEG and f["blur_px"] <= MEASURABLE_BLUR_PX]
     claimed = [f for f in found if within_bounds(f)]
     sharp = [f for f in claimed if f["module_px"] >= SHARP_MODULE_PX]
@@ -233,11 +203,11 @@ def _bounds(found: Sequence[dict]) -> Table:
     return Table("bounds", "Errors against the truth", ("figure", "value"), rows, about)
 
 
-def _covered(found: dict) -> bool:
+def _covered(found: Mapping) -> bool:
     return found["error_mm"] <= found["uncertainty_mm"]
 
 
-def _median(found: Sequence[dict], name: str) -> Estimate | None:
+def _median(found: Sequence[Mapping], name: str) -> Estimate | None:
     """The median with its 95 % interval over resampled photographs."""
     values = [np.atleast_1d(f[name]) for f in found]
     if not values:
@@ -249,7 +219,7 @@ def _median(found: Sequence[dict], name: str) -> Estimate | None:
     return Estimate(float(np.median(table)), float(low), float(high), len(values))
 
 
-def _by_quantity(found: Sequence[dict]) -> Table:
+def _by_quantity(found: Sequence[Mapping]) -> Table:
     rows = []
     for name, edges in _BINS.items():
         for low, high in pairwise(edges):
@@ -266,7 +236,7 @@ def _by_quantity(found: Sequence[dict]) -> Table:
     return Table("by_quantity", "By what a photograph was taken under", head, tuple(rows), about)
 
 
-def _codes(found: Sequence[dict]) -> Table:
+def _codes(found: Sequence[Mapping]) -> Table:
     counts: dict[tuple[str, str], int] = {}
     for f in found:
         key = (f["status"], f["code"] or "–")
@@ -286,7 +256,7 @@ def figures(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[
     return (*maps, Drawing("uncertainty", "Stated and true", lambda figure: _stated(figure, found)))
 
 
-def _map(figure, found: Sequence[dict], x: str, y: str) -> None:
+def _map(figure, found: Sequence[Mapping], x: str, y: str) -> None:
     axes = figure.add_subplot()
     for status, color in _COLORS.items():
         here = [f for f in found if f["status"] == status]
@@ -296,7 +266,7 @@ def _map(figure, found: Sequence[dict], x: str, y: str) -> None:
     axes.legend(frameon=False)
 
 
-def _stated(figure, found: Sequence[dict]) -> None:
+def _stated(figure, found: Sequence[Mapping]) -> None:
     axes, known = figure.add_subplot(), [f for f in found if f["status"] == "measured" and f["error_mm"] is not None]
     stated = [f["uncertainty_mm"] for f in known]
     axes.loglog(stated, [f["error_mm"] for f in known], ".", color="#2457c5")

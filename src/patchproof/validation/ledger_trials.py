@@ -12,25 +12,43 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 from pydantic import Field
+from torch import Tensor
 
+from patchproof.channel.printer import Printer, load_printer
 from patchproof.claims import rate
+from patchproof.classifier import center_square
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
 from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.evidence.classify import target_indices
+from patchproof.evidence.ledger import LEAST_PHOTOS, usable
+from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.task import Options
 from patchproof.geometry import local_scale
+from patchproof.optimizer.run import load_run
+from patchproof.output import image_pixels
+from patchproof.render.photograph import expose
+from patchproof.render.views import Views, see
 from patchproof.report.tables import Table
-from patchproof.scene.conditions import with_values
+from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
+from patchproof.reprints.inkjets import draw_inkjet
+from patchproof.scene.conditions import Conditions, with_values
+from patchproof.scene.scene import Scene, piece_of
+from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.strict import Strict
 from patchproof.study.study import Cell, Result, Study
 
 STEP = {"print": "print", "blur": "blur_and_noise", "cast": "light_and_camera", "dim": "light_and_camera"}
 LEAST_COST = 0.10  # of confidence
 _TRIES = 3  # troubles drawn for a trial until one costs enough
+Printed = Callable[[Tensor], Tensor]  # sRGB as sent, 1×3×H×W, to what is seen
 _FADED = 0.2  # of the density that dyes may keep
 
 
@@ -74,70 +92,44 @@ def run(settings: LedgerSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Hall:
-    """A run's sheet, ready to be photographed: `pixels` of the PDF's piece, 1×3×H×W sRGB."""
+    """A run's sheet, ready to be photographed, and its manifest as of photographs of `photo_px`."""
 
-    scene: Any
-    stage: Any
-    manifest: Any
-    model: Any
+    sheet: HungSheet
+    manifest: Manifest
+    model: Classifier
     indices: tuple[int, ...]
-    pixels: Any
+    sign: int  # of what the patch should add to confidence
     photo_px: tuple[int, int]
-    printer: Any
 
     @property
-    def sign(self) -> float:
-        return self.manifest.promise.target.goal.sign
+    def scene(self) -> Scene:
+        return self.sheet.scene
 
-    def module_px(self, conditions) -> float:
+    def module_px(self, conditions: Conditions) -> float:
         """A marker's module in the middle one of the views, in pixels of a photograph of the scene's own size."""
-        scene, middle = self.scene, np.array(self.scene.piece.size_mm) / 2
-        views = scene.piece_homographies(conditions, scene.settings.camera.photo_px)
-        return scene.piece.module_mm * float(np.median([local_scale(view, middle)[0] for view in views]))
+        piece, photo_px = piece_of(self.scene), self.scene.settings.camera.photo_px
+        views, middle = self.scene.piece_homographies(conditions, photo_px), np.array(piece.size_mm) / 2
+        return piece.module_mm * float(np.median([local_scale(view, middle)[0] for view in views]))
 
-    def piece(self, printed: Callable[[Any], Any]):
-        """The piece as it was printed, sRGB 1×3×H×W to the same."""
-        from patchproof.render.pixels import PiecePicture
-
-        srgb = printed(self.pixels)[0].permute(1, 2, 0)
-        whole = (0, 0, srgb.shape[1], srgb.shape[0])
-        return PiecePicture(srgb, whole, whole)
-
-    def views(self, conditions) -> list[Any]:
+    def views(self, conditions: Conditions) -> list[Views]:
         """What is rasterized once for all that is done to print, light and camera."""
-        from patchproof.render.views import see
+        each = range(len(conditions))
+        return [see(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.photo_px) for i in each]
 
-        piece, each = self.piece(self.printer.apply), range(len(conditions))
-        return [see(self.stage, piece, conditions[i : i + 1], self.photo_px) for i in each]
-
-    def take(self, views, conditions, printed: Callable[[Any], Any] | None = None) -> list[bytes]:
+    def take(self, views: Sequence[Views], conditions: Conditions, printed: Printed | None = None) -> list[bytes]:
         """A JPEG file for each condition of the piece as `printed` shows it (by default as promised)."""
-        import torch
-        from PIL import Image
-
-        from patchproof.render.photograph import expose
-
-        piece, photos = self.piece(printed or self.printer.apply), []
+        piece, photos = self.sheet.piece if printed is None else self.sheet.printed(printed), []
         for i, view in enumerate(views):
-            one = conditions[i : i + 1]
+            seen = replace(view, conditions=conditions[i : i + 1])
             with torch.no_grad():
-                picture = expose(replace(view, conditions=one), piece, jpeg=False)
-            codes = (picture[0].permute(1, 2, 0).numpy().clip(0, 1) * 255 + 0.5).astype(np.uint8)
-            buffer = BytesIO()
-            Image.fromarray(codes).save(buffer, "JPEG", quality=int(one.jpeg[0]))
-            photos.append(buffer.getvalue())
+                photos.append(jpeg_of(expose(seen, piece, jpeg=False), seen.conditions))
         return photos
 
     def confidence(self, photos: Sequence[bytes]) -> np.ndarray:
         """Target confidence of each photograph's centered square."""
-        import torch
-        from PIL import Image
-
-        from patchproof.classifier import center_square
-
         found = []
         for photo in photos:
-            srgb = np.asarray(Image.open(BytesIO(photo)).convert("RGB")) / np.float32(255)
+            srgb = image_pixels(photo) / np.float32(255)
             square = center_square(torch.from_numpy(srgb.transpose(2, 0, 1))[None], self.model.input_px)
             with torch.inference_mode():
                 found.append(float(self.model.confidence(self.model.logits(square), self.indices)[0]))
@@ -145,14 +137,10 @@ class _Hall:
 
     def judged(self, photos: Sequence[bytes], loss: np.ndarray) -> dict[str, Any]:
         """What `verify` makes of the photographs, each of which lost so much."""
-        from patchproof.evidence.ledger import LEAST_PHOTOS, usable
-        from patchproof.evidence.run import gather_evidence
-        from patchproof.evidence.task import Options
-
         with TemporaryDirectory() as folder:
             for i, photo in enumerate(photos):
                 (Path(folder) / f"{i:03d}.jpg").write_bytes(photo)
-            evidence = gather_evidence(folder, self.manifest, Options([self.model], self.printer))
+            evidence = gather_evidence(folder, self.manifest, Options([self.model]))
         report, ledger = evidence.report, evidence.ledger
         used = np.array([usable(entry.status, entry.code) for entry in report.photos])
         codes = [entry.code or "fine" for entry in report.photos]
@@ -175,54 +163,34 @@ class _Hall:
 
 @lru_cache(maxsize=8)
 def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
-    import torch
-
-    from patchproof.channel.printer import load_printer
-    from patchproof.classifier.load import load_classifier
-    from patchproof.evidence.classify import target_indices
-    from patchproof.optimizer.run import load_run
-    from patchproof.printing.sheet import sheet_of
-    from patchproof.render.stage import set_stage
-    from patchproof.reprints.reprint import DPI_RANGE, OVERSAMPLING
-    from patchproof.sheets.raster import piece_pixels
-
     made = load_run(folder)
-    scene, own_px = made.scene, made.scene.settings.camera.photo_px
-    size = photo_px or own_px
-    with TemporaryDirectory() as temporary:
-        pdf = Path(temporary) / "sheet.pdf"
-        manifest = sheet_of(made, pdf)
-        dpi = float(np.clip(OVERSAMPLING * scene.closest_px_per_mm(size) * 25.4, *DPI_RANGE))
-        pixels = torch.tensor(piece_pixels(pdf, manifest, dpi)).permute(2, 0, 1)[None] / 255
-    manifest = _at_size(manifest, size, own_px)
-    model = load_classifier(manifest.promise.models[0].name, scene.base)
+    sheet, own_px = hang_own(made, photo_px), made.scene.settings.camera.photo_px
+    manifest = _at_size(sheet.manifest, made.promise, photo_px or own_px, own_px)
+    model = load_classifier(made.promise.models[0].name, made.scene.base)
     return _Hall(
-        scene,
-        set_stage(scene),
+        sheet,
         manifest,
         model,
-        target_indices(model, manifest.promise, manifest.settings),
-        pixels,
-        size,
-        load_printer(scene.settings.printer.profile, scene.base),
+        target_indices(model, made.promise, manifest.settings),
+        made.promise.target.goal.sign,
+        photo_px or own_px,
     )
 
 
-def _at_size(manifest, photo_px: tuple[int, int], own_px: tuple[int, int]):
+def _at_size(manifest: Manifest, promise: Promise, photo_px: tuple[int, int], own_px: tuple[int, int]) -> Manifest:
     """The manifest as of a camera whose photographs are of another size."""
     scale = min(photo_px) / min(own_px)
     conditions = tuple(
-        one.model_copy(
-            update={k: None if (v := getattr(one, k)) is None else v * scale for k in ("px_per_mm", "blur_px")}
-        )
-        for one in manifest.promise.conditions
+        one.changed(**{k: v * scale for k in ("px_per_mm", "blur_px") if (v := getattr(one, k)) is not None})
+        for one in promise.conditions
     )
-    camera = manifest.settings["camera"] | {"photo_px": photo_px}
-    promise = manifest.promise.model_copy(update={"conditions": conditions})
-    return manifest.model_copy(update={"promise": promise, "settings": manifest.settings | {"camera": camera}})
+    settings = manifest.settings | {"camera": manifest.settings["camera"] | {"photo_px": photo_px}}
+    return manifest.changed(promise={"conditions": conditions}, settings=settings)
 
 
-def _trouble(kind: str, rng: np.random.Generator, conditions, hall: _Hall):
+def _trouble(
+    kind: str, rng: np.random.Generator, conditions: Conditions, hall: _Hall
+) -> tuple[str, Printed | None, Conditions]:
     """(what it is in words, the printer in place of the promise's or None, the conditions)."""
     if kind == "print":
         name, printer = _wrong_printer(rng, hall)
@@ -238,13 +206,8 @@ def _trouble(kind: str, rng: np.random.Generator, conditions, hall: _Hall):
     return f"{stops:.1f} stops", None, with_values(conditions, exposure_ev=conditions.sensor.exposure_ev - stops)
 
 
-def _wrong_printer(rng: np.random.Generator, hall: _Hall):
+def _wrong_printer(rng: np.random.Generator, hall: _Hall) -> tuple[str, Printed]:
     """A name, and a function from sRGB tensors 1×3×H×W as sent to what is seen."""
-    import torch
-
-    from patchproof.channel.printer import load_printer
-    from patchproof.reprints.inkjets import draw_inkjet
-
     which = rng.random()
     if which < 0.2:
         other = "uncoated" if hall.scene.settings.printer.profile != "uncoated" else "coated"
@@ -255,19 +218,17 @@ def _wrong_printer(rng: np.random.Generator, hall: _Hall):
         name, light = f"inkjet {seed}", lambda srgb: inkjet(srgb)
     else:
         kept = rng.uniform(_FADED, 1, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(_FADED, 0.5))
-        name, light = f"faded {kept.round(2)}", lambda srgb: _faded(hall.printer, kept, srgb)
+        name, light = f"faded {kept.round(2)}", lambda srgb: _faded(hall.sheet.printer, kept, srgb)
 
-    def printed(pixels):
+    def printed(pixels: Tensor) -> Tensor:
         seen = light(pixels[0].permute(1, 2, 0).double().numpy())
         return torch.from_numpy(srgb_from_linear(seen.clip(0, 1))).permute(2, 0, 1)[None].to(pixels)
 
     return name, printed
 
 
-def _faded(printer, kept: np.ndarray, srgb: np.ndarray) -> np.ndarray:
+def _faded(printer: Printer, kept: np.ndarray, srgb: np.ndarray) -> np.ndarray:
     """Light of a print whose dyes keep these shares of their density; what is neutral is black ink and stays."""
-    import torch
-
     seen = printer.apply(torch.from_numpy(srgb).float().permute(2, 0, 1)[None])[0].permute(1, 2, 0).double().numpy()
     density = -np.log(np.clip(linear_from_srgb(seen), 1e-3, 1))
     black = density.min(-1, keepdims=True)

@@ -68,6 +68,7 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     from patchproof.journey.verify import verify_photos
     from patchproof.optimizer.run import optimize_scene
     from patchproof.printing.sheet import sheet_of
+    from patchproof.reprints.hung_sheet import Hanging
     from patchproof.reprints.reprint import reprint
     from patchproof.study.trained import scene_of
 
@@ -77,7 +78,7 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
         made = optimize_scene(scene_of(base, cell), folder / "run", controls=("bare",))
         sheet_of(made, folder / "sheet.pdf")
         pdf, photos = folder / "sheet.pdf", folder / "photos"
-        reprint(pdf, made, settings.photos, photos, path_traced=settings.path_traced)
+        reprint(pdf, made, settings.photos, photos, Hanging(path_traced=settings.path_traced))
         report = verify_photos(photos, folder / "sheet.json", folder / "report")
     summary = report.summary
     return {

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.reprints.reprint import scaled_print
+from patchproof.reprints.hung_sheet import scaled_print
 from patchproof.scene.bend import curled
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.mesh_scene import MeshScene

@@ -1,0 +1,220 @@
+"""A printed sheet hung up on its object, to be photographed.
+
+In: a sheet's PDF and the run it was made from, and how it was printed. Out: `HungSheet`, which takes JPEG photographs
+and says where the page lies in them. What hangs there are the pixels that another library reads from the PDF, so that
+an error in the page shows here and not at the print shop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof import geometry
+from patchproof.channel import lens
+from patchproof.channel.printer import Printer, load_printer
+from patchproof.color import photo_codes_of
+from patchproof.evidence.surface import surface_of
+from patchproof.geometry import MM_PER_INCH
+from patchproof.optimizer.run import Run
+from patchproof.output import image_bytes
+from patchproof.printing.sheet import sheet_of
+from patchproof.render.photograph import photograph
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import Stage, set_stage
+from patchproof.reprints.path_traced import photograph_traced
+from patchproof.scene.conditions import Conditions, fields_of
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import Scene
+from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.raster import attached_manifest, piece_pixels
+from patchproof.strict import Refused
+
+# The print is rasterized this much finer than the closest view can see. Rasterizers of pages average code values: fine
+# patterns of strong colors came out 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
+OVERSAMPLING = 2.5
+DPI_RANGE = (100.0, 400.0)
+_FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal length refers
+
+
+@dataclass(frozen=True)
+class Hanging:
+    """How a sheet was printed and what hangs there: by another printer than the scene's (a name or a file), larger or
+    smaller along x and y, in its place that `control`'s own sheet (mean, grey, noise) or nothing (bare); `path_traced`
+    photographs are by a renderer that is not ours (see `path_traced`).
+    """
+
+    printer: str | None = None
+    print_scale: tuple[float, float] = (1.0, 1.0)
+    control: str | None = None
+    path_traced: bool = False
+
+    def printer_for(self, scene: Scene) -> Printer:
+        """The printer; the scene's own where none is named."""
+        if self.printer is None:
+            return load_printer(scene.settings.printer.profile, scene.base)
+        return load_printer(self.printer)
+
+
+AS_MADE = Hanging()
+
+
+@dataclass(frozen=True, eq=False)
+class HungSheet:
+    """A stage and the sheet that hangs on it: `sent` is its piece as the PDF has it, sRGB 1×3×H×W, for `printer`."""
+
+    stage: Stage
+    manifest: Manifest
+    sent: Tensor
+    printer: Printer
+    how: Hanging = AS_MADE
+
+    @property
+    def scene(self) -> Scene:
+        """The stage's scene."""
+        return self.stage.scene
+
+    @cached_property
+    def piece(self) -> PiecePicture | None:
+        """What hangs there; None where the object is bare."""
+        return None if self.how.control == "bare" else self.printed(self.printer.apply)
+
+    def printed(self, shows: Callable[[Tensor], Tensor]) -> PiecePicture:
+        """The piece as a print shows it that makes sRGB as seen of sRGB as sent, 1×3×H×W both."""
+        srgb = shows(self.sent)[0].permute(1, 2, 0).contiguous()
+        whole = (0, 0, srgb.shape[1], srgb.shape[0])
+        return PiecePicture(srgb, whole, whole)
+
+    def photograph(self, conditions: Conditions) -> bytes:
+        """A JPEG file of one view, of the drawn quality, with the camera's focal length in its EXIF data."""
+        if not self.how.path_traced:
+            return take_photo(self.stage, self.piece, conditions)
+        return _stored(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
+
+    def truth(self, conditions: Conditions) -> dict[str, Any]:
+        """Where the page's millimetres fall in the photograph of one view, and what it was taken under."""
+        drawn: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
+        drawn["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
+        if self.piece is None:
+            return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
+        surface, homography, cut = surface_of(self.manifest), self.px_from_page(conditions), self.manifest.cut_mm[:2]
+        bent = isinstance(self.scene, MeshScene) and not self.scene.is_flat
+        corners = {
+            str(i): seen_at(self.scene, conditions, page_mm - cut)
+            if bent
+            else geometry.apply_homography(homography, page_mm)
+            for i, page_mm in surface.corners_mm.items()
+            if i in surface.piece_ids
+        }
+        return {
+            "homography_px_from_mm": None if bent else geometry.normalized(homography).tolist(),
+            "marker_corners_px": {i: px.tolist() for i, px in corners.items()},
+            "conditions": drawn,
+        }
+
+    def px_from_page(self, conditions: Conditions) -> np.ndarray:
+        """3×3 from page millimetres to pixels of one view; of bent paper its tangent plane's, without the lens."""
+        x, y, *_ = self.manifest.cut_mm
+        piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+        photo_px = self.scene.settings.camera.photo_px
+        return self.scene.piece_homographies(conditions, photo_px)[0] @ piece_from_page
+
+
+def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:
+    """The PDF's sheet on the object of its run; refused where it is not of this run."""
+    manifest, scene = sheet_scene(pdf_path, run)
+    sent, stage = sent_pixels(pdf_path, manifest, scene), set_stage(scaled_print(scene, how.print_scale))
+    return HungSheet(stage, manifest, sent, how.printer_for(scene), how)
+
+
+def hang_own(run: Run, photo_px: tuple[int, int] | None = None) -> HungSheet:
+    """The sheet that the run makes, for photographs of `photo_px` (by default the scene's own)."""
+    with TemporaryDirectory() as temporary:
+        pdf = Path(temporary) / "sheet.pdf"
+        manifest = sheet_of(run, pdf)
+        sent = sent_pixels(pdf, manifest, run.scene, photo_px)
+    return HungSheet(set_stage(run.scene), manifest, sent, AS_MADE.printer_for(run.scene))
+
+
+def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
+    """A sheet's manifest and the scene with its template's frame; refused where the sheet is not of this run."""
+    manifest = attached_manifest(pdf_path, run.scene.sheet_id)
+    own = run.scene.settings.sheet.template
+    scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", own))
+    if manifest.sheet_id != scene.sheet_id:
+        raise Refused(
+            f"a sheet of this run ({scene.sheet_id})",
+            f"sheet {manifest.sheet_id}",
+            "name the run that it was made from",
+        )
+    return manifest, scene
+
+
+def sent_pixels(
+    pdf_path: str | Path, manifest: Manifest, scene: Scene, photo_px: tuple[int, int] | None = None
+) -> Tensor:
+    """The piece of a PDF as 1×3×H×W sRGB, with more pixels than the closest view of `photo_px` can see."""
+    finest = scene.closest_px_per_mm(photo_px or scene.settings.camera.photo_px)
+    dpi = float(np.clip(OVERSAMPLING * finest * MM_PER_INCH, *DPI_RANGE))
+    return torch.tensor(piece_pixels(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
+
+
+def scaled_print(scene: Scene, print_scale: tuple[float, float]) -> Scene:
+    """The scene with a piece printed larger or smaller, hung up at the same middle; piece mm stay the sheet's own."""
+    if print_scale == (1.0, 1.0):
+        return scene
+    if not isinstance(scene, MeshScene):
+        raise Refused("a scene with a mesh for a print of another size", "one of pictures", "leave --print-scale out")
+    placement, scale = scene.placed, np.array(print_scale)
+    middle = np.array(placement.size_mm) / 2
+    about = np.eye(4)
+    about[[0, 1], [0, 1]] = scale
+    about[:2, 3] = middle - scale * middle
+    vertices = placement.world(middle + (placement.piece_mm - middle) * scale)
+    frame = placement.world_from_piece @ about
+    return replace(scene, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
+
+
+def seen_at(scene: Scene, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
+    """Pixels N×2 of points N×2 of the piece in one photograph, through bent paper and a bent picture, too; NaN behind
+    the camera.
+    """
+    photo_px = scene.settings.camera.photo_px
+    if not isinstance(scene, MeshScene):
+        return geometry.apply_homography(scene.piece_homographies(conditions, photo_px)[0], piece_mm)
+    pose, world = scene.camera_from_print(conditions)[0], scene.placed.world(piece_mm)
+    points = geometry.project(scene.matrix_px(photo_px), pose, world)
+    return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
+
+
+def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
+    """A JPEG file of one view with the piece, or of the bare object, as `HungSheet.photograph` makes them."""
+    with torch.no_grad():
+        picture = photograph(stage, piece, conditions, stage.scene.settings.camera.photo_px, jpeg=False)
+    return _stored(picture, stage.scene, conditions)
+
+
+def _stored(picture: Tensor, scene: Scene, conditions: Conditions) -> bytes:
+    """A 1×3×H×W sRGB picture as this scene's camera writes it."""
+    from PIL import Image
+
+    exif, photo_px = Image.Exif(), scene.settings.camera.photo_px
+    if isinstance(scene, MeshScene):  # of pictures nobody knows the focal length
+        focal_px = scene.matrix_px(photo_px)[0, 0]
+        details = exif.get_ifd(0x8769)
+        details[0xA405] = round(focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
+    return jpeg_of(picture, conditions, {"exif": exif})
+
+
+def jpeg_of(picture: Tensor, conditions: Conditions, options: dict[str, Any] | None = None) -> bytes:
+    """A 1×3×H×W sRGB picture as a JPEG file of the view's drawn quality; `options` are Pillow's."""
+    codes = photo_codes_of(picture[0].permute(1, 2, 0).cpu().numpy())
+    return image_bytes(codes, "JPEG", {"quality": int(conditions.sensor.jpeg[0])} | (options or {}))

@@ -1,0 +1,91 @@
+"""The window of a photograph that shows the piece, rendered alone, at full resolution.
+
+In: a stage and a view's conditions. Out: `Frame`: a stage whose camera sees that part, at the same scale; the rest of
+the photograph costs most and shows no markers. Left out on purpose: what else in it might look like a marker.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from patchproof.render.stage import Stage
+from patchproof.reprints.hung_sheet import seen_at
+from patchproof.scene.backgrounds import Backgrounds
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
+
+_MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is rendered: pictures of `size_px`, whose corner lies at `origin_px` of the photograph."""
+
+    stage: Stage
+    size_px: tuple[int, int]
+    origin_px: tuple[int, int] = (0, 0)
+
+
+def window(stage: Stage, conditions: Conditions) -> Frame:
+    """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
+    scene, whole_px = stage.scene, stage.scene.settings.camera.photo_px
+    everything = Frame(stage, whole_px)
+    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.vignetting.any():
+        return everything
+    edge = np.linspace(0, 1, 9)
+    grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placed.size_mm
+    points = seen_at(scene, conditions, grid)
+    if not np.isfinite(points).all():
+        return everything
+    margin = _MARGIN_SHARE * np.ptp(points, axis=0).max() + _MARGIN_PX
+    low = np.clip(np.floor((points.min(0) - margin) / _BLOCK) * _BLOCK, 0, None).astype(int)
+    high = np.minimum(np.ceil((points.max(0) + margin) / _BLOCK).astype(int) * _BLOCK, whole_px)
+    if (high - low < 64).any():  # outside of the picture, almost
+        return everything
+    (left, top), (width, height) = low.tolist(), (high - low).tolist()
+    return Frame(_seen_through(stage, scene, (left, top), (width, height)), (width, height), (left, top))
+
+
+def on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> np.ndarray:
+    """A photograph that shows `part` at `origin_px` and nothing else."""
+    srgb, (x, y) = np.full((whole_px[1], whole_px[0], 3), np.median(part, (0, 1)).astype(np.uint8)), origin_px
+    srgb[y : y + part.shape[0], x : x + part.shape[1]] = part
+    return srgb
+
+
+@dataclass(frozen=True)
+class _WindowScene(MeshScene):
+    """A scene whose camera sees a part of the picture, at the same scale; its `photo_px` is the part's size."""
+
+    whole_px: tuple[int, int] = (0, 0)
+    origin_px: tuple[int, int] = (0, 0)
+
+    def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
+        """The whole picture's matrix, counted from the window's corner."""
+        matrix = super().matrix_px(self.whole_px).copy()
+        matrix[:2, 2] -= self.origin_px
+        return matrix
+
+
+@dataclass(frozen=True)
+class _WindowBackgrounds:
+    """The window's part of the whole picture's background."""
+
+    whole: Backgrounds
+    whole_px: tuple[int, int]
+    origin_px: tuple[int, int]
+
+    def picture(self, choice: np.ndarray, photo_px, size_px) -> np.ndarray:
+        x, y = self.origin_px
+        return self.whole.picture(choice, self.whole_px, self.whole_px)[y : y + size_px[1], x : x + size_px[0]]
+
+
+def _seen_through(stage: Stage, scene: MeshScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
+    """The stage as a camera sees it that shows a window of the photograph only."""
+    whole_px = scene.settings.camera.photo_px
+    parts = {field.name: getattr(scene, field.name) for field in fields(MeshScene)}
+    parts["settings"] = scene.settings.changed(camera={"photo_px": size_px})
+    parts["backgrounds"] = _WindowBackgrounds(scene.backgrounds, whole_px, origin_px)
+    return replace(stage, scene=_WindowScene(**parts, whole_px=whole_px, origin_px=origin_px))
