@@ -16,7 +16,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from patchproof.color import srgb_from_linear
+from patchproof.color import photo_codes_of, srgb_from_linear
 from patchproof.geometry import intrinsics, look_at, rect_corners
 from patchproof.photo.detect import DICTIONARY, printed_markers
 
@@ -133,6 +133,6 @@ def _developed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
     light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
     light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)
-    codes = (srgb_from_linear(light.clip(0, 1)) * 255 + 0.5).astype(np.uint8)
+    codes = photo_codes_of(srgb_from_linear(light.clip(0, 1)))
     jpeg = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(60, 96))])[1]
     return np.repeat(np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))[..., None], 3, 2)

@@ -32,7 +32,7 @@ def window(stage: Stage, conditions: Conditions) -> Frame:
     """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
     scene, whole_px = stage.scene, stage.scene.settings.camera.photo_px
     everything = Frame(stage, whole_px)
-    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.vignetting.any():
+    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.sensor.vignetting.any():
         return everything
     edge = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placed.size_mm
