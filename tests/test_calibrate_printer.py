@@ -321,7 +321,7 @@ def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, flo
         light = read_chart(shot.photo, manifest, known).light
         usable = np.isfinite(light).all(1)
         sent = np.array([s.srgb for s in manifest.chart])[usable]
-        choice = choose(rungs(priors), sent, srgb_from_linear(light[usable]))
+        choice = choose(kinds_of_maps(priors), sent, srgb_from_linear(light[usable]))
         errors.append(float(difference(bench_printer.relative(choice.predict, colors), truth).mean()))
     return errors[0], errors[1]
 
