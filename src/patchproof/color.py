@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def _hue(xp, b, a):
     return xp.where(angle < 0, angle + 2 * math.pi, angle)
 
 
-def _library(array):
+def _library(array: Any) -> Any:
     """The library that made the array; torch is looked up, never imported, so that photographs need no torch."""
     return sys.modules["torch"] if type(array).__module__.partition(".")[0] == "torch" else np
 

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 import trimesh
+from trimesh.exchange.gltf import export_glb
 
 from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
 from patchproof.strict import Refused
@@ -53,9 +54,7 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", g
 
 def glb_of(mesh: trimesh.Trimesh | trimesh.Scene) -> bytes:
     """A mesh in memory as the bytes of a GLB file."""
-    return (
-        trimesh.Scene(mesh).export(file_type="glb") if isinstance(mesh, trimesh.Trimesh) else mesh.export(None, "glb")
-    )
+    return export_glb(trimesh.Scene(mesh) if isinstance(mesh, trimesh.Trimesh) else mesh)
 
 
 def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
