@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimizer.promise import PROMISE_VIEWS, make_promise
 from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
@@ -77,7 +77,7 @@ def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDes
         scene = build_scene(settings, scene.base, scene.seed)
         if scene.piece.size_mm != run.scene.piece.size_mm and control is None:
             problem = set_problem(scene)
-            promise = promise_from(problem, try_out(problem, run.design, scene.draw("promise", PROMISE_VIEWS)))
+            promise = make_promise(problem, run.design, scene.draw("promise", PROMISE_VIEWS))
     kind = control or "design"
     piece = scene.piece
     if control is not None:
