@@ -1,23 +1,94 @@
 """Intervals and promises: what a count of recognized images allows one to claim.
 
-In: counts. Out: intervals in [0, 1], or counts for prediction intervals; all at 95 % unless told otherwise.
+In: counts and figures. Out: intervals, or counts for prediction intervals, and `Estimate`s for tables; all at 95 %
+unless told otherwise.
 A rate from n images gets a Wilson interval. What n *new* photographs may show is wider, since they have noise of
 their own: a beta-binomial prediction interval with the Jeffreys prior Beta(1/2, 1/2). Differences on the same
 conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10, applies.
 Left out on purpose: corrections for looking more than once. The promise set is looked at once.
 
 Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
-(paired).
+(paired); Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).
 """
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 CONFIDENCE = 0.95
 LEAST_CLUSTERS = 5
+_TAIL = (1 - CONFIDENCE) / 2
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its 95 % interval and the number of trials behind it; in a CSV four columns."""
+
+    value: float
+    low: float
+    high: float
+    n: int
+
+
+def rate(hits: Sequence[bool]) -> Estimate | None:
+    """The share of hits with Wilson's interval; None of nothing."""
+    return Estimate(sum(hits) / len(hits), *wilson(sum(hits), len(hits)), len(hits)) if hits else None
+
+
+def difference(a: list[bool], b: list[bool]) -> Estimate | None:
+    """Rate of `a` minus rate of `b` on the same conditions with Newcombe's paired interval; None of nothing."""
+    if not a:
+        return None
+    value, (low, high) = paired_difference(a, b)
+    return Estimate(value, low, high, len(a))
+
+
+def mean(values: Sequence[float]) -> Estimate | None:
+    """The mean with Student's interval; None of fewer than two values."""
+    return student_mean(values) if len(values) > 1 else None
+
+
+def student_mean(values: Sequence[float] | np.ndarray) -> Estimate:
+    """The mean of two values or more with Student's interval."""
+    n, value = len(values), statistics.fmean(values)
+    half = _student(n - 1) * (statistics.stdev(map(float, values)) / math.sqrt(n))
+    return Estimate(value, value - half, value + half, n)
+
+
+def median(values: Sequence[float] | np.ndarray) -> Estimate:
+    """The median with its distribution-free interval from order statistics; of few values, their range."""
+    from scipy.stats import binom
+
+    ordered, n = sorted(map(float, values)), len(values)
+    skipped = max(int(binom.ppf(_TAIL, n, 0.5)) - 1, 0)
+    return Estimate(statistics.median(ordered), ordered[skipped], ordered[n - 1 - skipped], n)
+
+
+def paired_means(values: np.ndarray) -> list[Estimate]:
+    """Means of the columns of S×K (K settings tried on the same S seeds) with intervals for comparing them: what all
+    settings of a seed have in common is taken out, and what is left gets Student's interval (Morey 2008).
+    """
+    seeds, settings = values.shape
+    left = values - values.mean(1, keepdims=True)
+    half = _student(seeds - 1) * left.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
+    return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
+
+
+def deviation(values: Sequence[float] | np.ndarray) -> Estimate:
+    """The standard deviation of normal values with its χ² interval."""
+    from scipy.stats import chi2
+
+    value, n = statistics.stdev(map(float, values)), len(values)
+    low, high = (value * math.sqrt((n - 1) / float(chi2.ppf(p, n - 1))) for p in (1 - _TAIL, _TAIL))
+    return Estimate(value, low, high, n)
 
 
 def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -101,6 +172,12 @@ def mcnemar_p(a: list[bool], b: list[bool]) -> float:
     only_a = sum(x and not y for x, y in zip(a, b, strict=True))
     only_b = sum(y and not x for x, y in zip(a, b, strict=True))
     return 1.0 if only_a + only_b == 0 else float(binomtest(only_a, only_a + only_b).pvalue)
+
+
+def _student(freedom: int) -> float:
+    from scipy.stats import t
+
+    return float(t.ppf(1 - _TAIL, freedom))
 
 
 def _z(confidence: float) -> float:

@@ -9,25 +9,14 @@ from __future__ import annotations
 import csv
 import io
 import math
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from patchproof.claims import paired_difference, wilson
+from patchproof.claims import Estimate, difference, mean, rate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A figure with its 95 % interval and the number of trials behind it; in a CSV four columns."""
-
-    value: float
-    low: float
-    high: float
-    n: int
 
 
 Value = str | int | float | bool | None | Estimate
@@ -53,32 +42,6 @@ class Drawing:
     draw: Callable[[Figure], None]
     size_in: tuple[float, float] = (7.0, 4.0)
     about: str = ""
-
-
-def rate(hits: list[bool]) -> Estimate | None:
-    """The share of hits with Wilson's interval; None of nothing."""
-    if not hits:
-        return None
-    return Estimate(sum(hits) / len(hits), *wilson(sum(hits), len(hits)), len(hits))
-
-
-def difference(a: list[bool], b: list[bool]) -> Estimate | None:
-    """Rate of `a` minus rate of `b` on the same conditions with Newcombe's paired interval; None of nothing."""
-    if not a:
-        return None
-    value, (low, high) = paired_difference(a, b)
-    return Estimate(value, low, high, len(a))
-
-
-def mean(values: list[float]) -> Estimate | None:
-    """The mean with Student's interval; None of fewer than two values."""
-    from scipy.stats import t as student
-
-    if len(values) < 2:
-        return None
-    value, error = statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(values))
-    half = float(student.ppf(0.975, len(values) - 1)) * error
-    return Estimate(value, value - half, value + half, len(values))
 
 
 def csv_text(table: Table) -> str:

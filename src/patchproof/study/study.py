@@ -15,16 +15,15 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from patchproof.output import check_folder, make_folder, write_whole
-from patchproof.report.study_page import study_page
-from patchproof.report.tables import Drawing, Table, csv_text, png
+from patchproof.report.results import Results, write_json, write_results
+from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict, nearest, read_toml, validated
 from patchproof.workers import Workers, one_thread, open_workers, result_of
 
@@ -45,7 +44,6 @@ STUDIES: dict[str, str] = {
     "stress": "patchproof.experiments.stress",
     "transfer": "patchproof.experiments.transfer",
 }
-_LIBRARIES = ("patchproof", "torch", "numpy")
 _NAME = re.compile(r"[\w=+.,-]{1,120}")
 
 
@@ -199,7 +197,7 @@ def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
             for old in out.glob(pattern):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
     make_folder(out / "cells")
-    _write_json(path, {"study": study.name, "settings": said})
+    write_json(path, {"study": study.name, "settings": said})
 
 
 def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
@@ -258,41 +256,19 @@ def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, by
         make_folder((out / name).parent)
         write_whole(out / name, lambda path, key=key: path.write_bytes(files[key]))
     found = values | names
-    _write_json(
+    write_json(
         out / "cells" / f"{cell.name}.json", {"cell": dict(cell.values), "found": found, "files": list(names.values())}
     )
     return found
 
 
 def _write(study, settings, out: Path, tables, figures, results, failed) -> None:
-    drawn = [(drawing, png(drawing)) for drawing in figures]
-    for table in tables:
-        text = csv_text(table)
-        write_whole(out / f"{study.name}_{table.name}.csv", lambda path, text=text: path.write_text(text, "utf-8"))
-    for drawing, content in drawn:
-        write_whole(out / f"{study.name}_{drawing.name}.png", lambda path, content=content: path.write_bytes(content))
-    said, versions, total = settings.model_dump(mode="json"), _versions(), len(results) + len(failed)
-    page = study_page(study.name, study.about, tables, drawn, failed, total, said, versions)
-    write_whole(out / f"{study.name}.html", lambda path: path.write_text(page, "utf-8"))
-    data = {
-        "study": study.name,
-        "settings": said,
-        "versions": versions,
-        "tables": {table.name: asdict(table) for table in tables},
-        "cells": {one.cell.name: {"cell": dict(one.cell.values), "found": one.found} for one in results},
-        "failed": failed,
-    }
-    _write_json(out / f"{study.name}.json", data)
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # run from a checkout
-            continue
-    return found
+    cells = {one.cell.name: {"cell": dict(one.cell.values), "found": one.found} for one in results}
+    extent = f"{len(results)} of {len(results) + len(failed)} cells finished"
+    said = settings.model_dump(mode="json")
+    write_results(
+        out, Results("study", study.name, study.about, extent, said, tables, figures, failed, {"cells": cells})
+    )
 
 
 def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -305,8 +281,3 @@ def _read(path: Path) -> dict[str, Any]:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise Refused("a study's JSON", f"{path} that cannot be read ({error})", "remove it") from error
-
-
-def _write_json(path: Path, data: Mapping[str, Any]) -> None:
-    text = json.dumps(data, indent=1, allow_nan=False) + "\n"
-    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
