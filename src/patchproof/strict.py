@@ -14,7 +14,7 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import Self
@@ -63,6 +63,7 @@ Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
 NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Model = TypeVar("Model", bound=BaseModel)
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
@@ -98,7 +99,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
 
 
-def validated(model: type[BaseModel], data: Any, where: str):
+def validated(model: type[Model], data: Any, where: str) -> Model:
     """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
     try:
         return model.model_validate(data)

@@ -1,4 +1,4 @@
-"""Harden a folder of labeled photographs, and the table of what FGSM and PGD leave of the networks' accuracy.
+"""Photographs changed so that networks recognize them better, and what attacks leave of that.
 
 In: images, a CSV of file names and labels, networks. Out: PNGs under the images' names at their own sizes, and tables:
 accuracy clean and attacked, hardened beside original on the same photographs, per network, with 95 % intervals; how far
@@ -33,7 +33,8 @@ from patchproof.output import write_whole
 from patchproof.photo.cannot import CannotJudge
 from patchproof.report.tables import Drawing, Table, difference, rate
 from patchproof.strict import Positive, Refused, Share, Strict, expand
-from patchproof.study.study import Cell, Finished, Result, Study, carry_out, short_name
+from patchproof.study.grid import short_name
+from patchproof.study.study import Cell, Finished, Result, Study, carry_out
 
 Attack = Literal["fgsm", "pgd"]
 CLEAN = "clean"
@@ -172,7 +173,7 @@ def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
         Table("accuracy", "Accuracy, hardened beside original", head, tuple(rows), about),
         Table("moved", "How far the images moved", moved_head, tuple(distances), "RMS of values in [0, 1]."),
     ]
-    unread = {(one["file"], one["reason"]) for result in results for one in result.found["unread"]}
+    unread = {(one["file"], one["reason"]) for result in results for one in result.answers["unread"]}
     if unread:
         found.append(Table("unread", "What could not be read", ("file", "reason"), tuple(sorted(unread))))
     return found
@@ -197,17 +198,7 @@ def figures(settings: HardenSettings, results: Sequence[Result]) -> list[Drawing
     return [Drawing("accuracy", "Accuracy under attack", draw, size, "ε = 0 is the clean photograph.")]
 
 
-STUDY = Study(
-    "harden",
-    "Labeled photographs changed so that networks recognize them better, and what attacks leave of that.",
-    HardenSettings,
-    cells,
-    run,
-    tables,
-    figures,
-    files=".",
-    own_files=("images",),
-)
+STUDY = Study("harden", HardenSettings, cells, run, tables, figures, files=".", own_files=("images",))
 
 
 def _study_in(out: Path) -> Study:
@@ -289,7 +280,7 @@ def _photos(results: Sequence[Result], variant: Mapping | None) -> Iterator[Mapp
     """The photographs of a variant, or the originals."""
     for result in results:
         if result.cell.values.get("variant") == variant:
-            yield from result.found["photos"]
+            yield from result.answers["photos"]
 
 
 def _outcomes(results, variant, name: str) -> dict[str, Mapping[str, bool]]:

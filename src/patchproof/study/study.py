@@ -11,6 +11,7 @@ Left out on purpose: cells that depend on one another (one cell trains and tests
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shutil
@@ -18,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict, nearest, read_toml, validated
 from patchproof.workers import Workers, one_thread, open_workers, result_of
 
-# by name the module whose STUDY it is, imported when asked for
+# by name the module whose STUDY it is; the first line of its docstring says what it is about
 STUDIES: dict[str, str] = {
     "ablation": "patchproof.validation.ablation",
     "deceive": "patchproof.experiments.deceive",
@@ -65,8 +67,12 @@ class Result:
     """
 
     cell: Cell
-    found: Mapping[str, Any]
+    answers: Mapping[str, Any]
     out: Path
+
+    def file(self, key: str) -> Path:
+        """The file of what `run` gave as bytes."""
+        return self.out / self.answers[key]
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,6 @@ class Study:
     """
 
     name: str
-    about: str
     settings: type[Strict]
     cells: Callable[[Any, Path], Sequence[Cell]]
     run: Callable[[Any, Path, Cell], dict[str, Any]]
@@ -106,10 +111,11 @@ def load_study(name: str) -> Study:
     return import_module(STUDIES[name]).STUDY
 
 
-def short_name(name: str) -> str:
-    """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
-    word = name.rpartition(":")[2]
-    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
+def about(module: str) -> str:
+    """The first line of a module's docstring; it is not imported."""
+    spec = find_spec(module)
+    source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
+    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
 
 
 def run_study(
@@ -160,12 +166,24 @@ def carry_out(
     _check_cells(study, cells)
     with open_workers(jobs, cluster) as workers:
         _begin(study, settings, out, resume)
-        found = {cell.name: values for cell in cells if (values := _kept(out, cell)) is not None}
-        failed = _do_cells(study, settings, base, cells, out, workers, found, on_cell)
-    results = tuple(Result(cell, found[cell.name], out) for cell in cells if cell.name in found)
+        answers = {cell.name: values for cell in cells if (values := _kept(out, cell)) is not None}
+        failed = _do_cells(study, settings, base, cells, out, workers, answers, on_cell)
+    results = tuple(Result(cell, answers[cell.name], out) for cell in cells if cell.name in answers)
     tables = tuple(study.tables(settings, results)) if results else ()
     figures = tuple(study.figures(settings, results)) if results else ()
-    _write(study, settings, out, tables, figures, results, failed)
+    done = {result.cell.name: {"cell": dict(result.cell.values), "found": result.answers} for result in results}
+    page = Results(
+        kind="study",
+        name=study.name,
+        about=about(study.run.__module__),
+        extent=f"{len(results)} of {len(cells)} cells finished",
+        settings=settings.model_dump(mode="json"),
+        tables=tables,
+        figures=figures,
+        failed=failed,
+        more={"cells": done},
+    )
+    write_results(out, page)
     return Finished(tables, results, failed)
 
 
@@ -184,9 +202,9 @@ def _own(study: Study) -> tuple[str, ...]:
 
 def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
     """The study's settings in `out`, which must be the same where one goes on."""
-    path, said = out / f"{study.name}.json", settings.model_dump(mode="json")
+    path, asked = out / f"{study.name}.json", settings.model_dump(mode="json")
     if resume and path.is_file():
-        if _read(path).get("settings") != said:
+        if _read(path).get("settings") != asked:
             do = "give it the same settings, or another --out"
             raise Refused(f"the settings that {out} was begun with, to resume it", "others", do)
         return
@@ -197,7 +215,7 @@ def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
             for old in out.glob(pattern):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
     make_folder(out / "cells")
-    write_json(path, {"study": study.name, "settings": said})
+    write_json(path, {"study": study.name, "settings": asked})
 
 
 def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
@@ -214,9 +232,18 @@ def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
     return kept["found"]
 
 
-def _do_cells(study, settings, base, cells, out, workers: Workers, found, on_cell) -> dict[str, str]:
-    """Do what is not in `found` and put it there; the sentences of those that failed, in the order of cells."""
-    todo, failed = [cell for cell in cells if cell.name not in found], {}
+def _do_cells(
+    study: Study,
+    settings: Strict,
+    base: Path,
+    cells: Sequence[Cell],
+    out: Path,
+    workers: Workers,
+    answers: dict[str, dict[str, Any]],
+    on_cell: Callable[[int, int], None],
+) -> dict[str, str]:
+    """Do what is not in `answers` and put it there; the sentences of those that failed, in the order of cells."""
+    todo, failed = [cell for cell in cells if cell.name not in answers], {}
     done = len(cells) - len(todo)
     on_cell(done, len(cells))
     for number, future in workers.completed(partial(_run_cell, study.run, settings, base), todo):
@@ -226,7 +253,7 @@ def _do_cells(study, settings, base, cells, out, workers: Workers, found, on_cel
         except Exception as error:  # a worker that died
             values, files, sentence = {}, {}, _sentence(error)
         if sentence is None:
-            found[cell.name] = _keep(study, out, cell, values, files)
+            answers[cell.name] = _keep(study, out, cell, values, files)
         else:
             failed[cell.name] = sentence
         on_cell(done, len(cells))
@@ -237,9 +264,9 @@ def _run_cell(run, settings: Strict, base: Path, cell: Cell) -> tuple[dict, dict
     """(JSON values, bytes, None), or why not: errors do not travel, since not every one survives it."""
     try:
         with one_thread():
-            found = run(settings, base, cell)
-        files = {key: value for key, value in found.items() if isinstance(value, bytes)}
-        return _through_json({key: value for key, value in found.items() if key not in files}), files, None
+            answers = run(settings, base, cell)
+        files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
+        return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
     except Exception as error:  # also what a user's own network raises
         return {}, {}, _sentence(error)
 
@@ -255,20 +282,9 @@ def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, by
     for key, name in names.items():
         make_folder((out / name).parent)
         write_whole(out / name, lambda path, key=key: path.write_bytes(files[key]))
-    found = values | names
-    write_json(
-        out / "cells" / f"{cell.name}.json", {"cell": dict(cell.values), "found": found, "files": list(names.values())}
-    )
-    return found
-
-
-def _write(study, settings, out: Path, tables, figures, results, failed) -> None:
-    cells = {one.cell.name: {"cell": dict(one.cell.values), "found": one.found} for one in results}
-    extent = f"{len(results)} of {len(results) + len(failed)} cells finished"
-    said = settings.model_dump(mode="json")
-    write_results(
-        out, Results("study", study.name, study.about, extent, said, tables, figures, failed, {"cells": cells})
-    )
+    kept = {"cell": dict(cell.values), "found": values | names, "files": list(names.values())}
+    write_json(out / "cells" / f"{cell.name}.json", kept)
+    return values | names
 
 
 def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
