@@ -18,8 +18,10 @@ from patchproof.optimizer.run import optimize_scene
 from patchproof.report.tables import Estimate, mean
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, validated
-from patchproof.study.study import Cell, Result, run_study, short_name
-from patchproof.study.trained import Told, TrainedSettings, cell_of, networks_of, scenes_of, verdict
+from patchproof.study.grid import cell_of, short_name
+from patchproof.study.record import Record
+from patchproof.study.study import Cell, Result, run_study
+from patchproof.study.trained import TrainedSettings, networks_of, verdict, ways_of
 from test_textures_optimized import scene_file
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
@@ -204,15 +206,15 @@ def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
 def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_path):
     config = written(tmp_path, config=f'networks = ["{RED}"]\n')
     settings = TrainedSettings(scenes=("texture.toml",), networks=(RED,))
-    ((_, _, before),) = scenes_of(settings, config.parent)
+    (before,) = ways_of(settings, config.parent)
     scene = tmp_path / "texture.toml"
     scene.write_text(scene.read_text().replace("distance_mm = [600", "distance_mm = [500"))
-    ((_, _, after),) = scenes_of(settings, config.parent)
-    cells = [cell_of(values, "row", (RED,), (RED,), 0) for values in (before, after)]
+    (after,) = ways_of(settings, config.parent)
+    cells = [cell_of(values, 0, "row") for values in (before, after)]
     assert cells[0].name == cells[1].name and cells[0].values != cells[1].values
-    wrong = settings.model_copy(update={"ways": {"odd": {"optimize": {"stpes": 3}}}})
+    wrong = settings.changed(ways={"odd": {"optimize": {"stpes": 3}}})
     with pytest.raises(Refused, match=r'way odd, got "optimize\.stpes": did you mean "steps"'):
-        scenes_of(wrong, config.parent)
+        list(ways_of(wrong, config.parent))
 
 
 def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path):
@@ -220,23 +222,25 @@ def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path)
         scenes=("a.toml",), networks=("builtin",), if_installed=("module:fake_networks.missing", RED)
     )
     assert networks_of(settings, tmp_path) == ("builtin", RED)
-    both = settings.model_copy(update={"networks": ("file:a/net.pt2", "file:b/net.pt2")})
     with pytest.raises(Refused, match="different names"):
-        networks_of(both, tmp_path)
+        networks_of(settings.changed(if_installed=("builtin",)), tmp_path)
+    with pytest.raises(Refused, match="different names"):
+        settings.changed(networks=("file:a/net.pt2", "file:b/net.pt2"))
     with pytest.raises(Refused, match=r"ways\.a b"):
         validated(TrainedSettings, {"scenes": ["a"], "networks": ["b"], "ways": {"a b": {}}}, "config")
 
 
 def test_pairs_are_those_of_seeds_that_both_have():
     def result(seed, hits):
-        values = {"seed": seed, "tested": ["net"]}
+        values = {"name": "scene", "seed": seed, "networks": ["net"]}
         return Result(Cell("c", values), {"hits": {"x": [hits]}, "confidence": {"x": [[0.5] * len(hits)]}}, Path())
 
-    one = Told([result(0, "1100"), result(1, "1111")], "x")
-    other = Told([result(1, "0001"), result(2, "0000")], "x")
+    one = Record([result(0, "1100"), result(1, "1111")], "x")
+    other = Record([result(1, "0001"), result(2, "0000")], "x")
     gain, _ = one.gain(other, "net")
     assert gain.n == 4 and gain.value == 0.75 and one.level("net")[0].n == 8
-    assert one.gain(Told([], "x"), "net") == (None, None) and verdict(None) == "not measured"
+    assert one.gain(other) == one.gain(other, "net")  # the only network need not be named
+    assert one.gain(Record([], "x"), "net") == (None, None) and verdict(None) == "not measured"
 
 
 def test_means_have_students_interval():

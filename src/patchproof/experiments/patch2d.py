@@ -40,6 +40,7 @@ from patchproof.render.photograph import Shown
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
+from patchproof.scene.scene import Scene
 from patchproof.strict import Refused, expand, nearest
 from patchproof.study.figures import number_grid, picture_sheet
 from patchproof.study.grid import Count, Names, Seeds, cell_of, grouped, network_of, scene_values, short_name
@@ -120,7 +121,7 @@ def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Shown]:
     return shown
 
 
-def _on(problem: Problem, scene: ImageScene) -> Problem:
+def _on(problem: Problem, scene: Scene) -> Problem:
     """The patch on other images."""
     return replace(problem, scene=scene, stage=set_stage(scene))
 
@@ -146,11 +147,8 @@ def _indices(classifier: Classifier, images_of: ImageClass) -> tuple[int, ...]:
 
 def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Shown) -> bytes:
     """Side by side: the patch, an image of its class with it, and up to three of other classes."""
-    others = [scene for scene in scenes if scene is not problem.scene][:3]
-    tiles = [
-        photographs(_on(problem, scene), shown, scene.draw("evaluate", 1), _TILE_PX)[0]
-        for scene in (problem.scene, *others)
-    ]
+    worlds = (problem, *(_on(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
+    tiles = [photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0] for world in worlds]
     return contact_sheet([[enlarged(design, _TILE_PX), *tiles]])
 
 
@@ -225,9 +223,7 @@ def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawin
     """Heat maps of what each patch does to each class, and what was made."""
     count, networks = len(results[0].answers["classes"]), list(dict.fromkeys(map(network_of, results)))
     firsts = [group[0] for group in grouped(results, lambda result: result.cell.values["target"]).values()]
-    files = {
-        f"{_target(first)['name']} ({i + 1})": first.file(f"{first.cell.name}.png") for i, first in enumerate(firsts)
-    }
+    files = [(_target(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
         Drawing(
             "effect",

@@ -41,6 +41,7 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import largest_share, load_image_scene
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
+from patchproof.sheets.piece import Piece
 from patchproof.strict import Range, Refused, Share
 from patchproof.study.figures import picture_sheet, whiskers
 from patchproof.study.grid import (
@@ -114,19 +115,22 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Problem:
     """The same patch as a classic 2D one: its scene is made of renders that are written to `folder`."""
-    scene = problem.scene
+    scene, subject = problem.scene, problem.subject
+    if not isinstance(scene, MeshScene) or not isinstance(subject, Patch):
+        raise Refused("a printed patch on a mesh", "another scene", "choose another")
     names = write_renders(problem.stage, settings.renders, problem.training_px, folder)
     write_labels([(name, scene.settings.target.label) for name in names], folder)
     flat = load_image_scene(flat_settings(scene, settings), folder, scene.seed)
-    subject = Patch(flat, problem.printer, problem.subject.design_px, problem.device)
-    return replace(problem, scene=flat, stage=set_stage(flat, problem.device), subject=subject)
+    pasted = Patch(flat, problem.printer, subject.design_px, problem.device)
+    return replace(problem, scene=flat, stage=set_stage(flat, problem.device), subject=pasted)
 
 
 def flat_settings(scene: MeshScene, settings: Patch3dSettings) -> SceneSettings:
     """A scene of images with the patch, printer, camera and optimizer of a scene with a mesh, and as large in it."""
-    patch = PatchSettings(width_mm=scene.settings.patch.width_mm, height_mm=scene.settings.patch.height_mm)
+    *_, width, height = piece_of(scene).design_rect_mm
+    patch = PatchSettings(width_mm=width, height_mm=height)
     low, high = np.quantile(design_shares(scene), _SIZES)
-    largest = largest_share((patch.width_mm, patch.height_mm), settings.roll_deg)
+    largest = largest_share((width, height), settings.roll_deg)
     share = (float(min(low, largest)), float(min(high, largest)))
     return scene.settings.changed(
         object=ObjectSettings(images=".", labels="labels.csv"),
@@ -141,9 +145,17 @@ def design_shares(scene: MeshScene, views: int = 256) -> np.ndarray:
     """The design's longer side over the picture's shorter one, in training views that see its face."""
     conditions, photo_px = scene.draw("train", views), scene.settings.camera.photo_px
     facing = np.abs(scene.piece_azimuth_deg(conditions)) < 90
-    middle = np.array(scene.piece.size_mm) / 2
-    scales = [local_scale(one, middle)[0] for one in scene.piece_homographies(conditions[facing], photo_px)]
-    return np.array(scales) * max(scene.piece.design_rect_mm[2:]) / min(photo_px)
+    piece = piece_of(scene)
+    middle = np.array(piece.size_mm) / 2
+    scales = [local_scale(view, middle)[0] for view in scene.piece_homographies(conditions[facing], photo_px)]
+    return np.array(scales) * max(piece.design_rect_mm[2:]) / min(photo_px)
+
+
+def piece_of(scene: MeshScene) -> Piece:
+    """The piece that hangs on the object."""
+    if scene.piece is None:
+        raise Refused("a printed patch", "the object's own texture", 'leave patch.kind at "patch"')
+    return scene.piece
 
 
 def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Shown]:
@@ -279,7 +291,8 @@ def _draw_scatter(figure: Figure, results: Sequence[Result]) -> None:
 def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:
     if settings.views:
         return dict(settings.views)
-    edges = np.linspace(*result.answers["azimuth_range_deg"], 4)
+    first, last = result.answers["azimuth_range_deg"]
+    edges = np.linspace(first, last, 4).tolist()
     return dict(zip(("left", "middle", "right"), itertools.pairwise(edges), strict=True))
 
 

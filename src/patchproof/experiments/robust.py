@@ -157,7 +157,7 @@ _SHEETS = (
 def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing]:
     """Colors of all classes, and per scene and way what the designs look like and what of them counts."""
     by_design = _by_design(results)
-    rows, networks = (list(dict.fromkeys(some)) for some in ([k[:3] for k in by_design], [k[3] for k in by_design]))
+    rows, networks = list(dict.fromkeys(key[:3] for key in by_design)), list(dict.fromkeys(key[3] for key in by_design))
     drawings = [
         Drawing(
             "colors",

@@ -276,7 +276,7 @@ def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawin
 def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
     name, title = result.cell.name, "{}, {}, seed {}: clean object".format(*_who(result))
     for number, (map_, asked) in enumerate(zip(result.answers["maps"], settings.maps, strict=True)):
-        rates = [[np.mean(hits_of(hits)) for hits in column] for column in map_["hits"]]
+        rates = [[float(np.mean(hits_of(hits))) for hits in column] for column in map_["hits"]]
         caption = f"rate, n = {asked.n} draws per cell; framed: the worst tenth"
         yield heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], map_ticks(map_["axes"]))
     hidden, asked = result.answers["occlusion"], settings.occlusion

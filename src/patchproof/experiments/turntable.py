@@ -20,6 +20,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, shade
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
+from patchproof.strict import Refused
 from patchproof.study.pictures import photographs
 
 _PATH_STEPS = 24  # of the integral; builtin's attributions then add up to within a few percent
@@ -73,6 +74,8 @@ def turn(problem: Problem, shown: Shown, views: int, side_px: int) -> Tensor:
 def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
     """sRGB codes of the mean light of the object's pixels over a full turn in even white light."""
     seen = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
+    if seen.object is None:
+        raise Refused("an object of its own", "a picture", "name a mesh")
     with torch.no_grad():
         light = shade(seen, shown).permute(0, 2, 3, 1).reshape(-1, 3)[seen.object.pixel]
     red, green, blue = (srgb_from_linear(light.double().mean(0)) * 255).round().clamp(0, 255).int().tolist()

@@ -67,7 +67,7 @@ def number_grid(
     for (row, column), value in np.ndenumerate(values):
         red, green, blue, _ = image.cmap(image.norm(value))
         ink = "black" if 0.3 * red + 0.6 * green + 0.1 * blue > 0.45 else "white"
-        axes.text(column, row, texts[row][column], ha="center", va="center", color=ink, fontsize=fontsize)
+        axes.text(column, row, str(texts[row][column]), ha="center", va="center", color=ink, fontsize=fontsize)
     for row, column in framed:
         axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="red", linewidth=2))
     return image

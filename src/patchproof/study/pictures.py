@@ -47,9 +47,10 @@ def enlarged(pixels: np.ndarray, side_px: int) -> Tensor:
 
 def object_file(problem: Problem, design: np.ndarray) -> tuple[str, bytes]:
     """(suffix, bytes): the object with its new textures as GLB, or the patch as PNG."""
-    if not isinstance(problem.subject, Texture):
+    canvas = getattr(problem.scene, "canvas", None)
+    if canvas is None or not isinstance(problem.subject, Texture):
         return "png", png(design)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "object.glb"
-        write_glb(problem.scene.canvas.mesh, problem.subject.textures(design), path)
+        write_glb(canvas.mesh, problem.subject.textures(design), path)
         return "glb", path.read_bytes()

@@ -94,6 +94,11 @@ class Study:
     files: str = "files"  # folder for what cells gave as bytes; "." is the study's own
     own_files: tuple[str, ...] = ("files",)  # patterns of names that --overwrite may replace besides
 
+    @property
+    def about(self) -> str:
+        """What it is about, in one line."""
+        return first_line(self.run.__module__)
+
 
 @dataclass(frozen=True)
 class Finished:
@@ -111,8 +116,8 @@ def load_study(name: str) -> Study:
     return import_module(STUDIES[name]).STUDY
 
 
-def about(module: str) -> str:
-    """The first line of a module's docstring; it is not imported."""
+def first_line(module: str) -> str:
+    """What a study's module is about: the first line of its docstring; it is not imported."""
     spec = find_spec(module)
     source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
@@ -175,7 +180,7 @@ def carry_out(
     page = Results(
         kind="study",
         name=study.name,
-        about=about(study.run.__module__),
+        about=study.about,
         extent=f"{len(results)} of {len(cells)} cells finished",
         settings=settings.model_dump(mode="json"),
         tables=tables,

@@ -136,7 +136,8 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     answers = {"modeled": responses(problem, {"design": shown}, problem.scene.draw("evaluate", settings.n))}
     if settings.photos:
         drawn = problem.scene.draw("reprint", settings.photos)
-        photos = (photograph_traced(problem.stage, shown, drawn[i : i + 1]) for i in range(len(drawn)))
+        piece = shown if isinstance(shown, PiecePicture) else None
+        photos = (photograph_traced(problem.stage, piece, drawn[i : i + 1]) for i in range(len(drawn)))
         answers["path_traced"] = joined([{"design": ask(problem, photo)} for photo in photos])
     costs = _costs(problem, settings.effects) if effect == ALL else {}
     return {"cost": costs, **{world: recorded(some) for world, some in answers.items()}}
@@ -204,7 +205,7 @@ def figures(settings: AblationSettings, results: Sequence[Result]) -> tuple[Draw
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for shift, at, label in ((-0.15, 3, "our renderer"), (0.15, 5, "path-traced")):
-            earned = {i + shift: row[at] for i, row in enumerate(rows) if isinstance(row[at], Estimate)}
+            earned = {i + shift: value for i, row in enumerate(rows) if isinstance(value := row[at], Estimate)}
             if earned:
                 values, reach = whiskers(list(earned.values()))
                 axes.errorbar(values, list(earned), xerr=reach, fmt="o", label=label, capsize=2)

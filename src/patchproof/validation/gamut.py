@@ -118,8 +118,9 @@ def other_printers(known: Printer) -> list[Printer]:
     """
     names = sorted(path.stem for path in shipped("calibration", "printers").glob("*.npz"))
     others = [load_printer(name) for name in names if name != known.name]
-    light = vary(linear_from_srgb(others[-1].lut), torch.tensor([0.10, 0.0, 0.05]))
-    made = replace(others[-1], name=f"{others[-1].name}, +10 % dot gain, pale black", lut=srgb_from_linear(light))
+    light = vary(torch.as_tensor(linear_from_srgb(others[-1].lut)), torch.tensor([0.10, 0.0, 0.05]))
+    name = f"{others[-1].name}, +10 % dot gain, pale black"
+    made = replace(others[-1], name=name, lut=torch.as_tensor(srgb_from_linear(light)))
     return [known, *others, made]
 
 

@@ -122,7 +122,7 @@ def shifted(rates, shift: float) -> np.ndarray:
 
 def fitted_shift(counts: Sequence[Count]) -> float:
     """The shift that makes the counts most likely."""
-    from scipy.optimize import minimize_scalar
+    from scipy.optimize import fminbound
 
     rates, hits, n = (np.array([count[key] for count in counts], float) for key in ("rate", "recognized", "judged"))
 
@@ -130,7 +130,7 @@ def fitted_shift(counts: Sequence[Count]) -> float:
         p = shifted(rates, shift or 1e-12)
         return -float((hits * np.log(p) + (n - hits) * np.log(1 - p)).sum())
 
-    return float(minimize_scalar(unlikely, bounds=(-3, 3), method="bounded").x)
+    return float(fminbound(unlikely, -3, 3))
 
 
 def _bias(counts: Sequence[Count], shift: float = 0.0) -> list[float]:

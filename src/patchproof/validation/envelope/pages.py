@@ -177,17 +177,19 @@ def _draw_page(figure: Figure, sweeps: Sequence[Result], maps: Sequence[Result])
     first = (sweeps or maps)[0].answers
     goal = "seen as" if Goal(first["goal"]).sign > 0 else "not seen as"
     figure.suptitle(f"Operating envelope of sheet {first['sheet']}: {goal} {first['label']} by {first['model']}")
-    parts = figure.subfigures(1, 2, width_ratios=(1.15, 1)) if sweeps and maps else [figure, figure]
+    left, right = figure, figure
+    if sweeps and maps:
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1))[0]
     if sweeps:
-        _draw_bars(parts[0].add_subplot(), sweeps)
+        _draw_bars(left.add_subplot(), sweeps)
     if maps:
         rows = -(-len(maps) // 2)
-        for axes, result in zip(parts[1].subplots(rows, 2, squeeze=False).flat, maps, strict=False):
+        for axes, result in zip(right.subplots(rows, 2, squeeze=False).flat, maps, strict=False):
             _draw_map(axes, result)
-        for axes in parts[1].axes[len(maps) :]:
+        for axes in right.axes[len(maps) :]:
             axes.set_axis_off()
         note = "number: share recognized, %; ×: fewer than half of the photographs can be measured"
-        parts[1].supxlabel(note, fontsize=7)
+        right.supxlabel(note, fontsize=7)
 
 
 def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
