@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+import patchproof
 import toy_studies as toy
 from patchproof.strict import Refused
 from patchproof.study import study
@@ -116,6 +118,27 @@ def test_studies_are_found_by_name_and_configs_read_strictly(tmp_path, monkeypat
     assert not (tmp_path / "out").exists()
     config.write_text("numbers = [2]")
     assert len(run_study("toy", config, tmp_path / "out").results) == 1
+
+
+def test_every_study_is_listed_under_its_own_name_and_says_what_it_is_about():
+    root = Path(patchproof.__file__).parent
+    modules = {
+        ".".join(["patchproof", *path.relative_to(root).with_suffix("").parts])
+        for path in root.rglob("*.py")
+        if re.search(r"^STUDY\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert modules == set(study.STUDIES.values()), "list it in STUDIES"
+    for name, module in study.STUDIES.items():
+        assert load_study(name).name == name
+        assert re.fullmatch(r"[A-Z].{20,118}\.", study.first_line(module)), module
+
+
+def test_listing_the_studies_imports_none_of_them():
+    code = (
+        "import sys; from patchproof.study.study import STUDIES, first_line\n"
+        "print(*map(first_line, STUDIES.values())); sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):

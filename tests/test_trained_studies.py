@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from patchproof.claims import Estimate, mean
 from patchproof.experiments import deceive, transfer
 from patchproof.experiments.turntable import attributions, from_sides, goal_log, mean_color, three_views
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate_run
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import optimize_scene
-from patchproof.report.tables import Estimate, mean
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, validated
 from patchproof.study.grid import cell_of, short_name

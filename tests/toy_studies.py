@@ -7,7 +7,8 @@ import signal
 import time
 from pathlib import Path
 
-from patchproof.report.tables import Drawing, Table, rate
+from patchproof.claims import rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict
 from patchproof.study.study import Cell, Study
 

@@ -23,6 +23,7 @@ import torch
 from PIL import Image
 from pydantic import BeforeValidator, Field
 
+from patchproof.claims import difference, rate
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -31,7 +32,7 @@ from patchproof.harden.harden import Method, harden, moved, squares
 from patchproof.harden.labeled import in_blocks, labeled_files, read_large_enough
 from patchproof.output import write_whole
 from patchproof.photo.cannot import CannotJudge
-from patchproof.report.tables import Drawing, Table, difference, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Positive, Refused, Share, Strict, expand
 from patchproof.study.grid import short_name
 from patchproof.study.study import Cell, Finished, Result, Study, carry_out

@@ -13,9 +13,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from patchproof.claims import Estimate
 from patchproof.output import write_whole
 from patchproof.report.images import data_uri
-from patchproof.report.tables import Drawing, Estimate, Table, csv_text, png, shown
+from patchproof.report.tables import Drawing, Table, csv_text, png, shown
 
 _LIBRARIES = ("patchproof", "torch", "numpy")
 

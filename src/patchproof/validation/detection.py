@@ -21,8 +21,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchproof.claims import Estimate, rate
 from patchproof.geometry import apply_homography, local_scale, rect_corners
-from patchproof.report.tables import Drawing, Estimate, Table, rate
+from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Share, Strict
 from patchproof.study.study import Cell, Result, Study
 

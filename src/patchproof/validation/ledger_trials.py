@@ -21,9 +21,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchproof.claims import rate
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import local_scale
-from patchproof.report.tables import Table, rate
+from patchproof.report.tables import Table
 from patchproof.scene.conditions import with_value
 from patchproof.strict import Strict
 from patchproof.study.study import Cell, Result, Study
