@@ -18,13 +18,13 @@ import patchproof
 import toy_studies as toy
 from patchproof.strict import Refused
 from patchproof.study import study
-from patchproof.study.study import carry_out, load_study, run_study
+from patchproof.study.study import Work, carry_out, load_study, run_study
 
 BASE = Path(__file__).parent
 
 
 def carried_out(out, *numbers, **options):
-    return carry_out(toy.STUDY, toy.ToySettings(numbers=numbers), BASE, out, **options)
+    return carry_out(toy.STUDY, toy.ToySettings(numbers=numbers), BASE, out, Work(**options))
 
 
 def contents(folder):
@@ -72,10 +72,10 @@ def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_pa
         done.append(cell.name)
         return {"square": -1}
 
-    carry_out(replace(toy.STUDY, run=run), toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, resume=True)
+    carry_out(replace(toy.STUDY, run=run), toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
     assert done == ["n3", "n13"]
     changed = replace(toy.STUDY, run=run, cells=lambda s, b: [study.Cell("n2", {"number": 20})])
-    carry_out(changed, toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, resume=True)
+    carry_out(changed, toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
     assert done == ["n3", "n13", "n2"]
 
 
@@ -144,7 +144,7 @@ def test_listing_the_studies_imports_none_of_them():
 def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     settings = toy.ToySettings(numbers=tuple(range(20, 32)), pause_s=0.2)
-    carry_out(toy.STUDY, settings, BASE, whole, jobs=2)
+    carry_out(toy.STUDY, settings, BASE, whole, Work(jobs=2))
     code = (
         f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
         "import toy_studies as toy\nfrom pathlib import Path\nfrom patchproof.study.study import carry_out\n"
@@ -158,7 +158,7 @@ def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert len(list(killed.glob("cells/*.json"))) < 12
-    carry_out(toy.STUDY, settings, BASE, killed, resume=True)
+    carry_out(toy.STUDY, settings, BASE, killed, Work(resume=True))
     assert contents(killed) == contents(whole)
 
 
@@ -169,6 +169,6 @@ def test_a_cluster_that_loses_a_worker_changes_no_byte(tmp_path):
     carry_out(toy.STUDY, settings, BASE, tmp_path / "here")
     (tmp_path / "n3").touch()
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        carry_out(toy.STUDY, settings, BASE, tmp_path / "there", cluster=cluster.scheduler_address)
+        carry_out(toy.STUDY, settings, BASE, tmp_path / "there", Work(cluster=cluster.scheduler_address))
     assert not (tmp_path / "n3").exists()
     assert contents(tmp_path / "there") == contents(tmp_path / "here")

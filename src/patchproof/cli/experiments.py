@@ -39,6 +39,7 @@ def harden(
     """Change labeled images so that classifiers recognize them better, and attack them."""
     from patchproof.harden.folder import HardenSettings, harden_images
     from patchproof.strict import validated
+    from patchproof.study.study import Work
 
     given = {
         "images": str(images),
@@ -54,15 +55,8 @@ def harden(
         "attack_epsilons": names_of(attack_eps),
     }
     with progress() as bar:
-        finished = harden_images(
-            validated(HardenSettings, given, "the options"),
-            out,
-            resume=resume,
-            overwrite=overwrite,
-            jobs=jobs,
-            cluster=cluster,
-            on_cell=lambda done, total: bar("harden", done, total),
-        )
+        work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("harden", done, total))
+        finished = harden_images(validated(HardenSettings, given, "the options"), out, work)
     say_study(finished)
     say(f"images: {out}, tables: {out / 'harden.html'}")
     raise typer.Exit(0 if finished.results else 1)
@@ -78,19 +72,11 @@ def study(
     cluster: Cluster = None,
 ) -> None:
     """One of the paper's experiments: many cells, tables with intervals, figures and one page."""
-    from patchproof.study.study import run_study
+    from patchproof.study.study import Work, run_study
 
     with progress() as bar:
-        finished = run_study(
-            name,
-            config,
-            out,
-            resume=resume,
-            overwrite=overwrite,
-            jobs=jobs,
-            cluster=cluster,
-            on_cell=lambda done, total: bar("cells", done, total),
-        )
+        work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("cells", done, total))
+        finished = run_study(name, config, out, work)
     say_study(finished)
     say(f"page: {out / name}.html")
     raise typer.Exit(0 if finished.results else 1)

@@ -16,6 +16,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -27,7 +28,7 @@ from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.report.results import Results, write_json, write_results
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict, nearest, read_toml, validated
-from patchproof.workers import Workers, one_thread, open_workers, result_of
+from patchproof.workers import one_thread, open_workers, result_of
 
 # by name the module whose STUDY it is; the first line of its docstring says what it is about
 STUDIES: dict[str, str] = {
@@ -123,60 +124,53 @@ def first_line(module: str) -> str:
     return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
 
 
-def run_study(
-    name: str,
-    config: str | Path,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    jobs: int = 1,
-    cluster: str | None = None,
-    on_cell: Callable[[int, int], None] = lambda done, total: None,
-) -> Finished:
+@dataclass(frozen=True)
+class Work:
+    """How a study is carried out: what may lie in its folder already, and who computes (see `open_workers`);
+    `on_cell` is called with (done, all).
+    """
+
+    resume: bool = False
+    overwrite: bool = False
+    jobs: int = 1
+    cluster: str | None = None
+    on_cell: Callable[[int, int], None] = lambda done, total: None
+
+
+HERE = Work()  # in this process, into a new folder
+
+
+def run_study(name: str, config: str | Path, out: str | Path, work: Work = HERE) -> Finished:
     """Run the study that the TOML file describes into the folder `out`."""
     study = load_study(name)
     settings = validated(study.settings, read_toml(config), str(config))
-    base = Path(config).resolve().parent
-    return carry_out(
-        study,
-        settings,
-        base,
-        out,
-        resume=resume,
-        overwrite=overwrite,
-        jobs=jobs,
-        cluster=cluster,
-        on_cell=on_cell,
-    )
+    return carry_out(study, settings, Path(config).resolve().parent, out, work)
 
 
-def carry_out(
-    study: Study,
-    settings: Strict,
-    base: Path,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    jobs: int = 1,
-    cluster: str | None = None,
-    on_cell: Callable[[int, int], None] = lambda done, total: None,
-) -> Finished:
-    """Run a study with settings at hand; `on_cell` is called with (done, all)."""
+def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work: Work = HERE) -> Finished:
+    """Run a study with settings at hand."""
     out = Path(out)
-    if not resume:
-        check_folder(out, _own(study), overwrite)
+    if not work.resume:
+        check_folder(out, _own(study), work.overwrite)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
-    with open_workers(jobs, cluster) as workers:
-        _begin(study, settings, out, resume)
-        answers = {cell.name: values for cell in cells if (values := _kept(out, cell)) is not None}
-        failed = _do_cells(study, settings, base, cells, out, workers, answers, on_cell)
-    results = tuple(Result(cell, answers[cell.name], out) for cell in cells if cell.name in answers)
+    with open_workers(work.jobs, work.cluster) as workers:
+        _begin(study, settings, out, work.resume)
+        kept = {cell.name: answers for cell in cells if (answers := _kept(out, cell)) is not None}
+        todo = [cell for cell in cells if cell.name not in kept]
+        failed: dict[str, str] = {}
+        work.on_cell(len(kept), len(cells))
+        do = partial(_run_cell, study.run, settings, base)
+        for done, (number, future) in enumerate(workers.completed(do, todo), len(kept) + 1):
+            cell = todo[number]
+            values, files, sentence = _outcome(future)
+            if sentence is None:
+                kept[cell.name] = _keep(study, out, cell, values, files)
+            else:
+                failed[cell.name] = sentence
+            work.on_cell(done, len(cells))
+    results = tuple(Result(cell, kept[cell.name], out) for cell in cells if cell.name in kept)
     tables = tuple(study.tables(settings, results)) if results else ()
-    figures = tuple(study.figures(settings, results)) if results else ()
-    done = {result.cell.name: {"cell": dict(result.cell.values), "found": result.answers} for result in results}
     page = Results(
         kind="study",
         name=study.name,
@@ -184,12 +178,12 @@ def carry_out(
         extent=f"{len(results)} of {len(cells)} cells finished",
         settings=settings.model_dump(mode="json"),
         tables=tables,
-        figures=figures,
-        failed=failed,
-        more={"cells": done},
+        figures=tuple(study.figures(settings, results)) if results else (),
+        failed={cell.name: failed[cell.name] for cell in cells if cell.name in failed},
+        more={"cells": {one.cell.name: {"cell": dict(one.cell.values), "found": one.answers} for one in results}},
     )
     write_results(out, page)
-    return Finished(tables, results, failed)
+    return Finished(tables, results, dict(page.failed))
 
 
 def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
@@ -237,42 +231,24 @@ def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
     return kept["found"]
 
 
-def _do_cells(
-    study: Study,
-    settings: Strict,
-    base: Path,
-    cells: Sequence[Cell],
-    out: Path,
-    workers: Workers,
-    answers: dict[str, dict[str, Any]],
-    on_cell: Callable[[int, int], None],
-) -> dict[str, str]:
-    """Do what is not in `answers` and put it there; the sentences of those that failed, in the order of cells."""
-    todo, failed = [cell for cell in cells if cell.name not in answers], {}
-    done = len(cells) - len(todo)
-    on_cell(done, len(cells))
-    for number, future in workers.completed(partial(_run_cell, study.run, settings, base), todo):
-        cell, done = todo[number], done + 1
-        try:
-            values, files, sentence = result_of(future)
-        except Exception as error:  # a worker that died
-            values, files, sentence = {}, {}, _sentence(error)
-        if sentence is None:
-            answers[cell.name] = _keep(study, out, cell, values, files)
-        else:
-            failed[cell.name] = sentence
-        on_cell(done, len(cells))
-    return {cell.name: failed[cell.name] for cell in cells if cell.name in failed}
+Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]  # (JSON values, bytes, None), or why there are none
 
 
-def _run_cell(run, settings: Strict, base: Path, cell: Cell) -> tuple[dict, dict[str, bytes], str | None]:
-    """(JSON values, bytes, None), or why not: errors do not travel, since not every one survives it."""
+def _run_cell(run: Callable[[Any, Path, Cell], dict[str, Any]], settings: Strict, base: Path, cell: Cell) -> Outcome:
+    """What a cell gave; errors do not travel, since not every one survives it."""
     try:
         with one_thread():
             answers = run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
         return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
     except Exception as error:  # also what a user's own network raises
+        return {}, {}, _sentence(error)
+
+
+def _outcome(future: Future) -> Outcome:
+    try:
+        return result_of(future)
+    except Exception as error:  # a worker that died
         return {}, {}, _sentence(error)
 
 
