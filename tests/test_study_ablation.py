@@ -66,7 +66,7 @@ def test_what_an_effect_earned_by_hand():
             hits = "1" * count + "0" * (10 - count)
             answers = {"modeled": {"hits": {"design": [hits]}, "confidence": {"design": [[count / 20] * 10]}}}
             answers["cost"] = {"noise": 0.1 + 0.2 * seed} if effect == ALL else {}
-            values = {"name": "s", "networks": ["n"], "seed": seed, "effect": effect}
+            values = {"name": "s", "networks": ["n"], "network": "n", "seed": seed, "effect": effect}
             results.append(Result(Cell(f"{seed}{effect}", values), answers, Path()))
     earned, designs = ablation.tables(settings, results)
     ((effect, groups, rate, confidence, *traced, cost),) = earned.rows

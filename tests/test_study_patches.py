@@ -116,7 +116,7 @@ def result3d(scene, model, seed, **kinds):
         "azimuth_range_deg": (-45.0, 45.0),
         "passes": {"3d": 1, "2d": 1},
     }
-    values = {"name": scene, "networks": [model], "seed": seed}
+    values = {"name": scene, "networks": [model], "network": model, "seed": seed}
     return Result(Cell(f"{scene}-{model}-{seed}", values), answers, Path())
 
 

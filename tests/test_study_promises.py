@@ -18,7 +18,13 @@ def count(rate, recognized, judged=40, n=400):
 
 
 def result(scene, one):
-    values = {"name": scene, "networks": ["builtin"], "scene": {"printer": {"profile": "coated"}}, "seed": 0}
+    values = {
+        "name": scene,
+        "networks": ["builtin"],
+        "network": "builtin",
+        "scene": {"printer": {"profile": "coated"}},
+        "seed": 0,
+    }
     return Result(Cell(f"{scene}{one['recognized']}", values), one, Path())
 
 

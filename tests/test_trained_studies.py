@@ -18,10 +18,10 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import optimize_scene
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, validated
-from patchproof.study.grid import cell_of, short_name
+from patchproof.study.grid import short_name
 from patchproof.study.record import Record
 from patchproof.study.study import Cell, Result, run_study
-from patchproof.study.trained import TrainedSettings, networks_of, verdict, ways_of
+from patchproof.study.trained import TrainedSettings, networks_of, trained_cells, verdict
 from test_textures_optimized import scene_file
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
@@ -206,15 +206,14 @@ def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
 def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_path):
     config = written(tmp_path, config=f'networks = ["{RED}"]\n')
     settings = TrainedSettings(scenes=("texture.toml",), networks=(RED,))
-    (before,) = ways_of(settings, config.parent)
+    (before,) = trained_cells(settings, config.parent)
     scene = tmp_path / "texture.toml"
     scene.write_text(scene.read_text().replace("distance_mm = [600", "distance_mm = [500"))
-    (after,) = ways_of(settings, config.parent)
-    cells = [cell_of(values, 0, "row") for values in (before, after)]
-    assert cells[0].name == cells[1].name and cells[0].values != cells[1].values
+    (after,) = trained_cells(settings, config.parent)
+    assert before.name == after.name and before.values != after.values
     wrong = settings.changed(ways={"odd": {"optimize": {"stpes": 3}}})
     with pytest.raises(Refused, match=r'way odd, got "optimize\.stpes": did you mean "steps"'):
-        list(ways_of(wrong, config.parent))
+        trained_cells(wrong, config.parent)
 
 
 def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path):

@@ -23,21 +23,11 @@ from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.figures import picture_sheet
-from patchproof.study.grid import grouped, of_values, problem_of, short_name, with_tables
+from patchproof.study.grid import grouped, of_values, problem_of, short_name
 from patchproof.study.pictures import contact_sheet, object_file, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
-from patchproof.study.trained import (
-    TrainedSettings,
-    Way,
-    Word,
-    left_out_note,
-    networks_of,
-    tested_in,
-    trained_cells,
-    trained_on,
-    ways_of,
-)
+from patchproof.study.trained import TrainedSettings, Way, Word, left_out_note, tested_in, trained_cells, trained_on
 
 CONTROLS = ("bare", "grey", "noise", "shuffled")
 _KINDS = ("design", *CONTROLS)
@@ -55,19 +45,7 @@ class DeceiveSettings(TrainedSettings):
 
 def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
     """One per scene, way, network and seed; the goal is `deceive` whatever the scene file says."""
-    networks = networks_of(settings, base)
-    return [
-        cell
-        for values in ways_of(settings, base)
-        for network in networks
-        for cell in trained_cells(
-            settings,
-            with_tables(values, {"target": {"goal": "deceive"}}),
-            short_name(network),
-            (network,),
-            networks,
-        )
-    ]
+    return trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
 
 
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from patchproof.render.photograph import Shown
 from patchproof.report.tables import Drawing, Table
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
-from patchproof.study.grid import Count, GridSettings, grouped, network_of, problem_of, with_tables
+from patchproof.study.grid import Count, GridSettings, grouped, of_values, problem_of, who, with_tables
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 
@@ -111,7 +111,7 @@ def tables(settings: MiningSettings, results: Sequence[Result]) -> tuple[Table, 
     """The lift in the worst cells and over all, per scene, network and seed; and pooled over seeds."""
     head = ("scene", "network", "seed", "steps", "steps mined", "passes", "passes mined")
     rates = ("clean", "not mined", "mined", "mined - not mined")
-    pooled = grouped(results, lambda result: (result.cell.values["name"], network_of(result)))
+    pooled = grouped(results, of_values("name", "network"))
     return (
         Table(
             "worst",
@@ -138,9 +138,7 @@ def tables(settings: MiningSettings, results: Sequence[Result]) -> tuple[Table, 
 
 
 def _row(result: Result, where: str) -> tuple:
-    values, answers = result.cell.values, result.answers
-    costs = (*answers["steps"], *answers["passes"])
-    return (values["name"], network_of(result), values["seed"], *costs, *_compared([result], where))
+    return (*who(result), *result.answers["steps"], *result.answers["passes"], *_compared([result], where))
 
 
 def _compared(results: Sequence[Result], where: str) -> tuple:
@@ -154,7 +152,7 @@ def figures(settings: MiningSettings, results: Sequence[Result]) -> tuple[Drawin
     caption = f"rate, n = {settings.map.n} draws per cell; framed: the worst tenth"
     drawings = []
     for result in results:
-        title = f"{result.cell.values['name']}, {network_of(result)}, seed {result.cell.values['seed']}: clean object"
+        title = "{}, {}, seed {}: clean object".format(*who(result))
         answers, name = result.answers, f"map_{result.cell.name}"
         ticks = map_ticks(answers["axes"])
         drawings.append(heat_map(name, (title, caption), answers["rates"], answers["worst"], ticks))

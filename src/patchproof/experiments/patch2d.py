@@ -43,7 +43,7 @@ from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
 from patchproof.scene.scene import Scene
 from patchproof.strict import Refused, expand, nearest
 from patchproof.study.figures import number_grid, picture_sheet
-from patchproof.study.grid import Count, Names, Seeds, cell_of, grouped, network_of, scene_values, short_name
+from patchproof.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
@@ -73,14 +73,12 @@ def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
     for target in targets:
         if target not in known:
             raise Refused("a target that there are images of", f'"{target}"', nearest(str(target), map(str, known)))
-    return [
-        cell_of(
-            {"name": f"target{i}", "target": target, "networks": [network], "renders": renders},
-            seed,
-            short_name(network),
-        )
-        for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks)
-    ]
+    cells = []
+    for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks):
+        name = short_name(network)
+        values = {"name": f"target{i}", "target": target, "networks": [network], "network": name, "renders": renders}
+        cells.append(cell_of(values, seed, name))
+    return cells
 
 
 def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
@@ -221,8 +219,11 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
     """Heat maps of what each patch does to each class, and what was made."""
-    count, networks = len(results[0].answers["classes"]), list(dict.fromkeys(map(network_of, results)))
-    firsts = [group[0] for group in grouped(results, lambda result: result.cell.values["target"]).values()]
+    count, networks = (
+        len(results[0].answers["classes"]),
+        list(dict.fromkeys(result.cell.values["network"] for result in results)),
+    )
+    firsts = [group[0] for group in grouped(results, of_values("target")).values()]
     files = [(_target(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
         Drawing(
@@ -261,9 +262,9 @@ def _draw_effect(figure: Figure, results: Sequence[Result], networks: Sequence[s
         axes.set_title(f"{network}: images of", fontsize=9)
 
 
-def _by_target(results: Sequence[Result]) -> dict[tuple[str | int, str], list[Result]]:
+def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:
     """Seeds together: results by (target, network)."""
-    return grouped(results, lambda result: (result.cell.values["target"], network_of(result)))
+    return grouped(results, of_values("target", "network"))
 
 
 def _target(result: Result) -> Class:

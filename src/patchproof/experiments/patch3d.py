@@ -44,18 +44,7 @@ from patchproof.settings import ObjectSettings, PatchSettings, SceneSettings, Vi
 from patchproof.sheets.piece import Piece
 from patchproof.strict import Range, Refused, Share
 from patchproof.study.figures import picture_sheet, whiskers
-from patchproof.study.grid import (
-    Count,
-    GridSettings,
-    Seeds,
-    cell_of,
-    grouped,
-    network_of,
-    of_values,
-    pairs,
-    problem_of,
-    short_name,
-)
+from patchproof.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import Record, hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
@@ -89,7 +78,7 @@ def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:
         if values["scene"]["object"]["mesh"] is None or values["scene"]["patch"]["kind"] != "patch":
             do = 'give object.mesh and patch.kind = "patch"'
             raise Refused("a scene with a mesh and a printed patch", values["file"], do)
-    return [cell_of(values, seed, short_name(values["networks"][0])) for seed in settings.seeds for values in scenes]
+    return [cell_of(values, seed, values["network"]) for seed in settings.seeds for values in scenes]
 
 
 def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
@@ -195,7 +184,7 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
 
 
 def _pooled(results: Sequence[Result]) -> Table:
-    groups = grouped(results, lambda result: (result.cell.values["name"], network_of(result)))
+    groups = grouped(results, of_values("name", "network"))
     hard = {key: group for key, group in groups.items() if _mean(group, "bare") <= HARD}
     rows = []
     for a, b in (("3d", "2d"), ("3d", "grey"), ("3d", "noise"), ("2d", "grey"), ("2d", "noise"), ("3d", "bare")):
@@ -223,7 +212,7 @@ def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
     groups: dict[tuple[str, str], dict[str, list[bool]]] = {}
     for result in results:
         for view, (low, high) in _views(settings, result).items():
-            group = groups.setdefault((network_of(result), view), {kind: [] for kind in KINDS})
+            group = groups.setdefault((result.cell.values["network"], view), {kind: [] for kind in KINDS})
             for kind in KINDS:
                 hits = zip(hits_of(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
                 group[kind] += [hit for hit, azimuth in hits if low <= azimuth <= high]
@@ -238,10 +227,9 @@ def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
 def _by_cell(results: Sequence[Result]) -> Table:
     rows = []
     for result in results:
-        start = (result.cell.values["name"], network_of(result), result.cell.values["seed"])
         gain = Record([result], "3d").gain(Record([result], "2d"))[0]
         passes = result.answers["passes"]
-        rows.append((*start, *(_mean([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"]))
+        rows.append((*who(result), *(_mean([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"]))
     head = ("object", "network", "seed", *KINDS, "3d minus 2d", "passes 3d", "passes 2d")
     return Table("cells", "Cell by cell", head, tuple(rows), "Passes are views that the network saw in training.")
 
@@ -279,7 +267,7 @@ def _draw_rates(figure: Figure, results: Sequence[Result]) -> None:
 
 def _draw_scatter(figure: Figure, results: Sequence[Result]) -> None:
     axes = figure.add_subplot()
-    for network, group in grouped(results, network_of).items():
+    for (network,), group in grouped(results, of_values("network")).items():
         flat, deep = ([_mean([result], kind) for result in group] for kind in ("2d", "3d"))
         axes.plot(flat, deep, "o", label=network, alpha=0.7)
     axes.plot([0, 1], [0, 1], color="#8a8f98", linewidth=0.8)

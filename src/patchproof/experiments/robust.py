@@ -24,7 +24,7 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.figures import picture_sheet
-from patchproof.study.grid import grouped, problem_of, short_name, with_tables
+from patchproof.study.grid import grouped, of_values, problem_of, short_name
 from patchproof.study.pictures import contact_sheet, object_file, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
@@ -33,12 +33,10 @@ from patchproof.study.trained import (
     Way,
     Word,
     left_out_note,
-    networks_of,
     tested_in,
     trained_cells,
     trained_on,
     verdict,
-    ways_of,
 )
 
 if TYPE_CHECKING:
@@ -58,15 +56,11 @@ class RobustSettings(TrainedSettings):
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:
     """One per scene, way, class, network and seed."""
-    networks, work = networks_of(settings, base), []
-    for values in ways_of(settings, base):
-        for label in settings.classes:
-            target = {"label": label, "accept": [], "goal": "assist"}
-            of_class = with_tables(values, {"target": target}) | {"class": str(label)}
-            for network in networks:
-                row = f"{str(label)[:24]}.{short_name(network)}"
-                work += trained_cells(settings, of_class, row, (network,), networks)
-    return work
+    variants = [
+        ({"target": {"label": label, "accept": [], "goal": "assist"}}, {"class": str(label)})
+        for label in settings.classes
+    ]
+    return trained_cells(settings, base, variants=variants)
 
 
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
@@ -91,16 +85,12 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     }
 
 
-Key = tuple[str, str, str, str]  # scene, way, class, trained on
+Key = tuple  # scene, way, class, trained on
 _HEAD = ("scene", "way", "class", "trained on")
 
 
 def _by_design(results: Sequence[Result]) -> Mapping[Key, Sequence[Result]]:
-    def key(result: Result) -> Key:
-        values = result.cell.values
-        return values["name"], values["way"], values["class"], short_name(values["trained"][0])
-
-    return grouped(results, key)
+    return grouped(results, of_values("name", "way", "class", "row"))
 
 
 def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:

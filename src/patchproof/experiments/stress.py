@@ -39,7 +39,7 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.scene.conditions import Conditions
 from patchproof.strict import Share, Strict
 from patchproof.study.figures import picture_sheet
-from patchproof.study.grid import Count, GridSettings, network_of, problem_of
+from patchproof.study.grid import Count, GridSettings, problem_of, who
 from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import bits, hits_of
 from patchproof.study.study import Cell, Result, Study
@@ -219,33 +219,29 @@ def _with(conditions: Conditions, values: Mapping[str, np.ndarray]) -> Condition
 
 def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """What was worst, measured anew; and every cell of the maps."""
-    who = ("scene", "network", "seed")
+    start = ("scene", "network", "seed")
     return (
         Table(
             "worst",
             "Worst cases of the clean object, measured on draws that did not choose them",
-            (*who, "test", "found at", "rate", "rate anywhere", "difference", "confidence"),
+            (*start, "test", "found at", "rate", "rate anywhere", "difference", "confidence"),
             tuple(row for result in results for row in _worst_rows(result)),
             "Differences are paired by condition: the same draws with pose, light or square as found, and without.",
         ),
         Table(
             "maps",
             "Maps of pose × light",
-            (*who, "pose", "from", "to", "light", "from ", "to ", "rate", "confidence"),
+            (*start, "pose", "from", "to", "light", "from ", "to ", "rate", "confidence"),
             tuple(row for result in results for map_ in result.answers["maps"] for row in _map_rows(result, map_)),
             "The clean object in every cell; all cells of a map share their other draws.",
         ),
     )
 
 
-def _who(result: Result) -> tuple[str, str, int]:
-    return result.cell.values["name"], network_of(result), result.cell.values["seed"]
-
-
 def _worst_rows(result: Result) -> Iterator[tuple]:
     def row(test: str, where: str, worst: str, usual: str, confidence: float | None) -> tuple:
         there, anywhere = hits_of(worst), hits_of(usual)
-        return (*_who(result), test, where, rate(there), rate(anywhere), difference(there, anywhere), confidence)
+        return (*who(result), test, where, rate(there), rate(anywhere), difference(there, anywhere), confidence)
 
     for test in ("pose", "light"):
         of_test = result.answers[test]
@@ -265,7 +261,7 @@ def _map_rows(result: Result, map_: Mapping[str, Any]) -> Iterator[tuple]:
     for i, column in enumerate(map_["hits"]):
         for j, hits in enumerate(column):
             place = (pose, poses[i], poses[i + 1], light, lights[j], lights[j + 1])
-            yield (*_who(result), *place, rate(hits_of(hits)), map_["confidence"][i][j])
+            yield (*who(result), *place, rate(hits_of(hits)), map_["confidence"][i][j])
 
 
 def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
@@ -274,7 +270,7 @@ def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawin
 
 
 def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
-    name, title = result.cell.name, "{}, {}, seed {}: clean object".format(*_who(result))
+    name, title = result.cell.name, "{}, {}, seed {}: clean object".format(*who(result))
     for number, (map_, asked) in enumerate(zip(result.answers["maps"], settings.maps, strict=True)):
         rates = [[float(np.mean(hits_of(hits))) for hits in column] for column in map_["hits"]]
         caption = f"rate, n = {asked.n} draws per cell; framed: the worst tenth"

@@ -22,7 +22,7 @@ from patchproof.optimizer.responses import Answers, responses
 from patchproof.scene.conditions import LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, Conditions
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, Strict
-from patchproof.study.grid import Count, GridSettings, cell_of, pairs, short_name
+from patchproof.study.grid import Count, GridSettings, cell_of, pairs
 from patchproof.study.study import Cell
 
 PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
@@ -56,13 +56,13 @@ Place = tuple[int, int]  # a map's cell: which of the poses, which of the lights
 
 def mesh_cells(settings: GridSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed; refused where pose and light cannot be set."""
-    found = []
+    cells = []
     for values in pairs(settings, base):
         if values["scene"]["object"]["mesh"] is None:
             got = values["file"]
             raise Refused("scenes with a mesh, whose pose and light can be set", got, "name object.mesh in it")
-        found += [cell_of(values, seed, short_name(values["networks"][0])) for seed in settings.seeds]
-    return found
+        cells += [cell_of(values, seed, values["network"]) for seed in settings.seeds]
+    return cells
 
 
 def axes_of(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:

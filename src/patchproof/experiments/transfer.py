@@ -34,13 +34,12 @@ from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import (
     ORIGINAL,
     TrainedSettings,
+    alone,
     left_out_note,
-    networks_of,
     tested_in,
     trained_cells,
     trained_on,
     verdict,
-    ways_of,
 )
 
 if TYPE_CHECKING:
@@ -59,18 +58,16 @@ class TransferSettings(TrainedSettings):
 
 def cells(settings: TransferSettings, base: Path) -> list[Cell]:
     """The original and every training set, per scene, way and seed."""
-    networks = networks_of(settings, base)
-    rows = {ORIGINAL: (), **{short_name(name): (name,) for name in networks}}
-    if settings.ensembles and len(networks) > 1:
-        if len(networks) > 2:  # else one network is left, which is a row already
-            rows |= {_WITHOUT + short_name(out): tuple(name for name in networks if name != out) for out in networks}
-        rows[_ALL] = networks
-    return [
-        cell
-        for values in ways_of(settings, base)
-        for row, trained in rows.items()
-        for cell in trained_cells(settings, values, row, trained, networks)
-    ]
+
+    def rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
+        ensembles = {}
+        if settings.ensembles and len(networks) > 1:
+            if len(networks) > 2:  # else one network is left, which is a row already
+                ensembles = {_WITHOUT + short_name(out): [name for name in networks if name != out] for out in networks}
+            ensembles[_ALL] = networks
+        return {ORIGINAL: (), **alone(networks), **ensembles}
+
+    return trained_cells(settings, base, rows)
 
 
 def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:

@@ -65,10 +65,10 @@ def with_tables(values: Values, tables: Tables) -> Values:
 
 
 def pairs(settings: GridSettings, base: Path) -> Iterator[Values]:
-    """The values of every scene before every single network, but for the seed."""
+    """The values of every scene before every single network, whose name tables say, but for the seed."""
     for values in teams(settings, base):
         for network in values["networks"]:
-            yield values | {"networks": [network]}
+            yield values | {"networks": [network], "network": short_name(network)}
 
 
 def teams(settings: GridSettings, base: Path) -> Iterator[Values]:
@@ -102,12 +102,6 @@ def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
     return set_problem(scene_of(base, values), models=networks_at(base, values))
 
 
-def network_of(result: Result) -> str:
-    """The name of the only network of a result's cell, as tables say it."""
-    (network,) = result.cell.values["networks"]
-    return short_name(network)
-
-
 def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
     """Results by key, keys in the order they come."""
     groups: dict[Key, list[Result]] = {}
@@ -119,6 +113,9 @@ def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key
 def of_values(*names: str) -> Callable[[Result], tuple]:
     """A key to group by: these values of a result's cell."""
     return lambda result: tuple(result.cell.values[name] for name in names)
+
+
+who = of_values("name", "network", "seed")  # scene, network and seed, as tables begin
 
 
 def _changed(data: Mapping[str, Any], tables: Tables, where: str) -> dict[str, Any]:

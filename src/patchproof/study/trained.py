@@ -6,8 +6,9 @@ that group by what was trained. Left out on purpose: promises, which belong to r
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,7 @@ from patchproof.claims import Estimate
 from patchproof.classifier.load import load_classifier
 from patchproof.optimizer.problem import Problem
 from patchproof.strict import Refused, expand
-from patchproof.study.grid import GridSettings, Names, Values, cell_of, scene_values, short_name
+from patchproof.study.grid import GridSettings, Names, Tables, cell_of, scene_values, short_name, with_tables
 from patchproof.study.study import Cell, Result
 
 Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
@@ -48,22 +49,28 @@ def networks_of(settings: TrainedSettings, base: Path) -> tuple[str, ...]:
     return tuple(names)
 
 
-def ways_of(settings: TrainedSettings, base: Path) -> Iterator[Values]:
-    """The values of each scene in each way."""
-    for file in settings.scenes:
-        for way, tables in settings.ways.items():
-            yield scene_values(file, base, tables, f", way {way}") | {"way": way}
+def alone(networks: Sequence[str]) -> dict[str, Sequence[str]]:
+    """Rows in which each network trains alone."""
+    return {short_name(name): (name,) for name in networks}
 
 
 def trained_cells(
-    settings: TrainedSettings, values: Values, row: str, trained: Sequence[str], networks: Sequence[str]
-) -> Iterator[Cell]:
-    """For each seed the cell that trains on some networks (none: the original) and tests on all; tables call it
-    `row`.
+    settings: TrainedSettings,
+    base: Path,
+    rows: Callable[[Sequence[str]], Mapping[str, Sequence[str]]] = alone,
+    variants: Sequence[tuple[Tables, Mapping[str, str]]] = (({}, {}),),
+) -> list[Cell]:
+    """A cell per scene, way, variant, row and seed; all networks test. `rows` names those that train (none: the
+    original); a variant is tables of the scene to change, and what of it cells should say.
     """
-    more = {"row": row, "trained": list(trained), "networks": list(networks), "of_scene": False}
-    for seed in settings.seeds:
-        yield cell_of(values | more, seed, values["way"], row)
+    networks, cells = networks_of(settings, base), []
+    for file, (way, changed), (tables, more) in product(settings.scenes, settings.ways.items(), variants):
+        values = with_tables(scene_values(file, base, changed, f", way {way}"), tables)
+        for (row, trained), seed in product(rows(networks).items(), settings.seeds):
+            who, words = {"way": way, **more, "row": row}, (way, *(text[:24] for text in more.values()), row)
+            networks_of_cell = {"trained": list(trained), "networks": list(networks), "of_scene": False}
+            cells.append(cell_of(values | who | networks_of_cell, seed, *words))
+    return cells
 
 
 def trained_on(problem: Problem, cell: Cell) -> Problem:

@@ -38,16 +38,7 @@ from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
 from patchproof.strict import Refused
 from patchproof.study.figures import whiskers
-from patchproof.study.grid import (
-    GridSettings,
-    Names,
-    cell_of,
-    grouped,
-    network_of,
-    pairs,
-    problem_of,
-    short_name,
-)
+from patchproof.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 
@@ -121,7 +112,7 @@ def without(problem: Problem, effect: str) -> Problem:
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed: a design trained with all effects, and one without each."""
     return [
-        cell_of(values | {"effect": effect}, seed, short_name(values["networks"][0]), effect[:40])
+        cell_of(values | {"effect": effect}, seed, values["network"], effect[:40])
         for values in pairs(settings, base)
         for seed in settings.seeds
         for effect in (ALL, *settings.effects)
@@ -156,26 +147,22 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
     rows, designs = [], []
     for group in _groups(results):
-        designs += [(*_who(result), result.cell.values["effect"], *_means(result)) for result in group.values()]
+        designs += [(*who(result), result.cell.values["effect"], *_means(result)) for result in group.values()]
     for effect in settings.effects:
         both = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
         if both:
             rows.append((effect, len(both), *_earned(both), mean([whole.answers["cost"][effect] for whole, _ in both])))
-    who = ("scene", "network", "seed", "trained without", *head[2:])
+    start = ("scene", "network", "seed", "trained without", *head[2:])
     cost = "share of a step's time"
     return (
         Table("earned", "What each effect earns", (*head, cost), tuple(rows), about),
-        Table("designs", "Every design", who, tuple(designs), "its own rates and confidences in the whole world"),
+        Table("designs", "Every design", start, tuple(designs), "its own rates and confidences in the whole world"),
     )
-
-
-def _who(result: Result) -> tuple[str, str, int]:
-    return result.cell.values["name"], network_of(result), result.cell.values["seed"]
 
 
 def _groups(results: Sequence[Result]) -> list[dict[str, Result]]:
     """By scene, network and seed the results of each effect."""
-    groups = grouped(results, _who).values()
+    groups = grouped(results, who).values()
     return [{result.cell.values["effect"]: result for result in group} for group in groups]
 
 

@@ -27,7 +27,6 @@ from patchproof.study.grid import (
     GridSettings,
     Names,
     cell_of,
-    network_of,
     networks_at,
     pairs,
     scene_of,
@@ -56,7 +55,7 @@ def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
         cell_of(
             with_tables(values, {"target": {"models": values["networks"]}, "printer": {"profile": printer}}),
             seed,
-            short_name(values["networks"][0]),
+            values["network"],
             short_name(printer),
         )
         for values in pairs(settings, base)
@@ -185,9 +184,9 @@ def _each(results: Sequence[Result]) -> Table:
         values, count = result.cell.values, result.answers
         if count["judged"]:
             printer = short_name(values["scene"]["printer"]["profile"])
-            who = (values["name"], network_of(result), printer, values["seed"])
+            start = (values["name"], values["network"], printer, values["seed"])
             what = (count["rate"], count["judged"], count["recognized"], *interval_of(count))
-            rows.append((*who, *what, held(count), count["verdict"]))
+            rows.append((*start, *what, held(count), count["verdict"]))
     unseen = len(results) - len(rows)
     about = f"{unseen} combinations without a photograph that could be judged are left out" if unseen else ""
     return Table("promises", "Every promise", (*head, "held", "verdict"), tuple(rows), about)
