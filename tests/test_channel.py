@@ -24,7 +24,7 @@ from patchproof.settings import SceneSettings
 from patchproof.strict import validated
 
 
-def conditions(n, **camera):
+def sensor(n, **camera):
     quiet = {"exposure_ev": [0, 0], "white_balance": 0, "blur_px": [0, 0], "noise": [0, 0], "jpeg": [95, 95]}
     settings = {
         "object": {"mesh": "primitive:mug", "length_mm": 100},
@@ -32,16 +32,16 @@ def conditions(n, **camera):
         "target": {"label": 0, "models": ["builtin"]},
         "camera": quiet | camera,
     }
-    return draw(validated(SceneSettings, settings, "test"), "promise", n, 0)
+    return draw(validated(SceneSettings, settings, "test"), "promise", n, 0).sensor
 
 
 def test_a_perfect_camera_only_encodes():
     linear = torch.rand(2, 3, 8, 8)
-    torch.testing.assert_close(linear_from_srgb(develop(linear, conditions(2), 0.4)), linear, atol=1e-5, rtol=0)
+    torch.testing.assert_close(linear_from_srgb(develop(linear, sensor(2), 0.4)), linear, atol=1e-5, rtol=0)
 
 
 def test_one_stop_doubles_the_light_and_what_is_too_much_is_clipped():
-    drawn = conditions(1, exposure_ev=[1, 1])
+    drawn = sensor(1, exposure_ev=[1, 1])
     linear = torch.tensor([0.1, 0.3, 0.7]).view(1, 1, 1, 3).expand(1, 3, 1, 3)
     torch.testing.assert_close(
         linear_from_srgb(develop(linear, drawn, 0.1))[0, 0, 0], torch.tensor([0.2, 0.6, 1.0]), atol=1e-5, rtol=0
@@ -49,7 +49,7 @@ def test_one_stop_doubles_the_light_and_what_is_too_much_is_clipped():
 
 
 def test_white_balance_keeps_green_and_moves_red_and_blue():
-    drawn = conditions(4, white_balance=0.1)
+    drawn = sensor(4, white_balance=0.1)
     seen = linear_from_srgb(develop(torch.full((4, 3, 2, 2), 0.2), drawn, 0.1))[:, :, 0, 0] / 0.2
     np.testing.assert_allclose(seen.numpy(), drawn.white_balance, rtol=1e-4)
     assert np.abs(drawn.white_balance[:, [0, 2]] - 1).max() > 0.02
@@ -130,7 +130,7 @@ def test_motion_is_each_pictures_own_and_too_short_a_one_costs_nothing():
 
 def test_only_what_treats_pixels_alone_and_alike_is_pointwise():
     def pointwise(**camera):
-        return is_pointwise(conditions(3, **camera), 1.0, False)
+        return is_pointwise(sensor(3, **camera), 1.0, False)
 
     assert pointwise() and pointwise(exposure_ev=[-1, 1], white_balance=0.1, motion_px=[0, 1])
     for term in ({"vignetting": [0, 0.2]}, {"motion_px": [4, 4]}, {"blur_px": [2, 2]}, {"noise": [0.05, 0.05]}):
@@ -139,7 +139,7 @@ def test_only_what_treats_pixels_alone_and_alike_is_pointwise():
 
 def test_terms_that_are_off_change_no_bit():
     linear = torch.rand(3, 3, 16, 16)
-    drawn = conditions(3, exposure_ev=[-0.5, 0.5], blur_px=[0, 2], noise=[0, 0.02])
+    drawn = sensor(3, exposure_ev=[-0.5, 0.5], blur_px=[0, 2], noise=[0, 0.02])
     spread = blurred(linear, torch.as_tensor(drawn.blur_px).float())
     assert vignetted(linear, torch.zeros(3)) is linear and moved(linear, torch.zeros(3), [0.0] * 3) is linear
     exposed = noisy(
@@ -149,7 +149,7 @@ def test_terms_that_are_off_change_no_bit():
 
 
 def test_vignetting_takes_light_before_the_sensor_clips():
-    drawn = conditions(1, vignetting=[0.5, 0.5], exposure_ev=[2, 2])
+    drawn = sensor(1, vignetting=[0.5, 0.5], exposure_ev=[2, 2])
     corner = linear_from_srgb(develop(torch.full((1, 3, 99, 99), 0.4), drawn, 0.1))[0, 0, 0, 0]
     assert float(corner) == pytest.approx(0.8, abs=0.01)  # 0.4 · 4 · 0.5; clipped first, it would be 0.5
 
@@ -164,7 +164,7 @@ def test_noise_has_the_stated_variance_and_is_each_views_own():
 
 
 def test_noise_shrinks_with_the_picture_as_averaging_shrinks_it():
-    drawn = conditions(1, noise=[0.04, 0.04])
+    drawn = sensor(1, noise=[0.04, 0.04])
     full = develop(torch.full((1, 3, 240, 240), 0.3), drawn, 1.0, jpeg=False)
     averaged = torch.nn.functional.avg_pool2d(linear_from_srgb(full), 3)
     small = linear_from_srgb(develop(torch.full((1, 3, 80, 80), 0.3), drawn, 1 / 3))
@@ -193,6 +193,6 @@ def test_jpeg_is_near_a_real_encoder_and_carries_gradients():
 
 def test_develop_matches_finite_differences():
     terms = {"motion_px": [8, 8], "vignetting": [0.3, 0.3]}
-    drawn = conditions(1, exposure_ev=[-0.3, -0.3], white_balance=0.05, blur_px=[2, 2], **terms)
+    drawn = sensor(1, exposure_ev=[-0.3, -0.3], white_balance=0.05, blur_px=[2, 2], **terms)
     linear = (torch.rand(1, 3, 6, 6, dtype=torch.float64) * 0.8 + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: develop(x, drawn, 0.4), linear, atol=1e-6)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from patchproof.evidence import measure
 from patchproof.evidence.camera import View
-from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
 from patchproof.geometry import intrinsics
 from patchproof.photo.detect import Found
@@ -22,16 +21,15 @@ from test_photo_synthetic import PIECE_IDS, make_manifest, view
 from test_verify_run import measured, shot
 
 SURFACE = surface_of(make_manifest())
-GOOD = dict(tilt_deg=10.0, blur_px=1.0, px_per_mm=2.0, residual_mm=0.05, corner_uncertainty_mm=0.05)
+GOOD = dict(tilt_deg=10.0, blur_px=1.0, contrast=0.5, px_per_mm=2.0, residual_mm=0.05, corner_uncertainty_mm=0.05)
 
 
 def trouble(markers=8, module_px=4.0, **figures):
     """What `measure` says of these figures, of a 100 mm design."""
-    entry = PhotoEntry(file="a", status="judged", **(GOOD | figures))
     borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, module_px, True)
     found = Found({i: borders for i in PIECE_IDS[:markers]}, (), ())
     fit = PageFit(np.eye(3), np.eye(8), 0.1, 0.05, PIECE_IDS[:markers])
-    return measure._trouble(entry, fit, found, SURFACE)
+    return measure._trouble(Geometry(**(GOOD | figures)), fit, found, SURFACE)
 
 
 @pytest.mark.parametrize(
@@ -55,23 +53,20 @@ def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
     ("scale", "code"), [(0.9905, None), (0.9895, "scale_off"), (1.0095, None), (1.0105, "scale_off")]
 )
 def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
-    entry = measure._with_scale(PhotoEntry(file="a", status="measured"), scale, 1.0)
-    assert (entry.status, entry.code, entry.scale_x) == ("measured", code, scale)
-    assert code is None or "100 %" in entry.advice
+    remark = measure._print_check(False, Scale(scale_x=scale, scale_y=1.0))
+    assert remark.code == code and ("100 %" if code else "not counted") in remark.advice
 
 
 def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     """The same sheet from 10° to the right: at 1.5 m the corners know it to 1°, at 8 m neither it nor how far it is."""
-    light, matrix = SimpleNamespace(contrast=0.5), intrinsics(40, (1200, 900))
+    matrix = intrinsics(40, (1200, 900))
     seen = View(Photo(np.zeros((900, 1200, 3), np.uint8), None, Path("a")), matrix, False)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
-        found = Found({i: Borders(corners[i], 1.0, 0.0, 1.0, 4.0, True) for i in PIECE_IDS}, (), ())
-        fit = fit_page(corners, marker_corners())
-        entry = measure._with_geometry(PhotoEntry(file="a", status="judged"), seen, found, fit, light, SURFACE)
-        assert (entry.azimuth_deg is not None) == tells == (entry.azimuth_uncertainty_deg < 10)
+        pose = measure._pose(seen, fit_page(corners, marker_corners()), True, SURFACE)
+        assert (pose.azimuth_deg is not None) == tells == (pose.azimuth_uncertainty_deg < 10)
         if tells:
-            assert entry.azimuth_deg == pytest.approx(10, abs=2) and entry.distance_mm == pytest.approx(1500, rel=0.01)
+            assert pose.azimuth_deg == pytest.approx(10, abs=2) and pose.distance_mm == pytest.approx(1500, rel=0.01)
 
 
 def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
@@ -94,11 +89,11 @@ def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
 @pytest.mark.parametrize("flip", [np.fliplr, np.flipud])
 def test_a_mirrored_photo_or_print_is_known_whichever_way_it_is_held(flip):
     entry = measured(np.ascontiguousarray(flip(shot()))).entry
-    assert (entry.status, entry.code) == ("rejected", "mirrored") and "mirror" in entry.advice
+    assert (entry.status, entry.code) == ("rejected", "mirrored") and "mirror" in entry.remark.advice
 
 
 def test_half_of_the_design_may_be_clipped():
     # a design of codes up to 236 in light of 0.8 stays below white; doubled, most of it does not
     assert measured(shot(light=0.8)).entry.code is None
     entry = measured(shot(light=2.0)).entry
-    assert entry.code == "clipped" and entry.figure > entry.threshold == measure.MOST_CLIPPED
+    assert entry.code == "clipped" and entry.remark.figure > entry.remark.threshold == measure.MOST_CLIPPED

@@ -12,7 +12,7 @@ import torch
 from patchproof import geometry
 from patchproof.optimizer.run import optimize_scene
 from patchproof.render.photograph import photograph
-from patchproof.scene.conditions import with_value
+from patchproof.scene.conditions import with_values
 from patchproof.strict import Refused
 from patchproof.study.study import run_study
 from patchproof.validation.envelope.axes import AXES, conditions_at, placed_at
@@ -50,17 +50,17 @@ def drawn(world):
 
 
 def test_a_value_replaces_one_condition_and_leaves_the_others(drawn):
-    changed = with_value(drawn, "jpeg", 12.0)
-    assert changed.jpeg.tolist() == [12] * 4 and changed.jpeg.dtype == drawn.jpeg.dtype
-    assert replace(changed, jpeg=drawn.jpeg) is not None and np.array_equal(changed.blur_px, drawn.blur_px)
-    assert with_value(drawn, "blur_px", np.arange(4)).blur_px.tolist() == [0, 1, 2, 3]
+    changed = with_values(drawn, jpeg=12.0)
+    assert changed.sensor.jpeg.tolist() == [12] * 4 and changed.sensor.jpeg.dtype == drawn.sensor.jpeg.dtype
+    assert np.array_equal(changed.sensor.blur_px, drawn.sensor.blur_px) and changed.pose.background.flags.writeable
+    assert with_values(drawn, blur_px=np.arange(4)).sensor.blur_px.tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 88.0])
 def test_tilt_is_the_angle_from_the_patch_s_axis_and_keeps_its_direction(world, drawn, tilt_deg):
     moved, frame = conditions_at(world.scene, drawn, {"tilt": tilt_deg}), world.scene.frame
-    before = geometry.orbit(drawn.azimuth_deg, drawn.elevation_deg, frame.normal, frame.up)
-    after = geometry.orbit(moved.azimuth_deg, moved.elevation_deg, frame.normal, frame.up)
+    before = geometry.orbit(drawn.pose.azimuth_deg, drawn.pose.elevation_deg, frame.normal, frame.up)
+    after = geometry.orbit(moved.pose.azimuth_deg, moved.pose.elevation_deg, frame.normal, frame.up)
     assert np.degrees(np.arccos((after @ frame.normal).clip(-1, 1))) == pytest.approx(np.full(4, tilt_deg), abs=1e-5)
     if tilt_deg:
         sides = [np.arctan2(d @ frame.up, d @ frame.right) for d in (before, after)]
@@ -103,7 +103,7 @@ def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world)
 
 
 def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
-    one = with_value(with_value(drawn[:1], "noise", 0.0), "blur_px", 0.0)
+    one = with_values(drawn[:1], noise=0.0, blur_px=0.0)
     stage, shown = _Stages(world).at({}), piece_at(world, {}, 0)
     frame = _window(world, stage, one)
     (x, y), (width, height) = frame.origin_px, frame.size_px

@@ -17,6 +17,7 @@ import pytest
 import torch
 from PIL import Image
 
+from patchproof.channel.effects import Print
 from patchproof.channel.printer import load_printer
 from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, rect_corners
@@ -27,6 +28,7 @@ from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.reprints.reprint import printed_piece, take_photo
+from patchproof.scene.conditions import with_values
 from patchproof.scene.mesh_scene import MeshScene, load_mesh_scene
 from patchproof.scene.placement import place_card
 from patchproof.settings import SceneSettings
@@ -145,11 +147,11 @@ def as_taken(scene, n: int):
     """Conditions that show photograph 0, 1, ... with the piece in it and nothing changed."""
     drawn, none, one = scene.draw("promise", n), np.zeros(n), np.ones((n, 3))
     low, high = scene.settings.view.zoom
-    background = drawn.background.copy()
+    background = drawn.pose.background.copy()
     background[:, 0], background[:, 1] = (np.arange(n) + 0.5) / n, np.log(1 / low) / np.log(high / low)
     still = {"background": background, "roll_deg": none, "look_at_offset": np.zeros((n, 3)), "jpeg": none + 95}
     camera = {"exposure_ev": none, "white_balance": one, "blur_px": none, "noise": none}
-    return replace(drawn, **still, **camera, dot_gain=none, density=none, black=none)
+    return with_values(drawn, **still, **camera, dot_gain=none, density=none, black=none)
 
 
 def design_pixels(homography, scene, size_px) -> np.ndarray:
@@ -204,7 +206,7 @@ def test_white_paper_is_pasted_as_bright_as_it_was_photographed(photos):
 
 def test_a_pasted_design_looks_as_its_print_does_in_that_place(photos, tmp_path):
     """Over the design at least 29 dB (measured: 30 to 34) against photographs of the print, mean light within 3 %."""
-    fixed = replace(photos.conditions, **dict.fromkeys(("dot_gain", "density", "black"), np.zeros(PHOTOS)))
+    fixed = replace(photos.conditions, print=Print())
     shoot(photos.world, photos.folder / "SHEET.pdf", fixed, tmp_path / "prints")
     for i, pasted in enumerate(composites(photos, photos.run.design)):
         printed = read(tmp_path / "prints" / f"photo_{i}.jpg")
@@ -218,9 +220,9 @@ def test_fresh_photographs_of_the_print_are_judged(photos, tmp_path):
     """From nearly the photographed places, some of them darker: all are measured, none is out of range. The very
     photographs of the blank are the control.
     """
-    near = replace(photos.conditions, azimuth_deg=photos.conditions.azimuth_deg + 1.5)
-    near = replace(near, exposure_ev=near.exposure_ev - 0.3 * (np.arange(PHOTOS) % 2))
-    near = replace(near, distance_mm=near.distance_mm * 1.03)
+    near = with_values(photos.conditions, azimuth_deg=photos.conditions.pose.azimuth_deg + 1.5)
+    near = with_values(near, exposure_ev=near.sensor.exposure_ev - 0.3 * (np.arange(PHOTOS) % 2))
+    near = with_values(near, distance_mm=near.pose.distance_mm * 1.03)
     shoot(photos.world, photos.folder / "SHEET.pdf", near, tmp_path / "fresh")
     sheet, controls = photos.folder / "SHEET.json", photos.folder / "photos"
     arguments = ("--sheet", sheet, "--out", tmp_path / "report", "--controls", controls)

@@ -107,7 +107,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
     middle.
     """
     from patchproof.optimizer.run import load_run
-    from patchproof.scene.conditions import Conditions
+    from patchproof.scene.conditions import of_fields
 
     scene = load_run(journey / "run").scene
     truth = json.loads((journey / "photos" / "truth.json").read_text())
@@ -115,7 +115,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
         if photo["status"] != "measured":
             continue
         drawn = truth[photo["file"]]["conditions"]
-        conditions = Conditions(**{k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
+        conditions = of_fields({k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
         pose = scene.camera_from_world(conditions)[0] @ scene.placement.world_from_piece
         azimuth, _, distance = geometry.view_angles(pose, np.array(scene.placement.size_mm) / 2)
         assert photo["distance_mm"] == pytest.approx(distance, rel=0.04)

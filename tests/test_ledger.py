@@ -18,6 +18,7 @@ from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.reproject import Shot, deblurred, light_fit, shot_of
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.surface import Promised, piece_picture, promised_of, surface_of
+from patchproof.evidence.task import Options
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
 from patchproof.report.plots import ledger_plot
@@ -93,7 +94,7 @@ def test_a_veil_is_no_lighter_than_the_darkest_place(darkest, ink, seen_ink):
     square[:20] = darkest
     light = FrameLight(np.full(3, 0.8), np.full(3, ink), 0.8 - ink, 0.0)
     shot = Shot("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((0, 3)), 1.0)
-    promised = Promised(None, np.zeros((0, 3)), np.full(3, 0.02))
+    promised = Promised(np.ones((1, 1, 3)), np.zeros((0, 3)), np.full(3, 0.02))
     fit = light_fit(shot, promised)
     assert fit.apply(light.paper) == pytest.approx(np.ones(3))
     assert fit.apply(light.ink) == pytest.approx(np.full(3, seen_ink), abs=1e-6)
@@ -139,7 +140,7 @@ def evidence(folder, faded=False, light=0.75, **look):
         homography = view(4 * i - 10, 5, 280, size_px=SIZE)
         taken = dict(blur_px=0.3, noise=0.002, jpeg=95, fine=2, light=light, seed=i) | look
         save(photograph(raster(faded), homography, SIZE, **taken), folder / f"{i}.png")
-    return gather_evidence(folder, sheet(), models=[NET], printer=identity_printer())
+    return gather_evidence(folder, sheet(), Options([NET], identity_printer()))
 
 
 @pytest.mark.parametrize(
@@ -162,22 +163,22 @@ def test_known_culprits_are_named(tmp_path, change, culprit):
     if culprit:
         assert whole > 0.1
         assert abs(summary.ledger["photo"].share) < 0.5 * summary.ledger[culprit].share
-    assert "not explained" in ledger_plot(found.notes()["ledger"])
+    assert "not explained" in ledger_plot(found.ledger.model_dump())
 
 
 def test_without_swatches_print_and_light_are_one_step(tmp_path):
     homography = view(5, 5, 280, size_px=SIZE)
     save(photograph(raster(True), homography, SIZE, blur_px=0.3, fine=2, light=0.75), tmp_path / "a.png")
     manifest = sheet().model_copy(update={"chart": ()})
-    found = gather_evidence(tmp_path, manifest, models=[NET], printer=identity_printer())
+    found = gather_evidence(tmp_path, manifest, Options([NET], identity_printer()))
     assert list(found.report.summary.ledger) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
     assert found.report.summary.ledger["print_light_and_camera"].share > 0.1
 
 
 def test_no_ledger_where_none_was_asked_for(tmp_path):
     save(photograph(raster(False), view(size_px=SIZE, distance_mm=280), SIZE, fine=2), tmp_path / "a.png")
-    found = gather_evidence(tmp_path, sheet(), models=[NET], printer=identity_printer(), ledger_photos=0)
-    assert found.report.summary.ledger is None and "ledger" not in found.notes()
+    found = gather_evidence(tmp_path, sheet(), Options([NET], identity_printer(), ledger_photos=0))
+    assert found.report.summary.ledger is None and found.ledger is None
 
 
 @pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.01), (3.0, 0.03)])
@@ -197,11 +198,12 @@ def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
 def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_left_out():
     surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
     srgb = photograph(raster(False), homography, SIZE, blur_px=0.5, light=0.75, fine=2)
-    found = measured(srgb, manifest=sheet())
-    assert shot_of(srgb, found.entry, found.light, surface, 96) is not None
-    turned = np.array(found.entry.homography_px_from_mm) @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
-    wrong = found.entry.model_copy(update={"homography_px_from_mm": tuple(map(tuple, turned))})
-    assert shot_of(srgb, wrong, found.light, surface, 96) is None
+    photo = measured(srgb, manifest=sheet())
+    geometry = photo.entry.geometry
+    rest = geometry.blur_px, photo.light, surface, 96
+    assert shot_of("a", srgb, geometry.homography_px_from_mm, *rest) is not None
+    turned = np.array(geometry.homography_px_from_mm) @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
+    assert shot_of("a", srgb, turned, *rest) is None
 
 
 def test_the_piece_is_drawn_as_the_page_shows_it():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.channel.light import Gloss, Lamp, Light, highlight, irradiance, light_of
+from patchproof.channel.light import Gloss, Lamp, Lighting, highlight, irradiance, lighting_of
 from patchproof.scene.conditions import draw
 from patchproof.settings import SceneSettings
 from patchproof.strict import validated
@@ -29,12 +29,12 @@ def drawn(n, stream="promise", **light):
         "target": {"label": 0, "models": ["builtin"]},
         "light": light,
     }
-    return draw(validated(SceneSettings, settings, "test"), stream, n, 0)
+    return draw(validated(SceneSettings, settings, "test"), stream, n, 0).light
 
 
-def one(ambient=0.0, directional=0.0, toward=(0.0, 0.0, 1.0), **terms) -> Light:
+def one(ambient=0.0, directional=0.0, toward=(0.0, 0.0, 1.0), **terms) -> Lighting:
     numbers = (torch.tensor([v], dtype=torch.float64) for v in (ambient, directional, toward))
-    return Light(*numbers, **terms)
+    return Lighting(*numbers, **terms)
 
 
 def directions(n) -> torch.Tensor:
@@ -55,17 +55,17 @@ def row(*values) -> torch.Tensor:
 
 def test_paper_facing_the_light_is_white_and_facing_away_gets_the_ambient_part():
     normal = torch.tensor([[0.0, 0, 1], [0, 0, -1], [1, 0, 0]])
-    lamp = Light(torch.tensor([0.4]), torch.tensor([0.6]), torch.tensor([[0.0, 0, 1]]))
+    lamp = Lighting(torch.tensor([0.4]), torch.tensor([0.6]), torch.tensor([[0.0, 0, 1]]))
     light = irradiance(normal, torch.tensor([0, 0, 0]), lamp)
     torch.testing.assert_close(light, torch.tensor([1.0, 0.4, 0.4]))
 
 
 def test_terms_that_are_off_do_not_exist_and_change_nothing():
     conditions = drawn(4)
-    light = light_of(conditions, FORWARD, UP, (0, 0, 0))
+    light = lighting_of(conditions, FORWARD, UP, (0, 0, 0))
     assert light.uneven is None and light.lamp is None and light.gloss is None
     assert highlight(row(0, 0, 1), row(0, 0, 0), row(0, 0, 9), zeros(1), light) is None
-    off = light_of(drawn(4, point=[0, 1], sh2=[0, 0.3], gloss=[0, 0.04]), FORWARD, UP, (0, 0, 0))
+    off = lighting_of(drawn(4, point=[0, 1], sh2=[0, 0.3], gloss=[0, 0.04]), FORWARD, UP, (0, 0, 0))
     nothing = torch.zeros(4)
     dark = replace(
         light,
@@ -83,7 +83,7 @@ def test_terms_that_are_off_do_not_exist_and_change_nothing():
 def test_a_lamp_gives_its_light_in_the_middle_and_a_quarter_at_twice_the_distance():
     conditions = drawn(3, ambient=[0, 0], directional=[0, 0], point=[0.8, 0.8], point_distance_mm=[500, 500])
     middle = np.array([10.0, 20, 30])
-    light = light_of(conditions, FORWARD, UP, middle)
+    light = lighting_of(conditions, FORWARD, UP, middle)
     away = light.lamp.position_mm - torch.tensor(middle, dtype=torch.float32)
     facing, view = away / 500, torch.arange(3)
     at_middle = torch.tensor(middle, dtype=torch.float32).expand(3, 3)
@@ -110,7 +110,7 @@ def test_a_lamp_far_away_is_a_directional_light_and_one_on_the_paper_stays_finit
 def test_uneven_light_has_the_stated_deviation_and_the_mean_of_even_light():
     """Over directions the mean is the ambient light; over draws the deviation is `sh2` of it at every normal."""
     conditions = drawn(4000, directional=[0, 0], ambient=[0.5, 0.5], sh2=[0.1, 0.1])
-    light = light_of(conditions, FORWARD, UP, (0, 0, 0))
+    light = lighting_of(conditions, FORWARD, UP, (0, 0, 0))
     normal = directions(400)
     for i in range(5):
         seen = irradiance(normal.float(), torch.full((400,), i), light)
@@ -138,7 +138,7 @@ def test_uneven_light_is_the_cosine_weighted_environment():
 
 
 def test_uneven_light_is_never_negative():
-    light = light_of(drawn(50, directional=[0, 0], sh2=[1, 1]), FORWARD, UP, (0, 0, 0))
+    light = lighting_of(drawn(50, directional=[0, 0], sh2=[1, 1]), FORWARD, UP, (0, 0, 0))
     seen = irradiance(directions(2000).float(), torch.arange(2000) % 50, light)
     assert float(seen.min()) == 0 and 0.05 < float((seen == 0).float().mean()) < 0.3
 
@@ -150,7 +150,7 @@ def test_a_highlight_reflects_its_share_whatever_the_shininess(shininess):
     eye = eye[eye[:, 2] > 0]
     n, view = len(eye), torch.arange(len(eye))
     share = torch.full((n,), 0.04, dtype=torch.float64)
-    light = Light(
+    light = Lighting(
         torch.zeros_like(share),
         torch.ones_like(share),
         row(0, 0, 1).expand(n, 3),
@@ -185,13 +185,13 @@ def test_a_lamp_has_a_highlight_too_and_even_light_is_a_veil():
 
 def test_batches_equal_single_views():
     conditions = drawn(6, point=[0, 1], sh2=[0, 0.5], gloss=[0, 0.1])
-    light = light_of(conditions, FORWARD, UP, (1, 2, 3))
+    light = lighting_of(conditions, FORWARD, UP, (1, 2, 3))
     normal, position, eye = directions(60).float(), torch.rand(60, 3) * 80, torch.rand(6, 3) * 100 + 400
     view = torch.arange(60) % 6
     together = irradiance(normal, view, light, position)
     shine = highlight(normal, position, eye, view, light)
     for i in range(6):
-        alone, rows = light_of(conditions[i : i + 1], FORWARD, UP, (1, 2, 3)), view == i
+        alone, rows = lighting_of(conditions[i : i + 1], FORWARD, UP, (1, 2, 3)), view == i
         first = zeros(int(rows.sum()))
         torch.testing.assert_close(irradiance(normal[rows], first, alone, position[rows]), together[rows])
         seen = highlight(normal[rows], position[rows], eye[i : i + 1], first, alone)
@@ -200,7 +200,7 @@ def test_batches_equal_single_views():
 
 def test_the_light_moves_with_the_patchs_side():
     conditions = drawn(5, point=[1, 1], gloss=[0.1, 0.1])
-    front, right = light_of(conditions, FORWARD, UP, (0, 0, 0)), light_of(conditions, (1.0, 0, 0), UP, (0, 0, 0))
+    front, right = lighting_of(conditions, FORWARD, UP, (0, 0, 0)), lighting_of(conditions, (1.0, 0, 0), UP, (0, 0, 0))
     turn = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # z to x about y
     torch.testing.assert_close(right.toward, front.toward @ turn.T)
     torch.testing.assert_close(right.lamp.position_mm, front.lamp.position_mm @ turn.T, atol=1e-3, rtol=0)

@@ -22,6 +22,7 @@ from patchproof.optimizer.promise import CONTROLS, make_promise
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
+from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
@@ -180,7 +181,7 @@ def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
     scene = scene_with(tmp_path, view__azimuth_deg=[-90, 90], optimize__steps=2)
     problem = set_problem(scene)
     behind = scene.draw("train", 4)
-    behind = replace(behind, azimuth_deg=np.full(4, 180.0))
+    behind = with_values(behind, azimuth_deg=180.0)
     shown = problem.subject.shown(start(problem).design.requires_grad_())
     seen = problem.see(shown, behind, problem.training_px)
     assert len(seen.piece.pixel) == 0
@@ -301,7 +302,9 @@ def test_promises_of_other_seeds_spread_as_their_interval_says(tmp_path):
     """
     scene, n = scene_with(tmp_path), 64
     drawn = [scene.draw("promise", n, seed) for seed in range(100)]
-    seen = np.array([(c.azimuth_deg < 10) | (c.white_balance[:, 0] > c.white_balance[:, 2]) for c in drawn])
+    seen = np.array(
+        [(c.pose.azimuth_deg < 10) | (c.sensor.white_balance[:, 0] > c.sensor.white_balance[:, 2]) for c in drawn]
+    )
     for recognized, holds in ((seen, True), (seen[:, :8].repeat(8, 1), False)):
         counts, rate = recognized.sum(1), recognized.mean()
         inside = sum(low <= rate <= high for low, high in (wilson(int(count), n) for count in counts))

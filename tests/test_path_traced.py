@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from patchproof import geometry
-from patchproof.channel.light import irradiance, light_of
+from patchproof.channel.light import irradiance, lighting_of
 from patchproof.color import linear_from_srgb
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.reprints import path_traced
 from patchproof.reprints.path_traced import Optics, draw_optics, photograph_traced, sky_directions, sky_radiance
-from patchproof.scene.conditions import with_value
+from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused
 
@@ -35,10 +35,8 @@ def scene(scene_file):
 def facing(scene, **values):
     """One view with the lights in front of the piece and nothing random in the camera."""
     quiet = {"light_azimuth_deg": 20.0, "light_elevation_deg": 30.0, "noise": 0.0, "blur_px": 0.0, "exposure_ev": 0.0}
-    conditions = scene.draw("reprint", 1)
-    for name, value in (quiet | {"distance_mm": 500.0, "look_at_offset": 0.0, "white_balance": 1.0} | values).items():
-        conditions = with_value(conditions, name, value)
-    return conditions
+    quiet |= {"distance_mm": 500.0, "look_at_offset": 0.0, "white_balance": 1.0}
+    return with_values(scene.draw("reprint", 1), **quiet | values)
 
 
 def plain(scene, level: float) -> PiecePicture:
@@ -48,12 +46,12 @@ def plain(scene, level: float) -> PiecePicture:
 def test_surroundings_light_a_surface_as_ours_do(scene):
     conditions = facing(scene, ambient=0.5, directional=0.0, sh2=0.1)
     toward = sky_directions()
-    radiance = sky_radiance(toward, conditions)
+    radiance = sky_radiance(toward, conditions.light)
     theta = np.arccos(toward[..., 1])
     solid = np.sin(theta) * (np.pi / toward.shape[0]) * (2 * np.pi / toward.shape[1])
     normals = np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.48, -0.64]]])
     found = [(radiance * (toward @ n).clip(0) * solid).sum() / np.pi for n in normals]
-    light = light_of(conditions, scene.frame.normal, scene.frame.up, scene.middle_mm)
+    light = lighting_of(conditions.light, scene.frame.normal, scene.frame.up, scene.middle_mm)
     ours = irradiance(torch.tensor(normals, dtype=torch.float32), torch.zeros(len(normals), dtype=torch.long), light)
     assert np.ptp(found) > 0.05  # it is uneven
     np.testing.assert_allclose(found, ours, rtol=3e-3)
@@ -102,7 +100,7 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
     monkeypatch.setattr(path_traced, "PASSES", 1)
     conditions, stage = facing(scene, **lights), set_stage(scene)
     for name in ("dot_gain", "density", "black"):
-        conditions = with_value(conditions, name, 0.0)
+        conditions = with_values(conditions, **{name: 0.0})
     piece = plain(scene, 0.5)
     ours = photograph(stage, piece, conditions, (200, 150), jpeg=False)[0].numpy()
     traced = photograph_traced(stage, piece, conditions, PINHOLE)[0].numpy()

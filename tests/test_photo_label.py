@@ -88,7 +88,7 @@ def test_a_page_of_another_design_is_the_wrong_sheet_though_its_markers_are_ours
     assert {m.id for m in other.markers} == {m.id for m in ours.markers}
     bad = verified(ours, look(other_page), scan_dpi)
     assert (bad.entry.status, bad.entry.code, bad.counted) == ("rejected", "wrong_sheet", False)
-    assert other.design.sha256[:16] in bad.entry.advice and ours.design.sha256[:16] in bad.entry.advice
+    assert other.design.sha256[:16] in bad.entry.remark.advice and ours.design.sha256[:16] in bad.entry.remark.advice
     # and without its code the design is not told apart: then its colors show it
     hidden = other_page.copy()
     hidden[: int(55 / 25.4 * 150), int(175 / 25.4 * 150) :] = 255
@@ -98,7 +98,7 @@ def test_a_page_of_another_design_is_the_wrong_sheet_though_its_markers_are_ours
 def test_another_sheet_is_named(pages):
     entry = verified(pages["ours"][0], pages["sheet"][1][: int(65 / 25.4 * 150)]).entry
     assert (entry.status, entry.code) == ("rejected", "wrong_sheet")
-    assert "Z9Y8X7W6V5" in entry.advice
+    assert "Z9Y8X7W6V5" in entry.remark.advice
 
 
 def test_the_code_alone_tells_of_another_sheet_when_no_marker_can_be_read(pages):

@@ -13,9 +13,10 @@ from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.scene import flat
+from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
 from patchproof.scene.photo_scene import _digest, load_photo_scene, see
-from patchproof.settings import SceneSettings
+from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.piece import lay_out_piece, sheet_id
@@ -111,11 +112,11 @@ def scene(world):
 def still(scene, n: int):
     """Conditions that show photograph 0, 1, ... as it is."""
     drawn = scene.draw("promise", n)
-    background = drawn.background.copy()
+    background = drawn.pose.background.copy()
     background[:, 0] = (np.arange(n) + 0.5) / len(scene.photos)
     low, high = scene.settings.view.zoom
     background[:, 1] = np.log(1 / low) / np.log(high / low)  # zoom 1
-    return replace(drawn, background=background, roll_deg=np.zeros(n), look_at_offset=np.zeros((n, 3)))
+    return with_values(drawn, background=background, roll_deg=np.zeros(n), look_at_offset=np.zeros((n, 3)))
 
 
 def test_geometry_light_blur_and_noise_are_recovered(world, scene):
@@ -150,7 +151,7 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
     assert all("unreadable" in warning for warning in scene.warnings)
     # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
     digest = _digest(scene.base / scene.settings.object.photos)
-    known = scene.settings.model_dump(mode="json") | {"blank": world.manifest.sheet_id, "photos": digest}
+    known = identifying(scene.settings) | {"blank": world.manifest.sheet_id, "photos": digest}
     assert sheet_id(known, 0) == scene.sheet_id != sheet_id(known, 1)
 
 
@@ -192,7 +193,7 @@ def test_picture_and_homography_move_alike(scene, size_px):
         dotted.append(replace(photo, picture=flat.Picture(np.round(picture).astype(np.uint8))))
     scene = replace(scene, photos=tuple(dotted))
     conditions = scene.draw("evaluate", 12)
-    assert np.ptp(scene.piece_blur_px(conditions)) > 0.1 and np.ptp(conditions.roll_deg) > 4
+    assert np.ptp(scene.piece_blur_px(conditions)) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
     pictures = scene.pictures(conditions, size_px)
     for picture, where in zip(pictures, scene.piece_homographies(conditions, size_px), strict=True):
         weight = picture[..., 0].astype(float)
@@ -204,9 +205,9 @@ def test_picture_and_homography_move_alike(scene, size_px):
 def test_zoom_takes_the_blur_along(scene):
     conditions = still(scene, 2)
     low = scene.settings.view.zoom[0]
-    background = conditions.background.copy()
+    background = conditions.pose.background.copy()
     background[:, 1] = 0
-    small = replace(conditions, background=background)
+    small = with_values(conditions, background=background)
     assert scene.piece_blur_px(small) == pytest.approx(scene.piece_blur_px(conditions) * low)
 
 

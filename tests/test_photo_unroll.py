@@ -84,10 +84,10 @@ def test_a_photograph_of_rolled_paper_is_measured_as_if_it_were_flat():
     surface = surface_of(make_manifest())
     seen = measure(view_of(Photo(photo, None, None), None), "a.jpg", surface, None, promised_ranges(()))
     entry = seen.entry
-    assert entry.status == "measured" and entry.homography_px_from_mm is None
-    assert entry.curl_radius_mm == pytest.approx(150, rel=0.05)
+    assert entry.status == "measured" and entry.geometry.homography_px_from_mm is None
+    assert entry.geometry.curl_radius_mm == pytest.approx(150, rel=0.05)
     # measured 0.03 to 0.1 mm
-    assert entry.residual_mm < 0.15 and entry.corner_uncertainty_mm < 0.5
+    assert entry.geometry.residual_mm < 0.15 and entry.geometry.corner_uncertainty_mm < 0.5
 
 
 def test_the_unrolled_picture_shows_the_design_where_its_homography_says():

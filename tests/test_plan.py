@@ -18,12 +18,13 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.plan.cost import measure_cost
 from patchproof.plan.errors import measure_terms
-from patchproof.plan.plan import Plan, marker_plan, other_surface, plan_lines, plan_scene, resolution_plan, scales
+from patchproof.plan.lines import plan_lines
+from patchproof.plan.plan import Plan, marker_plan, other_surface, plan_scene, resolution_plan, scales
 from patchproof.plan.samples import sample_plan
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.scene.flat import Picture
 from patchproof.scene.paper_light import PaperLight
-from patchproof.scene.photo_scene import PhotoScene, Seen
+from patchproof.scene.photo_scene import BasePhoto, PhotoScene
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import lay_out_piece
@@ -139,10 +140,11 @@ def test_the_marker_rule_by_hand(tmp_path):
     """7 modules of 2.5 px at the only scale there is; from far away none that fits is readable."""
     scene = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[400, 400], camera__photo_px=[1600, 1200])
     away_mm = 400 - scene.placement.center_mm @ scene.frame.normal
-    markers = marker_plan(scene)
+    markers = marker_plan(scene, scene.piece)
     assert markers.needed_mm == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
     assert markers.printed_mm == pytest.approx(markers.needed_mm, rel=0.03) and markers.unreadable_share == 0
-    far = marker_plan(scene_with(tmp_path, **STRAIGHT, view__distance_mm=[9000, 9000]))
+    distant = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[9000, 9000])
+    far = marker_plan(distant, distant.piece)
     assert far.printed_mm < far.needed_mm / 2 and far.unreadable_share == 1
 
 
@@ -171,10 +173,12 @@ def test_even_light_in_place_of_the_sun_or_a_lamp_is_as_strong_on_the_patch(tmp_
     setup = Setup(problem.stage, None, scene.draw("select", 8))
     terms = {term.name: term for term in scene_terms(problem, problem.subject.start(), None)}
     before, without = setup.conditions, terms["directional light"].change(setup).conditions
-    assert not without.directional.any() and scene.white_light(without) == pytest.approx(scene.white_light(before))
-    assert without.ambient * without.sh2 == pytest.approx(before.ambient * before.sh2)
+    assert not without.light.directional.any() and scene.white_light(without) == pytest.approx(
+        scene.white_light(before)
+    )
+    assert without.light.ambient * without.light.sh2 == pytest.approx(before.light.ambient * before.light.sh2)
     dark = terms["lamp"].change(setup).conditions
-    assert not dark.point.any() and (dark.ambient >= before.ambient).all()
+    assert not dark.light.point.any() and (dark.light.ambient >= before.light.ambient).all()
     assert terms["directional light"].change(replace(setup, conditions=without)) is None  # it is off already
 
 
@@ -224,7 +228,9 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
     piece = lay_out_piece((60, 60), 12, "A" * 10, "design")
     light = PaperLight(np.array([[0.5, -0.2, 0, 0, 0, 0]] * 3), 0.0, noise)
     where = np.array([[1.0, 0, 50], [0, 1, 25], [0, 0, 1]])
-    photos = [Seen(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)]
+    photos = [
+        BasePhoto(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)
+    ]
     return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos), ())
 
 
@@ -246,7 +252,7 @@ def test_textures_have_no_markers_and_no_printer(tmp_path):
     assert not terms & {"printer's colors", "print variation", "gloss"} and "directional light" in terms
     found = resolution_plan(problem)
     assert found.design_px is None and found.texels == sum(int(mask.sum()) for mask in scene.canvas.mask)
-    mean_mm = float(np.mean(scene.draw("select", 1024, 0).distance_mm))
+    mean_mm = float(np.mean(scene.draw("select", 1024, 0).pose.distance_mm))
     focal_px = 48 / math.tan(math.radians(25))
     assert found.px_per_mm_network[0] < focal_px / mean_mm < found.px_per_mm_network[1]
 

@@ -28,6 +28,7 @@ from patchproof.render.photograph import expose, photograph, shade
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.reprints.reprint import scaled_print
+from patchproof.scene.conditions import with_values
 from patchproof.strict import Refused
 from patchproof.study.study import Cell, Result, run_study
 from patchproof.validation.gamut import UNPRINTED, WAYS, other_printers, reprinted, rows_of, way_problem
@@ -127,7 +128,7 @@ def test_each_view_shows_its_own_misregistration(tmp_path):
     shifts_mm = np.array([[[0.6, -0.2], [0.1, 0.5]], [[-0.4, 0.3], [0.0, 0.0]]])
     conditions = posed(scene, 2, azimuth_deg=[0, 30])
     stage, size = set_stage(scene), (160, 160)
-    both = photograph(stage, piece, replace(conditions, misregistration_mm=shifts_mm), size, jpeg=False)
+    both = photograph(stage, piece, with_values(conditions, misregistration_mm=shifts_mm), size, jpeg=False)
     x0, _, x1, _ = piece.box_px
     px_per_mm = (x1 - x0) / scene.piece.size_mm[0]
     for i, shift in enumerate(shifts_mm):
@@ -142,7 +143,9 @@ def test_white_paper_reflects_what_its_lightness_and_tint_say(tmp_path):
     scene = box_scene(tmp_path)
     paper = np.array([[0.9, 0.95, 1.02]])
     stage, conditions = set_stage(scene), posed(scene, dot_gain=0, density=0, black=0)
-    seen = [shade(see(stage, WHITE, one, (120, 120)), WHITE) for one in (conditions, replace(conditions, paper=paper))]
+    seen = [
+        shade(see(stage, WHITE, one, (120, 120)), WHITE) for one in (conditions, with_values(conditions, paper=paper))
+    ]
     middle = (seen[1] / seen[0])[0, :, 55:65, 55:65].mean((1, 2))
     np.testing.assert_allclose(middle, paper[0], rtol=1e-4)
 
@@ -151,7 +154,7 @@ def test_white_paper_reflects_what_its_lightness_and_tint_say(tmp_path):
 def test_a_print_of_another_size_covers_as_much_as_one_of_a_scene_made_for_it(tmp_path, scale):
     scene = box_scene(tmp_path)
     conditions = posed(scene, 2, azimuth_deg=[0, 35])
-    drawn = replace(conditions, printed_scale=np.full(2, scale))
+    drawn = with_values(conditions, printed_scale=np.full(2, scale))
     plain, scaled = (area(outline(scene, one, (200, 200))) for one in (conditions, drawn))
     assert scaled[0] / plain[0] == pytest.approx(scale**2, rel=1e-6)
     piece, twin = piece_of(scene), scaled_print(scene, (scale, scale))

@@ -1,7 +1,9 @@
-"""The README's own blocks, run as they stand."""
+"""The README's own blocks, run as they stand, and figures in prose held against stored ones."""
 
 from __future__ import annotations
 
+import csv
+import json
 import re
 import shlex
 from importlib import import_module
@@ -11,6 +13,7 @@ import pytest
 
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
+from test_imports import GROUND, MAY_IMPORT
 from test_journey import command
 
 try:
@@ -18,7 +21,15 @@ try:
 except ModuleNotFoundError:
     import tomli as tomllib
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+ROOT = Path(__file__).resolve().parents[1]
+README, NOTEBOOK, CONTRIBUTING = (
+    ROOT / "README.md",
+    ROOT / ".readme" / "measured.md",
+    ROOT / ".github" / "CONTRIBUTING.md",
+)
+PACKAGE = ROOT / "src" / "patchproof"
+RASTERIZED = ("rasterizing alone", "rasterizing spot.glb")
+PRINTERS = ("coated", "uncoated")
 
 
 def blocks(language: str) -> list[str]:
@@ -75,10 +86,96 @@ def test_python(tmp_path, here, monkeypatch, capsys):
     assert capsys.readouterr().out.split()[0] in {"kept", "broken", "cannot_tell"}
 
 
-def test_pictures_and_files_that_it_names_exist():
-    text = README.read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        assert (README.parent / target).exists(), target
+def words(path: Path) -> str:
+    """A page in one line."""
+    return " ".join(path.read_text(encoding="utf-8").split())
+
+
+def stored(name: str) -> dict:
+    return json.loads((NOTEBOOK.parent / name).read_text(encoding="utf-8"))
+
+
+def interval(value: float, low: float, high: float) -> str:
+    """In points or %, as the notebook writes them."""
+    return f"{100 * value:+.1f} [{100 * low:.1f}, {100 * high:.1f}]".replace("+0.0", "0.0").replace("-0.0", "0.0")
+
+
+@pytest.mark.parametrize("page", [README, NOTEBOOK, NOTEBOOK.parent / "keys.md", CONTRIBUTING], ids=lambda p: p.name)
+def test_pictures_and_files_that_pages_name_exist(page):
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_a_newcomer_reads_two_screens_and_a_half():
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 180
+
+
+def test_figures_of_the_readme_are_those_of_the_notebook():
+    (section,) = re.findall(r"## Measured\n(.*?)\n## ", README.read_text(encoding="utf-8"), re.DOTALL)
+    quoted = re.findall(r"[+-]?\d+(?:\.\d+)?(?: %)?(?: \[[^]]+\])?", section)
+    assert len(quoted) >= 9
+    for figure in quoted:
+        assert figure in words(NOTEBOOK), figure
+
+
+def test_figures_of_the_promises_are_the_stored_ones():
+    rows = {row[0]: row for row in stored("promises/promises.json")["tables"]["held"]["rows"]}
+    said = {"suv": "SUV", "carton": "carton", "light": "traffic light", "postbox": "letter box", "all": "all"}
+    biases = ", ".join(f"{said[name]} {interval(*list(rows[name][3].values())[:3])}" for name in said)
+    assert f"in points: {biases}." in words(NOTEBOOK)
+    held = rows["all"][1]
+    count = f"{round(held['value'] * held['n'])} of {held['n']}"
+    share = f"{held['value']:.0%} [{100 * held['low']:.0f}, {100 * held['high']:.0f}]".replace("%", " %")
+    assert f"{count} prediction intervals of 95 % held: {share}." in words(NOTEBOOK)
+    assert f"Their median width is {rows['all'][2]:.0%}".replace("%", " %") in words(NOTEBOOK)
+    assert f"{count} promises" in words(README) and f": {share}." in words(README)
+
+
+def test_figures_of_the_ablation_are_the_stored_ones():
+    with (NOTEBOOK.parent / "ablation" / "ablation_earned.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    lines = NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    told = {"blur + motion blur": "blur, motion blur"}
+    told |= {row["trained without"]: "dot gain, ink density, black, paper white" for row in rows[6:7]}
+    told |= {row["trained without"]: "all that is off by default" for row in rows[-2:-1]}
+    told |= {row["trained without"]: "everything" for row in rows[-1:]}
+    assert len(rows) == 16
+    for row in rows:
+        earned, traced = (
+            interval(*(float(row[f"{key}{end}"]) for end in ("", "_low", "_high")))
+            for key in ("rate", "rate, path-traced")
+        )
+        name = told.get(row["trained without"], row["trained without"])
+        assert any(line.startswith(f"| {name} | {earned} | {traced} | ") for line in lines), name
+
+
+def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
+    (series,) = stored("bench_detect.json")["charts"]["levels_12mp"]["series"]
+    points = {point["setting"]: point for point in series["points"]}
+    fitted, theirs = points["1000 px, fitted"], points["1000 px, OpenCV's"]
+    assert f"searched in {fitted['cost'] / 1000:.2f} s" in words(NOTEBOOK)
+    assert f"{fitted['error']:.3f} px off" in words(NOTEBOOK) and f"{theirs['error']:.2f} px off" in words(NOTEBOOK)
+    charts = stored("bench_printer.json")["charts"]
+    best = [
+        next(point["error"] for point in charts[f"{count}_swatches"]["series"][0]["points"] if point["default"])
+        for count in (48, 96)
+    ]
+    assert f"has {best[0]:.2f} / {best[1]:.2f}" in words(NOTEBOOK)
+    step = stored("bench_render.json")["charts"]["step"]["series"][1]["points"]
+    suv, spot = (next(p["cost"] for p in step if p["setting"] == name) for name in RASTERIZED)
+    assert f"{suv:.0f} % (SUV, 1,514 faces), {spot:.0f} % (5,856 faces)" in words(NOTEBOOK)
+    accuracy = json.loads((PACKAGE / "classifier" / "builtin.json").read_text())["held_out_accuracy"]
+    assert f"| {100 * accuracy:.1f} % of 2,400 |" in words(NOTEBOOK)
+    printers = [json.loads((ROOT / "calibration" / "printers" / f"{name}.json").read_text()) for name in PRINTERS]
+    errors = [printer["provenance"]["delta_e00_to_exact_chain"] for printer in printers]
+    means, p95s, worst = (" / ".join(f"{one[key]:.2f}" for one in errors) for key in ("mean", "p95", "max"))
+    assert f"ΔE00 mean {means}, p95 {p95s}, max {worst} (coated / uncoated)" in words(NOTEBOOK)
+
+
+def test_the_table_of_rooms_has_the_order_of_imports():
+    rooms = re.findall(r"^\| `(\w+)/?` \|", CONTRIBUTING.read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(rooms[: len(GROUND)]) == GROUND
+    assert rooms[len(GROUND) :] == [room for room in MAY_IMPORT if room not in GROUND and not room.startswith("__")]
 
 
 def test_the_two_commands_are_there():

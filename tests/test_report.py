@@ -17,7 +17,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from patchproof.evidence.results import Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
+from patchproof.evidence.results import KEYS, Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
 from patchproof.report.images import delta_map, save_pictures
 from patchproof.report.photo_table import photos_csv
 from patchproof.report.write import write_report
@@ -31,7 +31,8 @@ def some_report(verdict="kept"):
         PhotoEntry(
             file=f"p{i}.jpg", status="measured", markers_found=8, residual_mm=0.02, px_per_mm=1.0 + i, tilt_deg=5.0 * i,
             contrast=0.7, blur_px=0.6, corner_uncertainty_mm=0.05, delta_e00_mean=2.0, delta_e00_p95=4.0,
-            color_fit="affine12", predictions={"net": seen}, sha256="f" * 64, scale_x=0.97, scale_y=0.971 + i / 1000,
+            color_fit="affine12", clipped_share=0.0, glossy_share=0.0,
+            predictions={"net": seen}, sha256="f" * 64, scale_x=0.97, scale_y=0.971 + i / 1000,
         )
         for i in range(3)
     ]  # fmt: skip
@@ -66,7 +67,7 @@ def written(out, verdict="kept"):
     manifest = make_manifest(promise(claims)).model_dump(mode="json")
     for file, kinds in pictures().items():
         save_pictures(out / "pictures", file, kinds)
-    return write_report(some_report(verdict).model_dump(mode="json"), manifest, out, {"ledger": some_ledger()})
+    return write_report(some_report(verdict).model_dump(mode="json"), manifest, out, some_ledger())
 
 
 class Tags(HTMLParser):
@@ -112,8 +113,9 @@ def test_the_page_says_what_the_report_says_and_escapes_it(tmp_path):
 
 def test_json_is_the_report_and_nothing_else(tmp_path):
     written(tmp_path)
-    assert json.loads((tmp_path / "report.json").read_text()) == json.loads(some_report().dump())
-    assert (tmp_path / "report.json").read_text() == some_report().dump()
+    assert json.loads((tmp_path / "report.json").read_text()) == some_report().model_dump(mode="json")
+    again = Report.model_validate_json((tmp_path / "report.json").read_text())
+    assert again.photos == some_report().photos and again.model_dump_json() == some_report().model_dump_json()
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir())[0] == "p0.jpg.delta_e00.png"
 
 
@@ -123,10 +125,12 @@ def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(tmp_path):
     photos = some_report().photos
     assert [row["file"] for row in rows] == [photo.file for photo in photos]
     assert (
-        float(rows[2]["scale_y"]) == photos[2].scale_y and rows[3]["scale_y"] == "" and rows[3]["code"] == "unreadable"
+        float(rows[2]["scale_y"]) == photos[2].scale.scale_y
+        and rows[3]["scale_y"] == ""
+        and rows[3]["code"] == "unreadable"
     )
     assert rows[0]["net label"] == "<b>bright</b>" and float(rows[0]["net confidence"]) == 0.8
-    names = set(PhotoEntry.model_fields) - {"homography_px_from_mm", "predictions"}
+    names = set(KEYS) - {"homography_px_from_mm", "predictions"}
     assert (
         names <= rows[0].keys()
         and {f"homography_px_from_mm_{i}{j}" for i in range(3) for j in range(3)} <= rows[0].keys()
@@ -134,8 +138,9 @@ def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(tmp_path):
 
 
 def test_csv_holds_no_formula():
-    entry = PhotoEntry(file="=1+1.jpg", status="rejected", homography_px_from_mm=((1, 2, 3), (4, 5, 6), (7, 8, 9.5)))
-    (row,) = csv.DictReader(io.StringIO(photos_csv([entry.model_dump(mode="json")])))
+    entry = some_report().photos[0].model_dump(mode="json")
+    entry |= {"file": "=1+1.jpg", "homography_px_from_mm": ((1, 2, 3), (4, 5, 6), (7, 8, 9.5))}
+    (row,) = csv.DictReader(io.StringIO(photos_csv([entry])))
     assert row["file"] == "'=1+1.jpg" and row["homography_px_from_mm_22"] == "9.5"
 
 

@@ -15,6 +15,7 @@ from patchproof.render.photograph import expose, photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
+from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import MODULES, frame_image
 from patchproof.strict import Refused
@@ -132,7 +133,7 @@ def test_the_square_is_the_middle_of_the_photograph(tmp_path):
 
 def test_a_patch_turned_away_is_not_seen(tmp_path, scene_file):
     scene = load_scene(scene_file)
-    stage, conditions = set_stage(scene), replace(scene.draw("promise", 2), azimuth_deg=np.array([180.0, 165.0]))
+    stage, conditions = set_stage(scene), with_values(scene.draw("promise", 2), azimuth_deg=np.array([180.0, 165.0]))
     seen = see(stage, piece_of(scene), conditions, (96, 96))
     assert len(seen.piece.pixel) == 0 < len(seen.piece.back_pixel)
 

@@ -249,8 +249,8 @@ def test_settings_change_through_a_door_that_checks(tmp_path):
     for wrong, named in (({"steps": -3}, "steps"), ({"stepz": 3}, 'did you mean "steps"')):
         with pytest.raises(Refused, match=named):
             plain.changed(optimize=wrong)
-    with pytest.raises(Refused, match="optimise"):
-        plain.changed(optimise={"steps": 3})
+    with pytest.raises(Refused, match="optimice"):
+        plain.changed(optimice={"steps": 3})
 
 
 def test_a_goal_that_is_none_is_refused_wherever_it_stands(tmp_path):

@@ -162,10 +162,10 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimetr
         measured = measure(view_of(Photo(scan, None, None), None), "scan", surface, None, promised_ranges(()), DPI)
         entry = measured.entry
         assert entry.status == "measured" and not measured.counted
-        assert entry.scale_x == pytest.approx(1, abs=0.002) and entry.scale_y == pytest.approx(1, abs=0.002)
+        assert (entry.scale.scale_x, entry.scale.scale_y) == pytest.approx((1, 1), abs=0.002)
         corners = rect_corners(tile.cut_mm)
         in_design_page = corners - np.array(tile.page_from_design_mm)[:, 2] + origin
-        seen = apply_homography(np.array(entry.homography_px_from_mm), in_design_page)
+        seen = apply_homography(np.array(entry.geometry.homography_px_from_mm), in_design_page)
         errors.append(np.linalg.norm(seen - apply_homography(truth, corners), axis=1).max() / PX_PER_MM)
     assert max(errors) < 0.5
 

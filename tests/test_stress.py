@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 from scipy.stats import spearmanr
 
-from patchproof.experiments import mining, stress
+from patchproof.channel.effects import FIELDS
+from patchproof.experiments import mining
 from patchproof.experiments.hard_views import (
     CANDIDATES,
     LIGHT,
@@ -35,6 +35,7 @@ from patchproof.optimizer import loop, run
 from patchproof.optimizer.loop import State, steps
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings
 from patchproof.strict import Refused, validated
@@ -80,9 +81,7 @@ def losses_of(problem, conditions):
 
 
 def rows_of(conditions, names):
-    return np.concatenate(
-        [np.asarray(getattr(conditions, name), float).reshape(len(conditions), -1) for name in names], 1
-    )
+    return np.concatenate([fields_of(conditions)[name].astype(float).reshape(len(conditions), -1) for name in names], 1)
 
 
 # ---------------------------------------------------------------------------------------------------------- mining
@@ -99,7 +98,7 @@ def test_mined_views_take_pose_and_light_of_expectedly_bad_draws_and_nothing_els
     mined, drawn = training_conditions(problem, 64), problem.scene.draw("train", 12 + 64 + 6 * CANDIDATES)
     assert len(mined) == 12
     names = POSE + LIGHT
-    others = [field.name for field in fields(drawn) if field.name not in names]
+    others = [name for name in FIELDS if name not in names]
     np.testing.assert_array_equal(rows_of(mined, others), rows_of(drawn[:12], others))
     np.testing.assert_array_equal(rows_of(mined, names)[::2], rows_of(drawn[:12], names)[::2])
     fresh, tried = drawn[76:], drawn[12:76]  # the worst of each eight draws that no try has used
@@ -113,7 +112,7 @@ def test_the_fit_finds_what_is_hard_and_ignores_what_does_not_vary(tmp_path):
     """Losses that rise with darkness and away from one azimuth, with noise: the expected order, by rank correlation."""
     problem = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]}, light={"ambient": [0.1, 0.9]})
     drawn = problem.scene.draw("train", 400)
-    truth = 2 * (1 - drawn.ambient) - np.cos(np.radians(drawn.azimuth_deg - 40))
+    truth = 2 * (1 - drawn.light.ambient) - np.cos(np.radians(drawn.pose.azimuth_deg - 40))
     noisy = truth + np.random.default_rng(0).normal(0, 0.5, 400)
     expected = expected_losses(drawn[:128], noisy[:128], drawn[128:])
     assert spearmanr(expected, truth[128:]).statistic > 0.9
@@ -126,9 +125,10 @@ def test_views_from_behind_a_patch_are_not_mined(tmp_path):
     """The object fails there, too, but the patch cannot be seen; where too few are not, nothing is mined."""
     around = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]})
     mined, drawn = training_conditions(around, 16), around.scene.draw("train", 12)
-    changed = mined.azimuth_deg != drawn.azimuth_deg
+    changed = mined.pose.azimuth_deg != drawn.pose.azimuth_deg
     assert changed.any() and (np.abs(around.scene.piece_azimuth_deg(mined))[changed] < 90).all()
-    np.testing.assert_array_equal(training_conditions(around, 1).azimuth_deg, drawn.azimuth_deg)  # too few to fit
+    too_few = training_conditions(around, 1)  # to fit anything to
+    np.testing.assert_array_equal(too_few.pose.azimuth_deg, drawn.pose.azimuth_deg)
 
 
 def test_the_worst_of_every_eight_by_hand():
@@ -171,9 +171,9 @@ def test_a_cell_moves_pose_and_light_as_far_as_they_lay_in_their_ranges(tmp_path
     assert both[0].edges == pytest.approx((-60, -20, 20, 60)) and both[1].edges == pytest.approx((0, 0.3, 0.6))
     drawn = problem.scene.draw("select", 32)
     there = in_cell(drawn, both, (2, 0))
-    np.testing.assert_allclose(there.azimuth_deg, 20 + (drawn.azimuth_deg + 60) / 3)
-    np.testing.assert_allclose(there.ambient, drawn.ambient / 2)
-    others = [field.name for field in fields(drawn) if field.name not in ("azimuth_deg", "ambient")]
+    np.testing.assert_allclose(there.pose.azimuth_deg, 20 + (drawn.pose.azimuth_deg + 60) / 3)
+    np.testing.assert_allclose(there.light.ambient, drawn.light.ambient / 2)
+    others = [name for name in FIELDS if name not in ("azimuth_deg", "ambient")]
     np.testing.assert_array_equal(rows_of(there, others), rows_of(drawn, others))
 
 
@@ -231,7 +231,7 @@ def test_the_search_ends_in_the_dark_for_a_network_that_wants_brightness(tmp_pat
     assert ranges.ambient[0] <= condition["ambient"] <= 0.2 and ranges.directional[0] <= condition["directional"]
     drawn = problem.scene.draw("select", 2 + 8, 0)
     first = [
-        losses_of(problem, stress._with(drawn[:2], {name: getattr(drawn, name)[i : i + 1] for name in LIGHT})).mean()
+        losses_of(problem, with_values(drawn[:2], **{n: fields_of(drawn)[n][i : i + 1] for n in LIGHT})).mean()
         for i in range(2, 10)
     ]
     assert found["losses"][0] == pytest.approx(max(first)) and found["losses"][-1] > max(first)

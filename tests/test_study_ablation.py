@@ -28,10 +28,12 @@ def seen(problem):
 
 def test_views_are_seen_without_the_effect_and_otherwise_alike(problem):
     plain, less = seen(problem).conditions, seen(without(problem, "noise")).conditions
-    assert (plain.noise > 0).all() and (less.noise == 0).all()
-    assert (plain.azimuth_deg == less.azimuth_deg).all() and (plain.exposure_ev == less.exposure_ev).all()
+    assert (plain.sensor.noise > 0).all() and (less.sensor.noise == 0).all()
+    assert (plain.pose.azimuth_deg == less.pose.azimuth_deg).all() and (
+        plain.sensor.exposure_ev == less.sensor.exposure_ev
+    ).all()
     both = seen(without(problem, "noise + exposure")).conditions
-    assert (both.noise == 0).all() and (both.exposure_ev == 0).all()
+    assert (both.sensor.noise == 0).all() and (both.sensor.exposure_ev == 0).all()
 
 
 def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):

@@ -99,7 +99,7 @@ def test_renders_show_the_bare_object_and_never_an_evaluated_view(scene_file, tm
     pictures = [pixels_of(tmp_path / name) for name in names]
     assert len(set(names)) == 3 and all(one.shape == (64, 64, 3) for one in pictures)
     assert not np.array_equal(pictures[0], pictures[1])
-    drawn = {stream: problem.scene.draw(stream, 64).azimuth_deg for stream in ("train", "evaluate")}
+    drawn = {stream: problem.scene.draw(stream, 64).pose.azimuth_deg for stream in ("train", "evaluate")}
     assert not np.isin(drawn["evaluate"], drawn["train"]).any()
     # the camera's exposure is not in them: the plain background keeps its color
     assert (pictures[0][0, 0] == 128).all()

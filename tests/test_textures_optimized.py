@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -18,6 +16,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
+from patchproof.scene.conditions import with_values
 from patchproof.scene.export import write_glb
 from patchproof.scene.scene import load_scene
 from test_journey import command
@@ -151,7 +150,7 @@ def test_the_ball_holds_whatever_a_step_asks_for(tmp_path):
 def test_the_gradient_of_a_texture_is_a_difference_of_pictures(tmp_path):
     """Along a random direction, through light and camera; texels that no view shows have none."""
     problem = set_problem(load_scene(scene_file(tmp_path, "texture")))
-    conditions = replace(problem.scene.draw("train", 2), noise=np.zeros(2))
+    conditions = with_values(problem.scene.draw("train", 2), noise=0)
     generator = torch.Generator().manual_seed(0)
     weight = torch.rand(2, 3, 96, 96, generator=generator)
 

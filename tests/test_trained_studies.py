@@ -179,7 +179,7 @@ def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
     written(tmp_path, "carton")
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
     views = three_views(problem, 4)
-    assert sorted(set(views.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
+    assert sorted(set(views.pose.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
     assert len(set(views.directional)) == 12 and len(set(views.distance_mm)) == 1
     still = from_sides(problem, np.array([0.0, 90.0]))
     assert not still.directional.any() and not still.noise.any() and (still.ambient == 1).all()
@@ -193,7 +193,9 @@ def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
     shuffled = subject.control("shuffled", design)
     assert np.array_equal(shuffled, subject.control("shuffled", design)) and not np.array_equal(shuffled, design)
     first = 0
-    for mask, was, now in zip(scene.canvas.mask, subject.textures(design), subject.textures(shuffled), strict=True):
+    for mask, was, now in zip(
+        scene.canvas.mask, subject.surface.textures(design), subject.surface.textures(shuffled), strict=True
+    ):
         count = int(mask.sum())
         parts = [np.sort(one[0, first : first + count].view("u1,u1,u1").ravel()) for one in (design, shuffled)]
         assert np.array_equal(*parts)

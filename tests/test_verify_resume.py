@@ -8,7 +8,6 @@ import subprocess
 import sys
 import weakref
 from concurrent.futures import Future
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,9 +15,10 @@ import torch
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence import look
-from patchproof.evidence.journal import Journal
+from patchproof.evidence import batch, measure
+from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.task import Options, task_of
 from patchproof.journey.verify import verify_photos
 from patchproof.photo.read import read_photo
 from patchproof.sheets.manifest import dump_manifest
@@ -85,13 +85,13 @@ def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeyp
     photos.mkdir()
     for path in folder.iterdir():
         (photos / path.name).write_bytes(path.read_bytes())
-    monkeypatch.setattr(look, "read_photo", lambda path: opened.append(path.name) or read_photo(path))
+    monkeypatch.setattr(batch, "read_photo", lambda path: opened.append(path.name) or read_photo(path))
 
     def judged(resume=True, **options):
         opened.clear()
-        options = {"ledger_photos": 0, "journal": tmp_path / "photos.jsonl", "resume": resume, **options}
-        given = dict(models=[NET], printer=identity_printer())
-        return gather_evidence(photos, make_manifest(promise()), **given, **options).report
+        options = Options([NET], identity_printer(), ledger_photos=0, **options)
+        kept = dict(journal=tmp_path / "photos.jsonl", resume=resume)
+        return gather_evidence(photos, make_manifest(promise()), options, **kept).report
 
     first = judged()
     assert len(opened) == 6
@@ -111,7 +111,7 @@ def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeyp
 
 def test_squares_do_not_wait_for_each_other(folder, monkeypatch):
     alive, most = [], []
-    squares_of = look.squares_of
+    squares_of = batch.squares_of
 
     def watched(srgb, sizes_px):
         squares = {size: square.copy() for size, square in squares_of(srgb, sizes_px).items()}
@@ -122,10 +122,9 @@ def test_squares_do_not_wait_for_each_other(folder, monkeypatch):
         most.append(sum(ref() is not None for ref in alive))
         return torch.zeros(len(photos), 2)
 
-    monkeypatch.setattr(look, "squares_of", watched)
+    monkeypatch.setattr(batch, "squares_of", watched)
     net = Classifier("net", "ab" * 32, 32, ("bright", "dark"), network)
-    given = dict(models=[net], printer=identity_printer(), ledger_photos=0)
-    gather_evidence(folder, make_manifest(promise()), **given)
+    gather_evidence(folder, make_manifest(promise()), Options([net], identity_printer(), ledger_photos=0))
     assert len(alive) == 5 and max(most) == 1
 
 
@@ -135,7 +134,7 @@ class Deadly:
     def completed(self, function, items):
         for number, item in enumerate(items):
             future = Future()
-            if item[1].name == "b2.jpg":
+            if item.path.name == "b2.jpg":
                 future.set_exception(WorkerDied("a", "b", "c"))
             else:
                 future.set_result(function(item))
@@ -143,24 +142,25 @@ class Deadly:
 
 
 def test_a_photograph_that_ends_its_process_each_time_is_rejected_and_the_others_go_on(folder):
-    task = look.set_task(make_manifest(promise()), [NET], identity_printer(), None, None)
-    paths = sorted(folder.iterdir())
-    seen = look.look_at_all(task, paths, lambda squares: {}, Deadly(), None, lambda *_: None, lambda done: None)
-    codes = {one.entry.file: (one.entry.status, one.entry.code) for one in seen}
+    task = task_of(make_manifest(promise()), Options([NET], identity_printer()), None)
+    items = [batch.Item(path) for path in sorted(folder.iterdir())]
+    photos = batch.measure_all(task, items, None, Deadly(), None, lambda *_: None, lambda *_: None)
+    codes = {photo.entry.file: (photo.entry.status, photo.entry.code) for photo in photos}
     assert codes.pop("b2.jpg") == ("rejected", "unreadable") and codes.pop("a.JPG") == ("rejected", "unreadable")
     assert set(codes.values()) == {("measured", None)}
 
 
 def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
-    measure = look.measure
+    names = []
 
     def wrong(view, name, *rest):
-        measured = measure(view, name, *rest)
-        residual_mm = float("nan") if name == "b3.jpg" else measured.entry.residual_mm
-        return replace(measured, entry=measured.entry.model_copy(update={"residual_mm": residual_mm}))
+        names.append(name)
+        return measure.measure(view, name, *rest)
 
-    monkeypatch.setattr(look, "measure", wrong)
-    found = gather_evidence(folder, make_manifest(promise()), models=[NET], printer=identity_printer()).report.photos
+    blur_px = measure.blur_px
+    monkeypatch.setattr(batch, "measure", wrong)
+    monkeypatch.setattr(measure, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
+    found = gather_evidence(folder, make_manifest(promise()), Options([NET], identity_printer())).report.photos
     assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]
 
 
@@ -169,7 +169,7 @@ def test_a_journal_forgets_other_keys_and_other_bytes(tmp_path):
     photo.write_bytes(b"one")
     for key, again in (("k", True), ("other", False)):
         journal = Journal(path, "k", resume=False)
-        journal.add("a.jpg", photo, {"x": 1.25})
+        journal.add("a.jpg", file_sha256(photo), {"x": 1.25})
         journal.close()
         journal = Journal(path, key, resume=True)
         assert (journal.find("a.jpg", photo) == {"x": 1.25}) is again

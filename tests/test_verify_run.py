@@ -18,6 +18,7 @@ from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.evidence.task import Options
 from patchproof.photo.read import Photo
 from patchproof.strict import Refused
 from test_photo_synthetic import COLORS, make_manifest, page_raster, photograph, save, view
@@ -63,51 +64,54 @@ def test_a_good_photo_is_measured_and_its_pose_is_right():
     look = measured(shot(30, 550, jpeg=92, noise=0.003), focal_px=824.2)
     entry = look.entry
     assert (entry.status, entry.code, entry.markers_found, look.counted) == ("measured", None, 8, True)
-    assert entry.azimuth_deg == pytest.approx(30, abs=0.5) and entry.distance_mm == pytest.approx(550, rel=0.01)
-    assert entry.tilt_deg == pytest.approx(30.4, abs=1) and entry.blur_px == pytest.approx(0.5, abs=0.2)
-    assert entry.px_per_mm == pytest.approx(824.2 / 550 * np.sqrt(np.cos(np.radians(30.4))), rel=0.02)
-    assert entry.color_fit == "affine12" and entry.delta_e00_mean < 2.5 and entry.scale_x is None
-    assert entry.contrast == pytest.approx(0.8, abs=0.05)
+    geometry, pose = entry.geometry, entry.pose
+    assert pose.azimuth_deg == pytest.approx(30, abs=0.5) and pose.distance_mm == pytest.approx(550, rel=0.01)
+    assert geometry.tilt_deg == pytest.approx(30.4, abs=1) and geometry.blur_px == pytest.approx(0.5, abs=0.2)
+    assert geometry.px_per_mm == pytest.approx(824.2 / 550 * np.sqrt(np.cos(np.radians(30.4))), rel=0.02)
+    assert entry.color.color_fit == "affine12" and entry.color.delta_e00_mean < 2.5 and entry.scale is None
+    assert geometry.contrast == pytest.approx(0.8, abs=0.05)
 
 
 def test_light_and_white_balance_are_no_color_difference_but_another_design_is():
-    plain = measured(shot()).entry.delta_e00_mean
-    tinted = measured(shot(light=np.array([0.8, 0.6, 0.45]))).entry.delta_e00_mean
+    plain = measured(shot()).entry.color.delta_e00_mean
+    tinted = measured(shot(light=np.array([0.8, 0.6, 0.45]))).entry.color.delta_e00_mean
     assert tinted == pytest.approx(plain, abs=0.5)
     faded = np.clip(make_manifest().design.pixels() * 0.5 + 90, 0, 255).astype(np.uint8)
-    assert measured(shot(), manifest=make_manifest(design=faded)).entry.delta_e00_mean > plain + 5
+    assert measured(shot(), manifest=make_manifest(design=faded)).entry.color.delta_e00_mean > plain + 5
 
 
 def test_each_swatch_is_compared_with_its_promise():
     entry = measured(shot(jpeg=90)).entry
-    assert [s.srgb for s in entry.swatches] == COLORS
-    assert max(s.delta_e00 for s in entry.swatches) < 3
-    assert entry.swatches[0].promised == pytest.approx(entry.swatches[0].seen, abs=0.05)
+    assert [s.srgb for s in entry.color.swatches] == COLORS
+    assert max(s.delta_e00 for s in entry.color.swatches) < 3
+    assert entry.color.swatches[0].promised == pytest.approx(entry.color.swatches[0].seen, abs=0.05)
     wrong = make_manifest()
     chart = (wrong.chart[0].model_copy(update={"srgb": (0.5, 0.0, 0.0)}), *wrong.chart[1:])  # printed black
-    deltas = [s.delta_e00 for s in measured(shot(), manifest=wrong.model_copy(update={"chart": chart})).entry.swatches]
+    deltas = [
+        s.delta_e00 for s in measured(shot(), manifest=wrong.model_copy(update={"chart": chart})).entry.color.swatches
+    ]
     assert np.argmax(deltas) == 0 and deltas[0] > 10
 
 
 def test_gloss_on_the_design_is_left_out_and_counted():
     plain = measured(shot(light=0.5)).entry
-    assert plain.glossy_share == 0 and plain.clipped_share == 0
+    assert plain.color.glossy_share == 0 and plain.color.clipped_share == 0
     srgb = shot(light=0.5)
     spot = cv2.warpPerspective(
         np.pad(np.full((30, 30), 0.25, np.float32), ((115, 152), (90, 90))),
-        np.array(plain.homography_px_from_mm),
+        np.array(plain.geometry.homography_px_from_mm),
         srgb.shape[1::-1],
     )
     shiny = srgb_from_linear(linear_from_srgb(srgb / 255) + spot[..., None]) * 255
     entry = measured(np.clip(shiny + 0.5, 0, 255).astype(np.uint8)).entry
-    assert entry.glossy_share == pytest.approx(0.09, abs=0.03) and entry.code is None
-    assert entry.delta_e00_mean < plain.delta_e00_mean + 0.8  # 2.5 with gloss in it
+    assert entry.color.glossy_share == pytest.approx(0.09, abs=0.03) and entry.code is None
+    assert entry.color.delta_e00_mean < plain.color.delta_e00_mean + 0.8  # 2.5 with gloss in it
 
 
 def test_without_swatches_paper_and_ink_fix_the_color():
     manifest = make_manifest().model_copy(update={"chart": ()})
     entry = measured(shot(light=np.array([0.8, 0.6, 0.45])), manifest=manifest).entry
-    assert entry.color_fit == "white_black" and entry.delta_e00_mean < 4
+    assert entry.color.color_fit == "white_black" and entry.color.delta_e00_mean < 4
 
 
 @pytest.mark.parametrize(
@@ -125,7 +129,7 @@ def test_without_swatches_paper_and_ink_fix_the_color():
 def test_each_trouble_has_its_code_and_advice(srgb, status, code):
     look = measured(srgb())
     assert (look.entry.status, look.entry.code) == (status, code)
-    assert look.entry.advice and look.counted == (status != "rejected")
+    assert look.entry.remark.advice and look.counted == (status != "rejected")
 
 
 def test_a_corner_of_the_frame_identifies_the_sheet_but_is_not_measured():
@@ -143,7 +147,7 @@ def test_bent_paper_is_never_measured_as_flat():
     rows, columns = np.mgrid[0:600, 0:800].astype(np.float32)
     bent = cv2.remap(photo, columns, rows + 14 * np.sin(columns / 90), cv2.INTER_LINEAR)
     entry = measured(bent).entry
-    assert entry.status == "judged" or entry.residual_mm > 0.3
+    assert entry.status == "judged" or entry.geometry.residual_mm > 0.3
 
 
 def test_views_outside_of_the_promise_are_not_counted():
@@ -159,14 +163,15 @@ def test_views_outside_of_the_promise_are_not_counted():
 
 def test_the_uncut_page_and_scans_are_measured_but_not_counted():
     page = measured(shot(10, 900, only_piece=False))
-    assert page.entry.status == "measured" and not page.counted and page.entry.scale_x is None
+    assert page.entry.status == "measured" and not page.counted and page.entry.scale is None
     for sx, sy, code in ((1.0, 1.0, None), (0.97, 0.965, "scale_off"), (1.003, 0.997, None)):
         homography = np.diag([100 / 25.4 * sx, 100 / 25.4 * sy, 1.0])
         homography[:2, 2] = 7.3, 4.9
         scan = photograph(raster(False), homography, (860, 1200), blur_px=0.5, light=0.9, fine=3)
         look = measured(scan, scan_dpi=100)
         assert (look.entry.status, look.entry.code, look.counted) == ("measured", code, False)
-        assert look.entry.scale_x == pytest.approx(sx, abs=0.002) and look.entry.scale_y == pytest.approx(sy, abs=0.002)
+        scale = look.entry.scale
+        assert (scale.scale_x, scale.scale_y) == pytest.approx((sx, sy), abs=0.002)
 
 
 @pytest.fixture(scope="module")
@@ -182,8 +187,9 @@ def folder(tmp_path_factory):
     return photos
 
 
-def verified(folder, **options):
-    return gather_evidence(folder, make_manifest(promise()), models=[NET], printer=identity_printer(), **options)
+def verified(folder, jobs=1, progress=lambda done, total: None, **options):
+    options = Options([NET], identity_printer(), **options)
+    return gather_evidence(folder, make_manifest(promise()), options, jobs=jobs, progress=progress)
 
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
@@ -203,7 +209,7 @@ def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
 
 
 def test_two_processes_give_the_same_bytes_as_one(folder):
-    assert verified(folder, jobs=2).report.dump() == verified(folder).report.dump()
+    assert verified(folder, jobs=2).report.model_dump_json() == verified(folder).report.model_dump_json()
 
 
 def test_controls_decide_the_effect(folder, tmp_path):
@@ -231,4 +237,4 @@ def test_folders_and_judges_that_will_not_do_are_refused_in_a_sentence(tmp_path)
     retrained = Classifier("net", "cd" * 32, 32, ("bright", "dark"), brightness)
     for model, words in ((other, "the promise's own network net"), (retrained, "another file under that name")):
         with pytest.raises(Refused, match=words):
-            gather_evidence(tmp_path, make_manifest(promise()), models=[model], printer=identity_printer())
+            gather_evidence(tmp_path, make_manifest(promise()), Options([model], identity_printer()))

@@ -6,7 +6,7 @@ import pytest
 
 from patchproof.claims import prediction_interval
 from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
-from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.results import Geometry, PhotoEntry, Pose
 from patchproof.evidence.verdict import compare, effect_of, judge
 from patchproof.goal import Goal
 from patchproof.sheets.manifest import ConditionClaim
@@ -59,7 +59,7 @@ def test_different_names_go_to_newcombe():
     patch, control = {f"a{i}": True for i in range(20)}, {f"b{i}": i < 5 for i in range(20)}
     compared = compare(patch, control, Goal.assist)
     assert compared.pairs == 0 and compared.p_value is None and compared.shown
-    assert compared.difference == pytest.approx(0.75) and compared.interval[0] > 0
+    assert compared.difference == pytest.approx(0.75) and compared.difference_interval[0] > 0
 
 
 def test_every_control_must_be_beaten_and_none_is_no_test():
@@ -76,8 +76,10 @@ def conditions(scales, recognized):
     return [ConditionClaim(px_per_mm=s, recognized=r, **empty) for s, r in rows]
 
 
-def entry(**figures):
-    return PhotoEntry(file="a.jpg", status="judged", **figures)
+def entry(photo_px=None, pose=None, **figures):
+    rest = dict(residual_mm=0, px_per_mm=2, tilt_deg=0, contrast=1, blur_px=1, corner_uncertainty_mm=0)
+    geometry = Geometry(**rest | figures) if figures else None
+    return PhotoEntry(file="a.jpg", status="judged", photo_px=photo_px, geometry=geometry, pose=pose)
 
 
 def test_ranges_have_a_tenth_of_margin_and_ignore_what_is_unknown():
@@ -105,9 +107,9 @@ def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():
         for a in (-30, 30)
     ]
     ranges = promised_ranges(claims)
-    at = dict(px_per_mm=1.0, tilt_deg=1.0, azimuth_deg=40.0)
-    assert ranges.violated(entry(**at, azimuth_uncertainty_deg=3.9), True).code == "out_of_range"
-    assert ranges.violated(entry(**at, azimuth_uncertainty_deg=4.1), True) is None
+    at = [entry(px_per_mm=1, tilt_deg=1, pose=Pose(azimuth_deg=40, azimuth_uncertainty_deg=u)) for u in (3.9, 4.1)]
+    assert ranges.violated(at[0], True).code == "out_of_range"
+    assert ranges.violated(at[1], True) is None
 
 
 def test_the_matched_rate_is_that_of_the_nearest_conditions():
@@ -115,4 +117,5 @@ def test_the_matched_rate_is_that_of_the_nearest_conditions():
     claims = conditions(near + far, [True] * 20 + [False] * 20)
     assert matched_rate([entry(px_per_mm=1.0)], claims) == 1.0
     assert matched_rate([entry(px_per_mm=1.0), entry(px_per_mm=5.0)], claims) == 0.5
-    assert matched_rate([entry(tilt_deg=3.0)], claims) is None and matched_rate([], claims) is None
+    assert matched_rate([entry()], claims) is None and matched_rate([], claims) is None
+    assert matched_rate([entry(px_per_mm=1.0)], conditions([None], [True])) is None

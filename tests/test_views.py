@@ -23,7 +23,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see
-from patchproof.scene.conditions import with_poses_of
+from patchproof.scene.conditions import with_poses_of, with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import frame_image
 from patchproof.strict import Refused
@@ -51,13 +51,7 @@ def posed(scene, n=1, **values):
     """`n` draws with the middle of each range, at these values."""
     drawn = scene.draw("promise", n)
     still = {"roll_deg": 0, "elevation_deg": 0, "azimuth_deg": 0, "distance_mm": 700, "look_at_offset": 0} | values
-    return replace(
-        drawn,
-        **{
-            name: np.broadcast_to(np.asarray(value, getattr(drawn, name).dtype), getattr(drawn, name).shape).copy()
-            for name, value in still.items()
-        },
-    )
+    return with_values(drawn, **still)
 
 
 def piece_of(scene, side=180):
@@ -202,7 +196,7 @@ def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch):
     """Front, back and bare object, with lamp and gloss; but for pixels that the piece's edge cuts."""
     scene = scene_of(tmp_path, tables=LIGHT)
     stage, piece = set_stage(scene), piece_of(scene)
-    conditions = replace(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]))
+    conditions = with_values(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]))
     torch.testing.assert_close(*both_ways(monkeypatch, stage, None, conditions, 192), atol=1e-5, rtol=0)
     part = see(stage, piece, conditions, (192, 192)).piece
     cut = torch.zeros(3 * 192 * 192, dtype=torch.bool)

@@ -1,38 +1,108 @@
-"""patchproof: optimise a patch on a 3D object, print it at true size, photograph it, judge the photographs.
+"""patchproof: optimize a patch on a 3D object, print it at true size, photograph it, judge the photographs.
 
 The public names tell the story in order: scene → optimize → sheet → photographs → verify. They are imported when first
-used, so that `import patchproof` and `patchproof --help` stay quick.
+used, so that `import patchproof` and `patchproof --help` stay quick; type checkers see them all.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+if TYPE_CHECKING:
+    from patchproof.channel.printer import Printer as Printer
+    from patchproof.channel.printer import load_printer as load_printer
+    from patchproof.classifier.custom import classifier_of as classifier_of
+    from patchproof.classifier.load import load_classifier as load_classifier
+    from patchproof.classifier.network import Classifier as Classifier
+    from patchproof.evidence.results import Report as Report
+    from patchproof.goal import Goal as Goal
+    from patchproof.journey.verify import verify_photos as verify
+    from patchproof.optimizer.evaluate import evaluate_run as evaluate
+    from patchproof.optimizer.run import Run as Run
+    from patchproof.optimizer.run import load_run as load_run
+    from patchproof.optimizer.run import optimize_scene as optimize
+    from patchproof.printing.sheet import sheet_of as sheet
+    from patchproof.render.photograph import photograph as photograph
+    from patchproof.render.stage import Stage as Stage
+    from patchproof.render.stage import set_stage as set_stage
+    from patchproof.reprints.reprint import reprint as reprint
+    from patchproof.scene.conditions import Conditions as Conditions
+    from patchproof.scene.scene import Scene as Scene
+    from patchproof.scene.scene import load_scene as load_scene
+    from patchproof.scene.scene import make_scene as make_scene
+    from patchproof.settings import SceneSettings as SceneSettings
+    from patchproof.sheets.manifest import Manifest as Manifest
+    from patchproof.sheets.manifest import Promise as Promise
+    from patchproof.sheets.manifest import load_manifest as load_manifest
+    from patchproof.strict import Refused as Refused
+
+# where each public name comes from, and what it is called there
 _HOME = {
-    "load_scene": "patchproof.scene.scene",
-    "load_classifier": "patchproof.classifier.load",
-    "load_printer": "patchproof.channel.printer",
-    "photograph": "patchproof.render.photograph",
-    "set_stage": "patchproof.render.stage",
-    "optimize_scene": "patchproof.optimizer.run",
-    "evaluate_run": "patchproof.optimizer.evaluate",
-    "load_run": "patchproof.optimizer.run",
-    "sheet_of": "patchproof.printing.sheet",
-    "reprint": "patchproof.reprints.reprint",
-    "load_manifest": "patchproof.sheets.manifest",
-    "verify_photos": "patchproof.journey.verify",
-    "Refused": "patchproof.strict",
+    "Classifier": "classifier.network:Classifier",
+    "Conditions": "scene.conditions:Conditions",
+    "Goal": "goal:Goal",
+    "Manifest": "sheets.manifest:Manifest",
+    "Printer": "channel.printer:Printer",
+    "Promise": "sheets.manifest:Promise",
+    "Refused": "strict:Refused",
+    "Report": "evidence.results:Report",
+    "Run": "optimizer.run:Run",
+    "Scene": "scene.scene:Scene",
+    "SceneSettings": "settings:SceneSettings",
+    "Stage": "render.stage:Stage",
+    "classifier_of": "classifier.custom:classifier_of",
+    "evaluate": "optimizer.evaluate:evaluate_run",
+    "load_classifier": "classifier.load:load_classifier",
+    "load_manifest": "sheets.manifest:load_manifest",
+    "load_printer": "channel.printer:load_printer",
+    "load_run": "optimizer.run:load_run",
+    "load_scene": "scene.scene:load_scene",
+    "make_scene": "scene.scene:make_scene",
+    "optimize": "optimizer.run:optimize_scene",
+    "photograph": "render.photograph:photograph",
+    "reprint": "reprints.reprint:reprint",
+    "set_stage": "render.stage:set_stage",
+    "sheet": "printing.sheet:sheet_of",
+    "verify": "journey.verify:verify_photos",
 }
 
-__all__ = list(_HOME)
+__all__ = [
+    "Classifier",
+    "Conditions",
+    "Goal",
+    "Manifest",
+    "Printer",
+    "Promise",
+    "Refused",
+    "Report",
+    "Run",
+    "Scene",
+    "SceneSettings",
+    "Stage",
+    "classifier_of",
+    "evaluate",
+    "load_classifier",
+    "load_manifest",
+    "load_printer",
+    "load_run",
+    "load_scene",
+    "make_scene",
+    "optimize",
+    "photograph",
+    "reprint",
+    "set_stage",
+    "sheet",
+    "verify",
+]
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'patchproof' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    module, _, attribute = _HOME[name].partition(":")
+    return getattr(import_module(f"patchproof.{module}"), attribute)
 
 
 def __dir__() -> list[str]:

@@ -159,10 +159,16 @@ def clustered_mean(
 
     if len(values) < LEAST_CLUSTERS:
         raise ValueError(f"expected at least {LEAST_CLUSTERS} clusters, got {len(values)}")
-    values = np.asarray(values, float)
-    picked = np.random.Generator(np.random.PCG64(0)).integers(0, len(values), (draws, len(values)))
-    low, high = np.quantile(values[picked].mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
-    return float(values.mean()), (float(low), float(high))
+    means = resampled_means(np.asarray(values, float), draws)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(np.mean(values)), (float(low), float(high))
+
+
+def resampled_means(values: np.ndarray, draws: int) -> np.ndarray:
+    """Means (`draws` × ...) of bootstrap resamples of the n × ... values, the same ones each time."""
+    import numpy as np
+
+    return values[np.random.default_rng(0).integers(0, len(values), (draws, len(values)))].mean(1)
 
 
 def clustered(values: Sequence[float]) -> Estimate | float | None:

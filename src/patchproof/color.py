@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import math
 import sys
+from typing import TypeVar
 
 import numpy as np
 
+Values = TypeVar("Values")  # what comes in, an array or a tensor, comes out
 LUMINANCE = (0.2126390, 0.7151687, 0.0721923)  # Y of sRGB's linear primaries, D65
 _XYZ_FROM_LINEAR = (
     (0.4123908, 0.3575843, 0.1804808),
@@ -26,7 +28,7 @@ _WHITE_D65 = (0.9504559, 1.0, 1.0890578)  # the matrix's own row sums, so that s
 _LINEAR_FROM_Z = (-0.5430160, 0.0452559, 1.1511030)  # the inverse matrix's last column, times white's Z
 
 
-def linear_from_srgb(srgb):
+def linear_from_srgb(srgb: Values) -> Values:
     """Light from sRGB code values, per value; odd-symmetric below 0 so that it can be inverted and differentiated."""
     xp = _library(srgb)
     size = xp.abs(srgb)
@@ -35,7 +37,7 @@ def linear_from_srgb(srgb):
     return xp.sign(srgb) * xp.where(size <= 0.04045, size / 12.92, curved)
 
 
-def srgb_from_linear(linear):
+def srgb_from_linear(linear: Values) -> Values:
     """The sRGB code values of light, per value; the exact inverse of `linear_from_srgb`."""
     xp = _library(linear)
     size = xp.abs(linear)

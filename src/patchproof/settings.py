@@ -35,12 +35,12 @@ class ObjectSettings(Strict):
     it, or a folder of labeled images.
     """
 
-    mesh: str | None = None
+    mesh: str | None = None  # a file (OBJ, GLB, glTF, PLY, STL) or primitive:NAME
     length_mm: Positive | None = None  # a mesh's longest extent
-    up: Literal["y", "z"] = "z"
-    photos: str | None = None
+    up: Literal["y", "z"] = "z"  # the mesh file's axis that points up
+    photos: str | None = None  # a folder of photographs of the object with a blank sheet on it
     sheet: str | None = None  # the blank sheet's manifest
-    images: str | None = None
+    images: str | None = None  # a folder of labeled images
     labels: str | None = None  # CSV: file name, label
 
     @model_validator(mode="after")
@@ -60,18 +60,18 @@ class PatchSettings(Strict):
     covers the object's own UV map or vertices, `masked` only what mask, materials or faces name.
     """
 
-    width_mm: Positive | None = None
-    height_mm: Positive | None = None
-    kind: Literal["patch", "texture", "masked"] = "patch"
-    side: Side = "+x"
-    offset_mm: tuple[Finite, Finite] = (0.0, 0.0)
+    width_mm: Positive | None = None  # of the design, without its frame
+    height_mm: Positive | None = None  # likewise
+    kind: Literal["patch", "texture", "masked"] = "patch"  # a printed piece, or the object's own texture
+    side: Side = "+x"  # of the object, that the patch hangs on
+    offset_mm: tuple[Finite, Finite] = (0.0, 0.0)  # [right, up] from the side's middle as one faces it
     at_mm: tuple[Finite, Finite, Finite] | None = None  # a point in the scene instead of a side's middle
-    spin_deg: Finite = 0.0
+    spin_deg: Finite = 0.0  # turn of the patch in its plane, clockwise
     bend: bool = False  # follow the surface instead of standing off it as a flat card
     mask: str | None = None  # an image over the UV map, white where the texture may change
-    materials: tuple[str, ...] = ()
-    faces: str | None = None  # a text file of face numbers
-    start: Literal["original", "grey"] = "original"
+    materials: tuple[str, ...] = ()  # names of the mesh's materials whose texture may change
+    faces: str | None = None  # a text file of numbers of the faces whose texture may change
+    start: Literal["original", "grey"] = "original"  # what a texture is optimized from
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
     @model_validator(mode="after")
@@ -93,28 +93,28 @@ class PatchSettings(Strict):
 class SheetSettings(Strict):
     """The page that the piece is printed on."""
 
-    template: str = "a4"
+    template: str = "a4"  # a shipped template's name, or a TOML file
 
 
 class TargetSettings(Strict):
     """What the classifiers should see, and which classifiers."""
 
-    label: str | int
-    models: Annotated[tuple[str, ...], Field(min_length=1)]
-    accept: tuple[str | int, ...] = ()
-    goal: Goal = Goal.assist
+    label: str | int  # an index, or a name in the first network's list
+    models: Annotated[tuple[str, ...], Field(min_length=1)]  # trained against together; the first one decides
+    accept: tuple[str | int, ...] = ()  # labels that count as recognized, too
+    goal: Goal = Goal.assist  # raise the label's rate, or lower it
 
 
 class ViewSettings(Strict):
-    """Where the camera may be; azimuth 0 faces the patch's side; distance from the camera's centre to `look_at`."""
+    """Where the camera may be."""
 
-    look_at: Literal["object", "patch"] = "object"
-    look_at_jitter: Share = 0.05  # share of the object's length
-    azimuth_deg: Range = (-60.0, 60.0)
-    elevation_deg: Annotated[Range, AfterValidator(lambda r: within(r, -89, 89))] = (2.0, 27.0)
-    distance_mm: PositiveRange = (440.0, 800.0)
-    roll_deg: Range = (-5.0, 5.0)
-    fov_deg: Annotated[Positive, Field(lt=170)] = 50.0
+    look_at: Literal["object", "patch"] = "object"  # whose middle the camera looks at
+    look_at_jitter: Share = 0.05  # how far it looks past that, as a share of the object's length
+    azimuth_deg: Range = (-60.0, 60.0)  # of the camera about the vertical; 0 faces the patch's side
+    elevation_deg: Annotated[Range, within(-89, 89)] = (2.0, 27.0)  # of the camera above the horizontal
+    distance_mm: PositiveRange = (440.0, 800.0)  # from the camera's center to what it looks at
+    roll_deg: Range = (-5.0, 5.0)  # of the camera about its axis
+    fov_deg: Annotated[Positive, Field(lt=170)] = 50.0  # field of view across the picture's shorter side
     zoom: PositiveRange = (0.9, 1.1)  # of a photographed scene's pictures about their middle
     patch_share: ShareRange = (0.1, 0.3)  # design's longer side over the picture's shorter side, in a folder of images
 
@@ -122,8 +122,8 @@ class ViewSettings(Strict):
 class LightSettings(Strict):
     """Ambient and directional light, a lamp, gloss; 1 is the light in which white paper is sRGB white at exposure 0."""
 
-    ambient: NotNegativeRange = (0.3, 0.7)
-    directional: NotNegativeRange = (0.2, 0.8)
+    ambient: NotNegativeRange = (0.3, 0.7)  # light from everywhere
+    directional: NotNegativeRange = (0.2, 0.8)  # light from one far side, on a surface that faces it
     point: NotNegativeRange = (0.0, 0.0)  # a lamp's light on the patch's middle where it faces the lamp
     point_distance_mm: PositiveRange = (300.0, 2000.0)  # of the lamp from the patch's middle
     sh2: ShareRange = (0.0, 0.0)  # standard deviation of the ambient light over directions, share of its mean
@@ -132,10 +132,10 @@ class LightSettings(Strict):
 
 
 class BackgroundSettings(Strict):
-    """Photographs behind the object, or one plain sRGB colour."""
+    """Photographs behind the object, or one plain color."""
 
-    images: str | None = None
-    color: tuple[Share, Share, Share] | None = None
+    images: str | None = None  # a folder of photographs
+    color: tuple[Share, Share, Share] | None = None  # sRGB
     erasing: Share = 0.5  # chance that a random box is erased in training, in a folder of images
 
     @model_validator(mode="after")
@@ -148,52 +148,54 @@ class BackgroundSettings(Strict):
 class PrinterSettings(Strict):
     """The printer's appearance model (a name in calibration/printers, or a file), and how prints differ from it."""
 
-    profile: str = "coated"
+    profile: str = "coated"  # coated, uncoated, or a file that `calibrate printer` wrote
     # One print to the next, ΔE00 1 to 3 together. Assumed, from the size of the tolerances of ISO 12647-2. Free.
-    dot_gain: Annotated[Range, AfterValidator(lambda r: within(r, -0.25, 0.25))] = (-0.04, 0.04)  # tone value at 50 %
-    density: Annotated[Range, AfterValidator(lambda r: within(r, -0.9, 3))] = (-0.05, 0.05)  # share of the ink's own
-    black: Annotated[Range, AfterValidator(lambda r: within(r, -0.1, 0.5))] = (-0.004, 0.004)  # light; paper is 1
-    # Paper beside the sheet that the light is measured by; papers differ by 0.92 to 1.03 (L* 92 to 96 beside 95) and by
-    # b* -8 to 7. Free, but off: either moved the demo's confidence by 0.004, without bias.
-    paper_white: PositiveRange = (1.0, 1.0)
-    paper_b: Annotated[Range, AfterValidator(lambda r: within(r, -40, 40))] = (0.0, 0.0)
-    # Shift of the color planes. Off: 0.1 mm moved the demo's confidence by 0.001 (0.3 mm: 0.006), and steps take 1.25
+    dot_gain: Annotated[Range, within(-0.25, 0.25)] = (-0.04, 0.04)  # added tone value at 50 %
+    density: Annotated[Range, within(-0.9, 3)] = (-0.05, 0.05)  # added ink, as a share of the ink's own
+    black: Annotated[Range, within(-0.1, 0.5)] = (-0.004, 0.004)  # added light of printed black; paper is 1
+    # Papers differ by 0.92 to 1.03 (L* 92 to 96 beside 95) and by b* -8 to 7. Free, but off: either moved the demo's
+    # confidence by 0.004, without bias.
+    paper_white: PositiveRange = (1.0, 1.0)  # the paper's light beside that of the sheet that the light is measured by
+    paper_b: Annotated[Range, within(-40, 40)] = (0.0, 0.0)  # the paper's b* beside it
+    # Off: 0.1 mm moved the demo's confidence by 0.001 (0.3 mm: 0.006), and steps take 1.25
     # times as long, as each view shows a print of its own.
-    misregistration_mm: Annotated[NotNegativeRange, AfterValidator(lambda r: within(r, 0, 5))] = (0.0, 0.0)
-    # Size over the sheet's own; "fit to page" makes 0.94 to 0.97. Off: sheets ask for 100 % and are measured. (0.97 to
+    misregistration_mm: Annotated[NotNegativeRange, within(0, 5)] = (0.0, 0.0)  # shift of the color planes
+    # "Fit to page" makes 0.94 to 0.97. Off: sheets ask for 100 % and are measured. (0.97 to
     # 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05 with a bias of -0.006.)
-    scale: Annotated[PositiveRange, AfterValidator(lambda r: within(r, 0.5, 2))] = (1.0, 1.0)
+    scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # size over the sheet's own
 
 
 class CameraSettings(Strict):
     """What the camera does; blur and noise are meant at `photo_px`."""
 
+    # Width and height of a whole photograph.
     photo_px: tuple[Annotated[int, Field(ge=64, le=20000)], Annotated[int, Field(ge=64, le=20000)]] = (1600, 1200)
-    exposure_ev: Range = (-0.5, 0.5)
-    white_balance: Annotated[Share, Field(le=0.5)] = 0.05
-    blur_px: NotNegativeRange = (0.0, 1.0)
-    noise: ShareRange = (0.0, 0.01)
+    exposure_ev: Range = (-0.5, 0.5)  # stops; at 0, white paper in light 1 is sRGB white
+    white_balance: Annotated[Share, Field(le=0.5)] = 0.05  # largest error of the red and of the blue gain
+    blur_px: NotNegativeRange = (0.0, 1.0)  # standard deviation of a Gaussian at photo_px
+    noise: ShareRange = (0.0, 0.01)  # standard deviation at white, at photo_px
     motion_px: NotNegativeRange = (0.0, 0.0)  # length of a straight motion blur at photo_px
-    vignetting: Annotated[ShareRange, AfterValidator(lambda r: within(r, 0, 0.95))] = (0.0, 0.0)  # lost in corners
+    vignetting: Annotated[ShareRange, within(0, 0.95)] = (0.0, 0.0)  # light lost in the corners
     file: str | None = None  # a calibrated camera: intrinsics and lens distortion in place of fov_deg
     jpeg: Annotated[
         tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(ordered)
-    ] = (60, 95)
+    ] = (60, 95)  # quality of the file
 
 
 class OptimizeSettings(Strict):
     """The loop: `views` conditions in each of `steps` steps."""
 
-    steps: Annotated[int, Field(ge=1)] = 240
-    views: Annotated[int, Field(ge=1)] = 4  # many small steps: as many views, 12 at a time, got less far in 3 scenes
-    seed: Annotated[int, Field(ge=0)] = 0
-    optimizer: Literal["adam", "sign"] = "adam"
-    # of sRGB's range, in which a larger one only jumps to the ends; by default 0.05 for a patch, 0.015 for a texture
-    step_size: Annotated[Positive, Field(le=1)] | None = None
-    tv: NotNegative = 0.0
-    # Loss for colors that the printer misses, per 100 ΔE00. At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
+    steps: Annotated[int, Field(ge=1)] = 240  # of the loop
+    # Many small steps: as many views, 12 at a time, got less far in 3 scenes.
+    views: Annotated[int, Field(ge=1)] = 4  # conditions in each step
+    seed: Annotated[int, Field(ge=0)] = 0  # of everything that is drawn
+    optimizer: Literal["adam", "sign"] = "adam"  # or the signed steps of FGSM and PGD
+    # A larger one only jumps to the ends of sRGB's range.
+    step_size: Annotated[Positive, Field(le=1)] | None = None  # of sRGB's range; 0.05 for a patch, 0.015 for a texture
+    tv: NotNegative = 0.0  # loss for the design's total variation
+    # At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
     # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).
-    gamut: NotNegative = 1.0
+    gamut: NotNegative = 1.0  # loss for colors that the printer misses, per 100 ΔE00
     in_gamut: bool = False  # keep the design, after every step, to colors that the printer shows as asked (ΔE00 ≤ 3)
 
     @model_validator(mode="before")

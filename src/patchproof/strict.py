@@ -13,10 +13,12 @@ import math
 import os
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 from typing_extensions import Self
 
 
@@ -66,6 +68,8 @@ PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 Model = TypeVar("Model", bound=BaseModel)
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
+Model = TypeVar("Model", bound=BaseModel)
+
 
 class Strict(BaseModel):
     """Frozen settings that know all their keys."""
@@ -79,8 +83,7 @@ class Strict(BaseModel):
         tables = {name: getattr(self, name) for name in type(self).model_fields}
         for name, value in values.items():
             table = tables.get(name)
-            nested = isinstance(table, Strict) and isinstance(value, dict)
-            tables[name] = table.changed(**value) if nested else value
+            tables[name] = table.changed(**value) if isinstance(table, Strict) and isinstance(value, dict) else value
         return validated(type(self), tables, type(self).__name__)
 
 
@@ -121,7 +124,7 @@ def expand(text: str, base: Path) -> str:
     prefix, colon, rest = text.partition(":")
     if colon and prefix == "file":
         return f"file:{_absolute(rest, base)}"
-    if (colon and (prefix in {"primitive", "torchvision", "timm", "module"})) or text == "builtin":
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text == "builtin":
         return text
     return str(_absolute(text, base))
 
@@ -137,14 +140,18 @@ def _absolute(path: str, base: Path) -> Path:
     return path_ if (path_ := Path(path)).is_absolute() else base / path_
 
 
-def within(pair: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-    """A range as it is, when it lies in [low, high]."""
+def within(low: float, high: float) -> AfterValidator:
+    """The check that a range lies in [low, high]."""
+    return AfterValidator(partial(_inside, low, high))
+
+
+def _inside(low: float, high: float, pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] < low or pair[1] > high:
         raise ValueError(f"must lie within [{low:g}, {high:g}]")
     return pair
 
 
-def _explain(model: type[BaseModel], error: dict, where: str) -> Refused:
+def _explain(model: type[BaseModel], error: ErrorDetails, where: str) -> Refused:
     key = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
         hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))

@@ -30,7 +30,7 @@ from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.render.photograph import Shown, expose
-from patchproof.render.views import Seen
+from patchproof.render.views import Views
 from patchproof.scene.conditions import draw
 from patchproof.scene.scene import build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings
@@ -161,7 +161,7 @@ class Judge:
         shown = problem.subject.shown(start(problem).design)
         self.problem = problem
         with torch.no_grad():
-            self.pools: list[Seen] = [
+            self.pools: list[Views] = [
                 problem.see(shown, conditions[i : i + CHUNK], problem.training_px) for i in range(0, count, CHUNK)
             ]
 

@@ -1,6 +1,6 @@
 """The camera: linear light at the lens becomes a display-encoded picture.
 
-In: N×3×H×W linear light and the drawn camera conditions. Out: N×3×H×W sRGB in [0, 1], differentiable. Order:
+In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order:
 vignetting, blur (optics, focus, straight motion), exposure and white balance, shot and read noise, clipping, tone curve
 (sRGB's). The lens's distortion has its own module.
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from patchproof.channel.effects import Sensor
 from patchproof.color import srgb_from_linear
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
@@ -28,33 +29,37 @@ SMALLEST_JPEG_SCALE = 0.5
 READ_SHARE = 0.25
 
 
-def develop(linear: Tensor, conditions, scale: float, jpeg: bool = True, diagonal_share: float = 1.0) -> Tensor:
-    """The picture that a camera makes; `conditions` as in `scene.conditions.Conditions`, one row per picture.
+def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, diagonal_share: float = 1.0) -> Tensor:
+    """The picture that a camera makes; one row of `sensor` per picture.
 
     `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     `diagonal_share` is what vignetting needs to know, from `diagonal_share_of`.
     """
-    linear = vignetted(linear, torch.as_tensor(conditions.vignetting).to(linear), diagonal_share)
-    linear = blurred(linear, torch.as_tensor(conditions.blur_px * scale).to(linear))
-    linear = moved(linear, torch.as_tensor(conditions.motion_px * scale).to(linear), conditions.motion_deg)
-    linear = linear * gains(conditions, linear)[:, :, None, None]
-    linear = noisy(linear, torch.as_tensor(conditions.noise * scale).to(linear), conditions.noise_seed)
+    linear = vignetted(linear, torch.as_tensor(sensor.vignetting).to(linear), diagonal_share)
+    linear = blurred(linear, torch.as_tensor(sensor.blur_px * scale).to(linear))
+    linear = moved(linear, torch.as_tensor(sensor.motion_px * scale).to(linear), sensor.motion_deg)
+    linear = linear * gains(sensor, linear)[:, :, None, None]
+    linear = noisy(linear, torch.as_tensor(sensor.noise * scale).to(linear), sensor.noise_seed)
     picture = encoded(linear)
-    if jpeg and scale >= SMALLEST_JPEG_SCALE:
-        picture = compressed(picture, torch.as_tensor(conditions.jpeg).to(linear))
+    if _is_stored(sensor, scale, jpeg):
+        picture = compressed(picture, torch.as_tensor(sensor.jpeg).to(linear))
     return picture
 
 
-def is_pointwise(conditions, scale: float, jpeg: bool) -> bool:
+def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
     """Whether `develop` treats every pixel alone and alike, so that a changed part can be developed without the rest.
 
     Vignetting is not alike: it depends on the place.
     """
-    sharp = conditions.blur_px.max() * scale < SMALLEST_BLUR_PX
-    still = (conditions.motion_px * scale).max() < SMALLEST_MOTION_PX
-    even = not conditions.vignetting.any()
-    clean = (conditions.noise * scale).max() < SMALLEST_NOISE
-    return bool(sharp and still and even and clean and not (jpeg and scale >= SMALLEST_JPEG_SCALE))
+    sharp = sensor.blur_px.max() * scale < SMALLEST_BLUR_PX
+    still = (sensor.motion_px * scale).max() < SMALLEST_MOTION_PX
+    even = not sensor.vignetting.any()
+    clean = (sensor.noise * scale).max() < SMALLEST_NOISE
+    return bool(sharp and still and even and clean and not _is_stored(sensor, scale, jpeg))
+
+
+def _is_stored(sensor: Sensor, scale: float, jpeg: bool) -> bool:
+    return bool(jpeg and scale >= SMALLEST_JPEG_SCALE and sensor.jpeg.any())
 
 
 def diagonal_share_of(size_px: tuple[int, int], photo_px: tuple[int, int]) -> float:
@@ -64,9 +69,9 @@ def diagonal_share_of(size_px: tuple[int, int], photo_px: tuple[int, int]) -> fl
     return min(1.0, diagonal * min(photo_px) / (photo_px[0] ** 2 + photo_px[1] ** 2) ** 0.5)
 
 
-def gains(conditions, like: Tensor) -> Tensor:
+def gains(sensor: Sensor, like: Tensor) -> Tensor:
     """Exposure and white balance: N×3 factors of the light."""
-    return torch.as_tensor(2 ** conditions.exposure_ev[:, None] * conditions.white_balance).to(like)
+    return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
 
 
 def encoded(linear: Tensor) -> Tensor:

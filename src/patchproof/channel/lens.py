@@ -140,7 +140,8 @@ def distorted(pictures: Tensor, camera: Camera, size_px: tuple[int, int]) -> Ten
 
     if not camera.bends:
         return pictures
-    grid = torch.as_tensor(_sampling_grid(camera, size_px)).to(pictures)
+    # pyright cannot know that frozen models have a hash
+    grid = torch.as_tensor(_sampling_grid(camera, size_px)).to(pictures)  # pyright: ignore[reportArgumentType]
     return torch.nn.functional.grid_sample(
         pictures, grid.expand(len(pictures), -1, -1, -1), mode="bilinear", padding_mode="border", align_corners=False
     )

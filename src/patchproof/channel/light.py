@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from patchproof import geometry
+from patchproof.channel.effects import Light
 
 # Irradiance per unit of the coefficients L1-1 L10 L11 L2-2 L2-1 L20 L21 L22 (eq. 13).
 _C1, _C2, _C3, _C5 = 0.429043, 0.511664, 0.743125, 0.247708
@@ -50,7 +51,7 @@ class Gloss:
 
 
 @dataclass(frozen=True)
-class Light:
+class Lighting:
     """The light of N views: `ambient` and `directional` N, the unit directions `toward` the light N×3, and what is not
     on in every scene; `uneven` N×8 is the part of the ambient light that depends on direction.
     """
@@ -63,26 +64,26 @@ class Light:
     gloss: Gloss | None = None
 
 
-def light_of(conditions, forward, up, middle_mm, device: torch.device | str = "cpu") -> Light:
-    """The light of drawn conditions on a patch whose side faces `forward`, with its middle at `middle_mm`."""
+def lighting_of(light: Light, forward, up, middle_mm, device: torch.device | str = "cpu") -> Lighting:
+    """The light of N views on a patch whose side faces `forward`, with its middle at `middle_mm`."""
 
     def on(values) -> Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
 
-    drawn, uneven, lamp, gloss = conditions, None, None, None
-    toward = geometry.orbit(drawn.light_azimuth_deg, drawn.light_elevation_deg, forward, up)
-    if drawn.sh2.any():
-        uneven = on((drawn.ambient * drawn.sh2)[:, None] * drawn.sh2_coefficients)
-    if drawn.point.any():
-        away = geometry.orbit(drawn.point_azimuth_deg, drawn.point_elevation_deg, forward, up)
-        position = np.asarray(middle_mm) + drawn.point_distance_mm[:, None] * away
-        lamp = Lamp(on(drawn.point), on(drawn.point_distance_mm), on(position))
-    if drawn.gloss.any():
-        gloss = Gloss(on(drawn.gloss), on(drawn.shininess))
-    return Light(on(drawn.ambient), on(drawn.directional), on(toward), uneven, lamp, gloss)
+    uneven = lamp = gloss = None
+    toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, forward, up)
+    if light.sh2.any():
+        uneven = on((light.ambient * light.sh2)[:, None] * light.sh2_coefficients)
+    if light.point.any():
+        away = geometry.orbit(light.point_azimuth_deg, light.point_elevation_deg, forward, up)
+        position = np.asarray(middle_mm) + light.point_distance_mm[:, None] * away
+        lamp = Lamp(on(light.point), on(light.point_distance_mm), on(position))
+    if light.gloss.any():
+        gloss = Gloss(on(light.gloss), on(light.shininess))
+    return Lighting(on(light.ambient), on(light.directional), on(toward), uneven, lamp, gloss)
 
 
-def irradiance(normal: Tensor, view: Tensor, light: Light, position_mm: Tensor | None = None) -> Tensor:
+def irradiance(normal: Tensor, view: Tensor, light: Lighting, position_mm: Tensor | None = None) -> Tensor:
     """Light on P fragments with unit `normal` P×3, each in one of the views (`view` P).
 
     `position_mm` P×3 is needed where there is a lamp only. Uneven ambient light that would be negative is 0: at `sh2`
@@ -100,7 +101,9 @@ def irradiance(normal: Tensor, view: Tensor, light: Light, position_mm: Tensor |
     return total
 
 
-def highlight(normal: Tensor, position_mm: Tensor, eye_mm: Tensor, view: Tensor, light: Light) -> Tensor | None:
+def highlight(
+    normal: Tensor, position_mm: Tensor | None, eye_mm: Tensor, view: Tensor, light: Lighting
+) -> Tensor | None:
     """White light P that glossy paper adds to what is printed, as seen from `eye_mm` N×3; None where nothing is glossy.
 
     Blinn-Phong with h halfway between light l and eye: share · (s + 2)(s + 4) / (8 (s + 2^(-s/2))) · (n·h)^s · (n·l),
@@ -109,6 +112,8 @@ def highlight(normal: Tensor, position_mm: Tensor, eye_mm: Tensor, view: Tensor,
     """
     if light.gloss is None:
         return None
+    if position_mm is None:
+        raise ValueError("highlights need positions")
     share, shininess = light.gloss.share.index_select(0, view), light.gloss.shininess
     peak = (shininess + 2) * (shininess + 4) / (8 * (shininess + 2 ** (-shininess / 2)))
     toward_eye = torch.nn.functional.normalize(eye_mm.index_select(0, view) - position_mm, dim=-1)
@@ -126,8 +131,10 @@ def highlight(normal: Tensor, position_mm: Tensor, eye_mm: Tensor, view: Tensor,
     return share * total
 
 
-def _from_lamp(lamp: Lamp, view: Tensor, position_mm: Tensor) -> tuple[Tensor, Tensor]:
+def _from_lamp(lamp: Lamp, view: Tensor, position_mm: Tensor | None) -> tuple[Tensor, Tensor]:
     """Irradiance P of a surface that faces the lamp, and the unit directions P×3 to it."""
+    if position_mm is None:
+        raise ValueError("light from a lamp needs positions")
     away = lamp.position_mm.index_select(0, view) - position_mm
     square = (away * away).sum(-1).clamp_min(_NEAREST_MM**2)
     power = (lamp.irradiance * lamp.distance_mm**2).index_select(0, view)

@@ -119,8 +119,8 @@ def printer_from_table(
     """A printer from arrays 33×33×33×3 (clipped to [0, 1], see the module's head) and 33×33×33; black is read off."""
     lut = np.clip(np.asarray(lut, np.float64), 0, 1)
     paper = Paper(white_lab=white_lab, black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
-    tables = (torch.tensor(array, dtype=torch.float32) for array in (lut, np.asarray(gamut, np.float64)))
-    return Printer(name, method, *tables, paper, provenance)
+    distances = torch.tensor(np.asarray(gamut, np.float64), dtype=torch.float32)
+    return Printer(name, method, torch.tensor(lut, dtype=torch.float32), distances, paper, provenance)
 
 
 def vary(seen_linear: Tensor, change: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -30,8 +31,16 @@ def load_custom(dotted: str, base: Path, device: torch.device | str = "cpu") -> 
     if not isinstance(made, torch.nn.Module) or not isinstance(input_px, int) or not labels or isinstance(labels, str):
         do = "return a torch.nn.Module with input_px (an int) and labels (a list of names), or a Classifier"
         raise Refused(f"a network from {name}", f"a {type(made).__name__} without them", do)
-    network = made.eval().to(device)
-    return Classifier(name, weights_sha256(network), input_px, tuple(map(str, labels)), network)
+    return classifier_of(made.to(device), input_px, labels, name)
+
+
+def classifier_of(
+    network: torch.nn.Module, input_px: int, labels: Sequence[str], name: str = "python:network"
+) -> Classifier:
+    """A network in memory as a Classifier: it takes N×3×S×S sRGB in [0, 1], S = `input_px`, its normalization inside,
+    and returns N×K logits, K the number of `labels`. Put into evaluation mode.
+    """
+    return Classifier(name, weights_sha256(network), input_px, tuple(map(str, labels)), network.eval())
 
 
 def _factory(dotted: str, base: Path):

@@ -5,6 +5,7 @@
     torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py)
     timm:NAME
     module:package.factory the user's own code, which is imported and called (custom.py)
+    python:...             a Classifier given in Python beside the scene (custom.classifier_of)
 
 Paths are relative to the scene file's folder and may hold `${VAR}`. Networks come frozen: evaluation mode, no weight
 gradients. Several names are simply several classifiers.
@@ -24,8 +25,12 @@ from patchproof.classifier.network import Classifier
 from patchproof.strict import Refused, expand
 
 
-def load_classifier(name: str, base: Path, device: torch.device | str = "cpu") -> Classifier:
-    """The classifier of that name on `device`, refused in one sentence where it is missing or cannot be trusted."""
+def load_classifier(name: str | Classifier, base: Path, device: torch.device | str = "cpu") -> Classifier:
+    """The classifier of that name, or the one given, on `device`; refused in one sentence where it is missing or cannot
+    be trusted.
+    """
+    if isinstance(name, Classifier):
+        return _trusted(name, device)
     kind, _, rest = expand(name, Path(base)).partition(":")
     if name == "builtin":
         from patchproof.classifier.builtin import load_builtin
@@ -44,11 +49,17 @@ def load_classifier(name: str, base: Path, device: torch.device | str = "cpu") -
         from patchproof.classifier.custom import load_custom
 
         classifier = load_custom(rest, Path(base), device)
+    elif kind == "python":
+        raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
         known = "builtin, torchvision:NAME, timm:NAME, file:NAME.pt2 or module:package.factory"
         do = f'write "file:{name}"' if name.endswith(".pt2") else "write one of these"
         raise Refused(f"a model named {known}", f'"{name}"', do)
-    classifier = replace(classifier, name=name)
+    return _trusted(replace(classifier, name=name), device)
+
+
+def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
+    """The classifier frozen, doubted, and as fast as it can be called."""
     if isinstance(classifier.network, torch.nn.Module):
         classifier.network.requires_grad_(False)
     check_network(classifier, device)

@@ -12,7 +12,7 @@ import warnings
 import typer
 
 from patchproof.cli.calibrate import camera, printer
-from patchproof.cli.experiments import bench, harden, study
+from patchproof.cli.experiments import ListsStudies, bench, harden, keys, study
 from patchproof.cli.journey import demo, evaluate, optimize, plan, reprint, sheet, verify
 from patchproof.strict import Refused
 
@@ -20,7 +20,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Optimise a patch on a 3D object, print it at true size, photograph it, and judge the photographs.",
+    help="Optimize a patch on a 3D object, print it at true size, photograph it, and judge the photographs.",
 )
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
@@ -29,7 +29,9 @@ for _verb in (demo, plan, optimize, evaluate, sheet, reprint, verify):
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):
     _calibrate.command()(_verb)
-for _verb in (harden, study, bench):
+app.command()(harden)
+app.command(cls=ListsStudies)(study)
+for _verb in (keys, bench):
     app.command()(_verb)
 
 

@@ -1,4 +1,4 @@
-"""Hardened images, the paper's other experiments, and benchmarks."""
+"""Hardened images, studies, the page of all keys, and benchmarks."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer.core import TyperCommand
 
 from patchproof.cli.console import Cluster, Jobs, Overwrite, Resume, names_of, progress, say, say_study
 
@@ -62,8 +63,20 @@ def harden(
     raise typer.Exit(0 if finished.results else 1)
 
 
+class ListsStudies(TyperCommand):
+    """A command whose help ends with all studies."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """The usual help, then a line per study."""
+        from patchproof.study.study import STUDIES, first_line
+
+        super().format_help(ctx, formatter)
+        say("Studies (all keys of a config: patchproof keys NAME):")
+        say(*(f"  {name:<10} {first_line(module)}" for name, module in STUDIES.items()))
+
+
 def study(
-    name: Annotated[str, typer.Argument(help="A study's name.")],
+    name: Annotated[str, typer.Argument(help="One of the studies below.")],
     config: Annotated[Path, typer.Option(help="What to vary: a TOML file.")],
     out: Annotated[Path, typer.Option(help="Folder for tables, figures and the page.")],
     resume: Resume = False,
@@ -71,7 +84,7 @@ def study(
     jobs: Jobs = 1,
     cluster: Cluster = None,
 ) -> None:
-    """One of the paper's experiments: many cells, tables with intervals, figures and one page."""
+    """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
     from patchproof.study.study import Work, run_study
 
     with progress() as bar:
@@ -80,6 +93,15 @@ def study(
     say_study(finished)
     say(f"page: {out / name}.html")
     raise typer.Exit(0 if finished.results else 1)
+
+
+def keys(
+    name: Annotated[str | None, typer.Argument(help="scene, template, board or a study; without one, all.")] = None,
+) -> None:
+    """All keys of scene files, page templates and studies: range, unit, default and meaning, as Markdown."""
+    from patchproof.cli.keys import keys_page
+
+    print(keys_page(name), end="")
 
 
 def bench(

@@ -66,7 +66,8 @@ def plan(
 ) -> None:
     """What is modeled, what is not, and why."""
     from patchproof.output import check_file, write_whole
-    from patchproof.plan.plan import plan_lines, plan_scene
+    from patchproof.plan.lines import plan_lines
+    from patchproof.plan.plan import plan_scene
 
     if out is not None:
         check_file(out, overwrite)
@@ -86,7 +87,7 @@ def optimize(
     device: Device = "cpu",
     seed: Seed = None,
 ) -> None:
-    """Optimise the patch of a scene and promise its rate."""
+    """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.run import optimize_scene
     from patchproof.report.summary import promise_lines
 
@@ -99,7 +100,7 @@ def optimize(
             resume=resume,
             overwrite=overwrite,
             on_scene=lambda loaded: warn(loaded.warnings),
-            on_step=lambda step, total: bar("optimise", step.state.number, total),
+            on_step=lambda step, total: bar("optimize", step.state.number, total),
             on_promise=lambda done, total: bar("promise", done, total),
         )
     say(*promise_lines(run.promise), f"run: {out}")

@@ -9,14 +9,14 @@ with gloss, light that is added to all three channels in one place, are left out
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from scipy.special import ndtr
 
 from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
-from patchproof.evidence.results import PhotoEntry, SwatchSeen
+from patchproof.evidence.results import Color, Geometry, SwatchSeen
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
@@ -24,6 +24,7 @@ from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
 from patchproof.photo.rectify import rectify
 
+LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # light by code value
 _CELLS = (6, 48)  # least and most along the design's shorter side
 MOST_CLIPPED = 0.5  # share of the design at full white, where colour is unknown
 _MOST_CLIPPED_PAPER = 0.2
@@ -35,54 +36,52 @@ _GLOSS = 0.15  # linear light, paper = 1
 _POINTS = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7)), -1).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class Appearance:
-    """Fields of `PhotoEntry`, the clipped share of the design, pictures (uint8 sRGB; `delta_e00` float cells)."""
-
-    figures: dict[str, float | str | None]
-    clipped: float
-    pictures: dict[str, np.ndarray]
-
-
 def appearance(
-    srgb: np.ndarray, px_from_mm: np.ndarray, surface: Surface, promised: Promised, light: FrameLight, entry: PhotoEntry
-) -> Appearance:
-    """Colour difference of the whole design; figures stay null where more than half of it is clipped."""
+    srgb: np.ndarray,
+    px_from_mm: np.ndarray,
+    surface: Surface,
+    promised: Promised,
+    light: FrameLight,
+    geometry: Geometry,
+) -> tuple[Color, dict[str, np.ndarray]]:
+    """Colour difference of the whole design, None where more than half of it is clipped, and pictures (uint8 sRGB;
+    `delta_e00` float cells).
+    """
     part, px_from_mm = piece_only(srgb, px_from_mm, surface)
-    linear = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[part]
-    swatches = seen_swatches(part, linear, px_from_mm, surface, entry.blur_px, light.paper)
+    linear = LINEAR[part]
+    swatches = seen_swatches(part, linear, px_from_mm, surface, geometry.blur_px, light.paper)
     fit = color_fit(swatches, promised, light)
-    cells_per_mm = _cells_per_mm(surface, entry)
-    seen = fit.apply(rectify(linear, px_from_mm, surface.rect_mm, cells_per_mm).astype(float))
-    at_limit = rectify(
-        (part >= CLIPPED_CODE).any(-1)[..., None].astype(np.float32), px_from_mm, surface.rect_mm, cells_per_mm
-    )
-    clipped = at_limit.reshape(seen.shape[:2]) > 0.05
-    expected = _coarse(
-        promised.design, seen.shape[:2], entry.blur_px / entry.px_per_mm * promised.design.shape[1] / surface.rect_mm[2]
-    )
+    flat = partial(rectify, px_from_mm=px_from_mm, rect_mm=surface.rect_mm, px_per_mm=_cells_per_mm(surface, geometry))
+    seen = fit.apply(flat(linear).astype(float))
+    clipped = flat((part >= CLIPPED_CODE).any(-1, keepdims=True).astype(np.float32)).reshape(seen.shape[:2]) > 0.05
+    blur_mm = geometry.blur_px / geometry.px_per_mm
+    expected = _coarse(promised.design, seen.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
     delta = ciede2000(lab_from_linear(expected), lab_from_linear(seen))
     glossy = _glossy(seen, expected) & ~clipped
-    usable = ~clipped & ~glossy
+    usable = ~(clipped | glossy)
     usable[[0, -1]] = usable[:, [0, -1]] = False
     inner = np.s_[1:-1, 1:-1]
     share = float(clipped[inner].mean())
     if fit.name == "white_black" and light.clipped > _MOST_CLIPPED_PAPER:
         share = 1.0  # paper at full white is no reference
-    figures: dict = {"color_fit": fit.name, "clipped_share": share, "glossy_share": float(glossy[inner].mean())}
-    figures["swatches"] = _compared(fit, swatches, promised.swatches, surface.swatches_srgb)
-    if share <= MOST_CLIPPED and usable.any():
-        values = delta[usable]
-        figures |= {"delta_e00_mean": float(values.mean()), "delta_e00_p95": float(np.percentile(values, 95))}
-    picture_px_per_mm = _PICTURE_PX / max(surface.rect_mm[2:])
-    fitted = fit.apply(rectify(linear, px_from_mm, surface.rect_mm, picture_px_per_mm))
+    known = delta[usable] if share <= MOST_CLIPPED else delta[:0]
+    color = Color(
+        color_fit=fit.name,
+        clipped_share=share,
+        glossy_share=float(glossy[inner].mean()),
+        swatches=_compared(fit, swatches, promised.swatches, surface.swatches_srgb),
+        delta_e00_mean=float(known.mean()) if known.size else None,
+        delta_e00_p95=float(np.percentile(known, 95)) if known.size else None,
+    )
+    flat = partial(flat, px_per_mm=_PICTURE_PX / max(surface.rect_mm[2:]))
+    fitted = fit.apply(flat(linear))
     pictures = {
-        "seen": rectify(part, px_from_mm, surface.rect_mm, picture_px_per_mm),
+        "seen": flat(part),
         "fitted": _eight_bit(fitted),
         "promised": _eight_bit(_coarse(promised.design, fitted.shape[:2], 0.0)),
         "delta_e00": np.where(usable, delta, np.nan).astype(np.float32),
     }
-    return Appearance(figures, share, pictures)
+    return color, pictures
 
 
 def color_fit(swatches: np.ndarray, promised: Promised, light: FrameLight) -> ColorFit:
@@ -94,14 +93,14 @@ def color_fit(swatches: np.ndarray, promised: Promised, light: FrameLight) -> Co
 
 def _compared(fit: ColorFit, seen: np.ndarray, promised: np.ndarray, sent: np.ndarray) -> tuple[SwatchSeen, ...]:
     """Each readable swatch after the color fit beside its promise."""
-    found = []
+    compared = []
     for color, light, wanted in zip(sent, seen, promised, strict=True):
         if np.isfinite(light).all():
             fitted = np.clip(fit.apply(light), 0, 1)
             delta = ciede2000(lab_from_linear(wanted), lab_from_linear(fitted))
             colors = [tuple(c.tolist()) for c in (color, srgb_from_linear(wanted), srgb_from_linear(fitted))]
-            found.append(SwatchSeen(srgb=colors[0], promised=colors[1], seen=colors[2], delta_e00=float(delta)))
-    return tuple(found)
+            compared.append(SwatchSeen(srgb=colors[0], promised=colors[1], seen=colors[2], delta_e00=float(delta)))
+    return tuple(compared)
 
 
 def _glossy(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
@@ -114,7 +113,9 @@ def _glossy(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
 
 
-def seen_swatches(part, linear, px_from_mm, surface: Surface, blur_px: float, paper: np.ndarray) -> np.ndarray:
+def seen_swatches(
+    part: np.ndarray, linear: np.ndarray, px_from_mm: np.ndarray, surface: Surface, blur_px: float, paper: np.ndarray
+) -> np.ndarray:
     """Linear light N×3 of the piece's swatches; NaN where one is clipped, unresolved or out of the picture.
 
     Each is read clear of its border by blur and by JPEG's halved resolution of color, and what the blur still brings
@@ -124,12 +125,11 @@ def seen_swatches(part, linear, px_from_mm, surface: Surface, blur_px: float, pa
     return np.array([np.full(3, np.nan) if value is None else value for value in values]).reshape(-1, 3)
 
 
-def _swatch(part, linear, px_from_mm, rect, blur_px, paper) -> np.ndarray | None:
+def _swatch(part, linear, px_from_mm, rect, blur_px: float, paper) -> np.ndarray | None:
     """Linear light of a swatch's core; None where it has none, is clipped, or lies out of the picture."""
     x, y, w, h = rect
     quad = apply_homography(px_from_mm, rect_corners(rect))
-    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
-    sides = np.array([min(sides[0], sides[2]), min(sides[1], sides[3])])
+    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).reshape(2, 2).min(0)  # width, height
     if ((0.75 + _CHROMA_PX + 1.5 * blur_px) / sides > 0.4).any():
         return None
     edge = np.minimum((0.75 + _CHROMA_PX + 2.5 * blur_px) / sides, 0.4)  # shares of width, height
@@ -144,9 +144,10 @@ def _swatch(part, linear, px_from_mm, rect, blur_px, paper) -> np.ndarray | None
     return np.median((sample(linear, points) - (1 - own) * paper) / own, axis=0)
 
 
-def _cells_per_mm(surface: Surface, entry: PhotoEntry) -> float:
-    cell_mm = max(2.0, 2 * entry.blur_px) / entry.px_per_mm
-    cell_mm = max(cell_mm / np.sqrt(max(np.cos(np.radians(entry.tilt_deg)), 0.05)), 4 * entry.corner_uncertainty_mm)
+def _cells_per_mm(surface: Surface, geometry: Geometry) -> float:
+    cell_mm = max(2.0, 2 * geometry.blur_px) / geometry.px_per_mm
+    foreshortened = np.sqrt(max(np.cos(np.radians(geometry.tilt_deg)), 0.05))
+    cell_mm = max(cell_mm / foreshortened, 4 * geometry.corner_uncertainty_mm)
     side_mm = min(surface.rect_mm[2:])
     return float(np.clip(side_mm / cell_mm, *_CELLS)) / side_mm
 
@@ -159,15 +160,20 @@ def _coarse(design: np.ndarray, shape: tuple[int, int], blur_design_px: float) -
     return cv2.resize(design, (shape[1], shape[0]), interpolation=way).astype(float)
 
 
-def piece_only(srgb, px_from_mm, surface: Surface):
+def piece_only(srgb: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     """The part of the photo that holds the design and all swatches, and the homography to it."""
     corners = np.concatenate([rect_corners(r) for r in (surface.rect_mm, *surface.swatch_rects_mm)])
-    quad = apply_homography(px_from_mm, corners)
-    limit = np.array([srgb.shape[1], srgb.shape[0]])
-    low = np.clip(np.floor(quad.min(0)).astype(int) - 4, 0, limit - 1)
-    high = np.clip(np.ceil(quad.max(0)).astype(int) + 4, low + 1, limit)
-    shift = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1.0]])
-    return np.ascontiguousarray(srgb[low[1] : high[1], low[0] : high[0]]), shift @ px_from_mm
+    inside = part_around(apply_homography(px_from_mm, corners), 4, srgb.shape[:2])
+    shift = np.array([[1, 0, -inside[1].start], [0, 1, -inside[0].start], [0, 0, 1.0]])
+    return np.ascontiguousarray(srgb[inside]), shift @ px_from_mm
+
+
+def part_around(points_px: np.ndarray, margin_px: int, shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of a picture H×W that hold points N×2 (x, y) and a margin about them; at least a pixel."""
+    limit = np.array(shape[::-1])
+    low = np.clip(np.floor(points_px.min(0)).astype(int) - margin_px, 0, limit - 1)
+    high = np.clip(np.ceil(points_px.max(0)).astype(int) + margin_px, low + 1, limit)
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
 
 def _eight_bit(linear: np.ndarray) -> np.ndarray:

@@ -30,46 +30,23 @@ class View:
 
 def view_of(photo: Photo, camera: lens.Camera | None) -> View:
     """The photograph as the camera file has it; as EXIF has it where there is none, or it is another camera's."""
-    fitting = None if camera is None else _held(camera, photo)
-    if fitting is not None:
-        size_px = photo.srgb.shape[1], photo.srgb.shape[0]
-        matrix = lens.matrix_px(fitting, size_px) if size_px[0] != size_px[1] else None
-        if matrix is not None:
-            straight = Photo(_straightened(photo, fitting, matrix), float(matrix[0, 0]), photo.path)
-            return View(straight, matrix, True)
-    if photo.focal_px is not None:
-        return View(photo, _centered(photo.focal_px, photo), False)
-    return View(photo, None, False)
-
-
-def _centered(focal_px: float, photo: Photo) -> np.ndarray:
     height, width = photo.srgb.shape[:2]
-    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
-
-
-def _held(camera: lens.Camera, photo: Photo) -> lens.Camera | None:
-    """The camera as it was held for this photograph; None where it cannot have taken a picture of this shape."""
-    height, width = photo.srgb.shape[:2]
-    for held in (camera, _turned(camera)):
-        if abs(width * held.image_px[1] / (height * held.image_px[0]) - 1) <= lens.ASPECT_TOLERANCE:
-            return held
-    return None
+    if camera is not None and width != height:
+        for held in (camera, _turned(camera)):
+            if abs(width * held.image_px[1] / (height * held.image_px[0]) - 1) <= lens.ASPECT_TOLERANCE:
+                matrix = lens.matrix_px(held, (width, height))
+                straight = Photo(_straightened(photo, held, matrix), float(matrix[0, 0]), photo.path)
+                return View(straight, matrix, True)
+    focal = photo.focal_px
+    matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return View(photo, matrix, False)
 
 
 def _turned(camera: lens.Camera) -> lens.Camera:
     """The same camera whose pictures are turned by 90° clockwise: (x, y) becomes (height - y, x)."""
-    width, height = camera.image_px
-    return camera.model_copy(
-        update={
-            "image_px": (height, width),
-            "fx": camera.fy,
-            "fy": camera.fx,
-            "cx": height - camera.cy,
-            "cy": camera.cx,
-            "p1": camera.p2,
-            "p2": -camera.p1,
-        }
-    )
+    (width, height), cx, cy = camera.image_px, camera.cx, camera.cy
+    turned = camera.changed(image_px=(height, width), fx=camera.fy, fy=camera.fx, cx=height - cy, cy=cx)
+    return turned.changed(p1=camera.p2, p2=-camera.p1)
 
 
 def _straightened(photo: Photo, camera: lens.Camera, matrix: np.ndarray) -> np.ndarray:

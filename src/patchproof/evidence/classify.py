@@ -1,14 +1,15 @@
 """What the networks make of the photographs: the whole photo's centered square, as in training, one by one.
 
-In: a square of every network's input size. Out: `Prediction`s. The target's labels are looked up in each network's own
-list; the promise fixes them for its primary network. No batches: a photograph's figures must not depend on which
-others lie beside it (they did, by 2e-5), and on a processor batches are no faster.
+In: a square of every network's input size, and `Judges`. Out: `Prediction`s. The target's labels are looked up in each
+network's own list; the promise fixes them for its primary network. No batches: a photograph's figures must not depend
+on which others lie beside it (they did, by 2e-5), and on a processor batches are no faster.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,34 +21,60 @@ if TYPE_CHECKING:
     from patchproof.classifier import Classifier
 
 
+@dataclass(frozen=True)
+class Judges:
+    """Networks, the labels of each that count as recognized, and the one that the promise was made for."""
+
+    models: Sequence[Classifier]
+    indices: dict[str, tuple[int, ...]]
+    primary: Classifier
+
+    def predictions(self, squares: Mapping[int, np.ndarray]) -> dict[str, Prediction]:
+        """What every network says of one photograph, by name."""
+        return {model.name: predict(model, self.indices[model.name], squares[model.input_px]) for model in self.models}
+
+
+def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None:
+    """The networks as the sheet's judges; None where it promises nothing. Refused without the promise's own."""
+    if manifest.promise is None:
+        return None
+    promise, primary = manifest.promise, _primary(models, manifest.promise)
+    return Judges(models, {m.name: target_indices(m, promise, manifest.settings) for m in models}, primary)
+
+
+def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+    """The centered square of a picture H×W×3 (a view of it), and its left and top pixel."""
+    height, width = srgb.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    return srgb[top : top + side, left : left + side], (left, top)
+
+
 def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarray]:
     """The centered square of an uint8 photograph at each size, float32 3×S×S in [0, 1]."""
     import torch
 
     from patchproof.classifier import center_square
 
-    height, width = srgb.shape[:2]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    square = srgb[top : top + side, left : left + side]  # before it becomes float, which takes 4 times the memory
+    square, _ = square_of(srgb)  # before it becomes float, which takes 4 times the memory
     photo = torch.from_numpy(np.ascontiguousarray(square.transpose(2, 0, 1))).float().div_(255)[None]
     with torch.inference_mode():
         return {size: center_square(photo, size)[0].numpy() for size in sizes_px}
 
 
-def target_indices(model: Classifier, manifest: Manifest) -> tuple[int, ...]:
+def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:
     """The labels of `model` that count as recognized; for the promise's primary network those of the promise itself."""
     from patchproof.classifier import find_labels
 
-    target = manifest.promise.target
-    if model.name == manifest.promise.models[0].name and max(target.indices) < len(model.labels):
+    target = promise.target
+    if model.name == promise.models[0].name and max(target.indices) < len(model.labels):
         return target.indices
-    wanted = manifest.settings.get("target", {})
+    wanted = settings.get("target", {})
     return find_labels(model.labels, wanted.get("label", target.label), wanted.get("accept", ()))
 
 
-def check_primary(models: Sequence[Classifier], promise: Promise) -> None:
-    """Refuse a judge other than the one that the promise was made for."""
+def _primary(models: Sequence[Classifier], promise: Promise) -> Classifier:
+    """The judge that the promise was made for; refused where it is not there, or another under its name."""
     primary = promise.models[0]
     named = {model.name: model for model in models}
     if primary.name not in named:
@@ -58,6 +85,7 @@ def check_primary(models: Sequence[Classifier], promise: Promise) -> None:
             "another file under that name",
             "use the same weights, or make the sheet again",
         )
+    return named[primary.name]
 
 
 def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray) -> Prediction:

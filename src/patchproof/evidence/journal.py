@@ -1,7 +1,7 @@
 """What is finished of a verification, one flushed line per photograph, so that a kill costs the photographs in work.
 
 In: a file of JSON lines and a key that stands for everything a result depends on besides the photograph itself. Out:
-what an earlier run said of a photograph of the same name and the same bytes under the same key. Lines of other keys
+what an earlier run made of a photograph of the same name and the same bytes under the same key. Lines of other keys
 and a last line that was cut short do not count, so a photograph, network, sheet or option that changed since is looked
 at anew.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -22,7 +22,7 @@ from patchproof.output import make_folder, write_whole
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
-    from patchproof.classifier import Classifier
+    from patchproof.evidence.task import Options
     from patchproof.sheets.manifest import Manifest
 
 
@@ -33,20 +33,20 @@ class Journal:
         make_folder(path.parent)
         self._key, self._kept = key, {}
         for line in _lines(path) if resume else ():
-            if isinstance(line, dict) and line.get("key") == key and {"file", "sha256", "said"} <= line.keys():
+            if isinstance(line, dict) and line.get("key") == key and {"file", "sha256", "result"} <= line.keys():
                 self._kept[line["file"]] = line
         text = "".join(json.dumps(line) + "\n" for line in self._kept.values())
         write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
         self._file: TextIO = open(path, "a", encoding="utf-8")
 
     def find(self, name: str, photo: Path) -> Any:
-        """What was said of the photograph under that name; None where nothing was, or its bytes have changed."""
+        """The result of the photograph under that name; None where there is none, or its bytes have changed."""
         line = self._kept.get(name)
-        return line["said"] if line is not None and line["sha256"] == file_sha256(photo) else None
+        return line["result"] if line is not None and line["sha256"] == file_sha256(photo) else None
 
-    def add(self, name: str, photo: Path, said: Any) -> None:
-        """Keep JSON values for the photograph."""
-        line = {"file": name, "sha256": file_sha256(photo), "key": self._key, "said": said}
+    def add(self, name: str, sha256: str | None, result: Any) -> None:
+        """Keep JSON values for the photograph of those bytes."""
+        line = {"file": name, "sha256": sha256, "key": self._key, "result": result}
         self._file.write(json.dumps(line, allow_nan=False) + "\n")
         self._file.flush()
 
@@ -55,22 +55,20 @@ class Journal:
         self._file.close()
 
 
-def settings_key(
-    manifest: Manifest, models: Sequence[Classifier], printer: Printer | None, options: dict[str, Any]
-) -> str:
+def settings_key(manifest: Manifest, options: Options) -> str:
     """SHA-256 of what a photograph's result depends on besides its bytes.
 
     A network without a SHA-256 of its own (the user's code) is known by its name alone.
     """
-    networks = [(model.name, model.sha256, model.input_px) for model in models]
-    said = {
+    settings = {
         "versions": (patchproof.__version__, cv2.__version__, np.__version__),
         "manifest": manifest.model_dump(mode="json"),
-        "models": networks,
-        "printer": None if printer is None else _printer_sha256(printer),
-        "options": options,
+        "models": [(model.name, model.sha256, model.input_px) for model in options.models],
+        "printer": _printer_sha256(options.printer),
+        "scan_dpi": options.scan_dpi,
+        "camera": options.camera and options.camera.model_dump(mode="json"),
     }
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
 def file_sha256(path: Path) -> str | None:
@@ -98,10 +96,8 @@ def _lines(path: Path) -> list[Any]:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return []
-    found = []
+    lines = []
     for line in text.splitlines():
-        try:
-            found.append(json.loads(line))
-        except ValueError:  # cut short by a kill
-            continue
-    return found
+        with suppress(ValueError):  # cut short by a kill
+            lines.append(json.loads(line))
+    return lines

@@ -24,23 +24,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import product
 from math import factorial
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
+from patchproof.claims import LEAST_CLUSTERS, resampled_means
 from patchproof.color import linear_from_srgb
+from patchproof.evidence.classify import Judges
 from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.reproject import Reference, Shot, design_fit, light_fit, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
 from patchproof.evidence.surface import Promised, Surface, piece_picture, reduced
 from patchproof.sheets.manifest import Manifest
 
-if TYPE_CHECKING:
-    from patchproof.classifier import Classifier
+Values = Mapping[tuple[bool, ...], float]  # confidence by what is switched on
 
 GAMUT, PRINT, LIGHT, BLUR, PHOTO = "gamut", "print", "light_and_camera", "blur_and_noise", "photo"
 PRINT_AND_LIGHT = "print_light_and_camera"
-LEAST_PHOTOS = 5  # below, a bootstrap says nothing
+LEAST_PHOTOS = LEAST_CLUSTERS
 LEAST_SHARE = 0.05  # a culprit costs at least as much
 _RESAMPLES = 2000
 _USABLE = (None, "clipped", "blurred", "too_small")  # codes of photographs whose homography can still be believed
@@ -56,30 +57,34 @@ def ledger_of(
     manifest: Manifest,
     surface: Surface,
     promised: Promised,
-    model: Classifier,
-    indices: tuple[int, ...],
+    judges: Judges,
     confidence: Mapping[str, float],
 ) -> Ledger | None:
     """The ledger of photographs whose own target confidence is `confidence` by file; None where nothing can be said."""
-    conditions = [c for c in manifest.promise.conditions if c.contrast is not None and c.blur_px is not None]
-    if not shots or not conditions or promised.design is None:
+    if not shots or manifest.promise is None or manifest.design is None:
+        return None
+    claims = [
+        (c.contrast, c.blur_px) for c in manifest.promise.conditions if c.contrast is not None and c.blur_px is not None
+    ]
+    if not claims:
         return None
     undo = [light_fit(shot, promised) for shot in shots]
     relative = [fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)]
     inks = [fit.apply(shot.light.ink) for fit, shot in zip(undo, shots, strict=True)]
     printed = fit_print(relative, promised.swatches, np.median(inks, axis=0), promised.ink)
-    looks = _looks(manifest, surface, promised, printed)
+    looks = _looks(manifest.design.pixels(), surface, promised, printed)
+    camera = manifest.settings.get("camera", {})
     values = []
-    for shot, fit, reference in zip(shots, undo, _references(conditions, shots, manifest, promised), strict=True):
+    for shot, fit, reference in zip(shots, undo, _references(claims, shots, camera, promised), strict=True):
         print_light = fit if printed is not None else design_fit(shot, promised, surface)
         squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
-        values.append(_confidences(squares, model, indices))
+        values.append(_confidences(squares, judges))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
-    seen = np.array([confidence[shot.file] for shot in shots])
-    return _ledger(steps, values, seen, manifest.promise.target.goal.sign)
+    own = np.array([confidence[shot.file] for shot in shots])
+    return _ledger(steps, values, own, manifest.promise.target.goal.sign)
 
 
-def shapley(values: Mapping[tuple[bool, ...], float]) -> np.ndarray:
+def shapley(values: Values) -> np.ndarray:
     """Mean cost of switching each of k players on, over all orders; `values` has all 2^k combinations."""
     k = len(next(iter(values)))
     cost = np.zeros(k)
@@ -91,19 +96,22 @@ def shapley(values: Mapping[tuple[bool, ...], float]) -> np.ndarray:
     return cost
 
 
-def _ledger(steps, values, seen: np.ndarray, sign: float) -> Ledger:
-    parts = np.array([[*shapley(v), v[(True,) * len(steps)] - own] for v, own in zip(values, seen, strict=True)])
+def _ledger(steps: Sequence[str], values: Sequence[Values], photo: np.ndarray, sign: float) -> Ledger:
+    """The ledger of `values` by photograph, whose own confidences are `photo` (n)."""
+    parts = np.array([[*shapley(v), v[(True,) * len(steps)] - own] for v, own in zip(values, photo, strict=True)])
     parts, names = sign * parts, (*steps, PHOTO)
     means, resampled = parts.mean(0), None
+    intervals = [None] * len(names)
     if len(parts) >= LEAST_PHOTOS:
-        picks = np.random.default_rng(0).integers(0, len(parts), (_RESAMPLES, len(parts)))
-        resampled = parts[picks].mean(1)
-    shares = {}
-    for i, name in enumerate(names):
-        interval = None if resampled is None else tuple(float(v) for v in np.quantile(resampled[:, i], (0.025, 0.975)))
-        shares[name] = LedgerShare(share=float(means[i]), interval=interval)
-    ideal = float(np.mean([v[(False,) * len(steps)] for v in values]))
-    return Ledger(shares, _culprit(names, means, resampled), ideal, float(seen.mean()), len(values))
+        resampled = resampled_means(parts, _RESAMPLES)
+        intervals = np.quantile(resampled, (0.025, 0.975), axis=0).T.tolist()
+    return Ledger(
+        shares={n: LedgerShare(share=m, interval=i) for n, m, i in zip(names, means, intervals, strict=True)},
+        culprit=_culprit(names, means, resampled),
+        ideal=float(np.mean([v[(False,) * len(steps)] for v in values])),
+        photo=float(photo.mean()),
+        photos=len(values),
+    )
 
 
 def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | None) -> str | None:
@@ -121,9 +129,9 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
     return names[top] if clear and names[top] != PHOTO else None
 
 
-def _looks(manifest: Manifest, surface: Surface, promised: Promised, printed) -> dict[tuple[bool, ...], np.ndarray]:
+def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[tuple[bool, bool], np.ndarray]:
     """The piece's light by (gamut, print), or by (gamut, False) alone where the print is not known."""
-    design = reduced(linear_from_srgb(manifest.design.pixels() / 255.0).astype(np.float32))
+    design = reduced(linear_from_srgb(sent_srgb / 255.0))
     sent = piece_picture(surface, design, linear_from_srgb(surface.swatches_srgb), np.zeros(3))
     looks = {
         (False, False): sent,
@@ -134,38 +142,40 @@ def _looks(manifest: Manifest, surface: Surface, promised: Promised, printed) ->
     return looks
 
 
-def _references(conditions, shots: Sequence[Shot], manifest: Manifest, promised: Promised) -> list[Reference]:
-    """One of the promise's conditions for each photograph, spread evenly over their contrasts.
+def _references(
+    claims: Sequence[tuple[float, float]], shots: Sequence[Shot], camera: Mapping[str, Any], promised: Promised
+) -> list[Reference]:
+    """One of the promise's conditions (contrast, blur_px) for each photograph, spread evenly over their contrasts.
 
     The brightest photograph gets the brightest, and so on: paired by chance, a few photographs' light share is mostly
     the luck of the draw.
     """
-    conditions = sorted(conditions, key=lambda c: c.contrast)
-    spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(conditions)).astype(int)
+    claims = sorted(claims, key=lambda claim: claim[0])
+    spread = ((np.arange(len(shots)) + 0.5) / len(shots) * len(claims)).astype(int)
     rank = np.argsort(np.argsort([float(np.mean(shot.light.paper - shot.light.ink)) for shot in shots]))
-    camera = manifest.settings.get("camera", {})
     low, high = camera.get("noise", (0.0, 0.0))
     noise = low + (high - low) * np.random.default_rng(1).permutation(len(shots) * 2)[: len(shots)] / (2 * len(shots))
     references = []
     for shot, i, level in zip(shots, spread[rank], noise, strict=True):
         side = shot.square.shape[0]
         scale = side / min(camera["photo_px"]) if "photo_px" in camera else shot.scale
-        white = conditions[i].contrast / (1 - float(promised.ink.mean()))
-        references.append(Reference(white, conditions[i].blur_px * scale, float(level) * scale))
+        contrast, blur_px = claims[i]
+        white = contrast / (1 - float(promised.ink.mean()))
+        references.append(Reference(white, blur_px * scale, float(level) * scale))
     return references
 
 
-def _confidences(squares, model: Classifier, indices) -> dict[tuple[bool, ...], float]:
+def _confidences(squares: Mapping[tuple[bool, ...], np.ndarray], judges: Judges) -> Values:
     """Target confidence by combination; the switch for print is dropped where it was never on."""
     import torch
 
     from patchproof.classifier import center_square
 
-    keys = list(squares)
+    model, keys = judges.primary, list(squares)
     with torch.inference_mode():
         pictures = [torch.from_numpy(squares[key].transpose(2, 0, 1))[None].float() for key in keys]
         batch = torch.cat([center_square(picture, model.input_px) for picture in pictures])
-        found = model.confidence(model.logits(batch), indices).double().cpu().tolist()
-    if any(key[1] for key in keys):
-        return dict(zip(keys, found, strict=True))
-    return {(gamut, light, blur): v for (gamut, _, light, blur), v in zip(keys, found, strict=True)}
+        confidence = model.confidence(model.logits(batch), judges.indices[model.name]).double().cpu().tolist()
+    if not any(key[1] for key in keys):
+        keys = [(gamut, light, blur) for gamut, _, light, blur in keys]
+    return dict(zip(keys, confidence, strict=True))

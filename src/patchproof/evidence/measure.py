@@ -10,14 +10,15 @@ and leaving them out would flatter.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.ranges import PromisedRanges
-from patchproof.evidence.results import PhotoEntry
-from patchproof.evidence.scan import is_scan, page_scales
+from patchproof.evidence.results import Geometry, PhotoEntry, Pose, Remark, Scale
+from patchproof.evidence.scan import scan_scale
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import local_scale, plane_pose, view_angles
 from patchproof.photo.cannot import CannotJudge
@@ -40,21 +41,23 @@ MOST_SCALE_ERROR = 0.01
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
-_ADVICE = {
-    "blurred": "hold still, tap to focus on the patch, or use more light",
-    "too_small": "come closer or use the camera's full resolution",
-    "tilted": "look at the patch less from the side",
-}
+_COME_CLOSER = "come closer or use the camera's full resolution"
+_FEW = "show more of the frame: its markers fix where the patch lies"
+_FEW_AGREE = "too few markers agree to tell flat paper from bent: show all of the frame"
+_BENT = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
 
 
 @dataclass(frozen=True)
-class Measured:
-    """An entry without predictions, whether it is counted, pictures by kind, and the light on the frame where seen."""
+class MeasuredPhoto:
+    """An entry without predictions, whether it is counted, pictures by kind, the light on the frame where it was read,
+    and what the networks will see of it by side, where it was asked for.
+    """
 
     entry: PhotoEntry
     counted: bool
     pictures: dict[str, np.ndarray]
     light: FrameLight | None = None
+    squares: dict[int, np.ndarray] | None = None
 
 
 def measure(
@@ -64,60 +67,49 @@ def measure(
     promised: Promised | None,
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
-) -> Measured:
+) -> MeasuredPhoto:
     """Everything that one readable photograph says; `promised` None leaves colour unmeasured."""
     photo = view.photo
     try:
         found, surface = identify(photo.srgb, surface)
     except CannotJudge as cannot:
-        return Measured(_coded(PhotoEntry(file=name, status="rejected"), cannot), False, {})
+        return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(cannot)), False, {})
     size_px = photo.srgb.shape[1], photo.srgb.shape[0]
-    entry = PhotoEntry(file=name, status="judged", photo_px=size_px, markers_found=len(found.markers))
+    entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(found.markers))
     fit = _fit(found, surface)
     if fit is None:
-        few = CannotJudge(
-            "too_few_markers", len(found.markers), 1, "the marker in view is distorted: show the whole patch"
-        )
-        return Measured(_coded(entry, few), True, {})
+        advice = "the marker in view is distorted: show the whole patch"
+        few = CannotJudge("too_few_markers", len(found.markers), 1, advice)
+        return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True, {})
     light = frame_light(photo.srgb, found.markers.values())
-    unrolled = _unrolled(view.photo, found, surface)
+    unrolled = _unrolled(photo, found, surface)
     srgb, fit = (photo.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
-    entry = _with_geometry(entry, view, found, fit, light, surface)
-    if unrolled is not None:  # no homography maps the page to the photograph
-        figures = {"corner_uncertainty_mm": unrolled.uncertainty_mm, "curl_radius_mm": unrolled.radius_mm}
-        entry = entry.model_copy(update=figures | {"homography_px_from_mm": None, "scale_x_over_y": None})
+    geometry = _geometry(fit, unrolled, found, light, surface)
+    pose = _pose(view, fit, unrolled is None, surface)
+    entry = partial(entry, geometry=geometry, pose=pose)
     page_check = _is_uncut(fit, found, surface)
-    if page_check and surface.page_mm is not None:
-        try:
+    scale = None if scan_dpi is None else scan_scale(fit.px_from_mm, surface, scan_dpi)
+    counted = not page_check and scale is None
+    trouble = _trouble(geometry, fit, found, surface)
+    try:
+        if page_check and surface.page_mm is not None:
             refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
-        except CannotJudge as other:
-            return Measured(_coded(entry.model_copy(update={"status": "rejected"}), other), False, {})
-    if not surface.piece_ids:  # a page that shows none of the design's frame, or a part of it
-        promised = None
-    scan = scan_dpi is not None and is_scan(fit.px_from_mm, surface, scan_dpi)
-    counted = not (page_check or scan)
-    cannot, pictures = _trouble(entry, fit, found, surface), {}
-    if counted:
-        outside = ranges.violated(entry, trust_angles=cannot is None)
-        if outside is not None:
-            return Measured(_coded(entry.model_copy(update={"status": "rejected"}), outside), False, pictures)
-    if cannot is None and promised is not None and promised.design is not None:
-        look = appearance(srgb, fit.px_from_mm, surface, promised, light, entry)
-        entry, pictures = entry.model_copy(update=look.figures), look.pictures
-        if look.clipped > MOST_CLIPPED:
+        if counted and (outside := ranges.violated(entry(status="judged"), trust_angles=trouble is None)) is not None:
+            raise outside
+    except CannotJudge as cannot:
+        return MeasuredPhoto(entry(status="rejected", remark=Remark.of(cannot)), False, {})
+    color, pictures = None, {}
+    # a page in tiles shows none of the design's frame, or a part of it
+    if trouble is None and promised is not None and surface.piece_ids:
+        color, pictures = appearance(srgb, fit.px_from_mm, surface, promised, light, geometry)
+        if color.clipped_share > MOST_CLIPPED:
             advice = "the patch is overexposed: lower the exposure by one or two steps"
-            cannot = CannotJudge("clipped", look.clipped, MOST_CLIPPED, advice)
-    entry = _coded(entry, cannot) if cannot else entry.model_copy(update={"status": "measured"})
-    if scan and cannot is None:
-        entry = _with_scale(entry, *page_scales(fit.px_from_mm, surface, scan_dpi))
-    if not counted and entry.code is None and entry.advice is None:
-        advice = (
-            "a scan checks the print and is not counted"
-            if scan
-            else "a photo of the uncut page checks the print and is not counted"
-        )
-        entry = entry.model_copy(update={"advice": advice})
-    return Measured(entry, counted, pictures, light)
+            trouble = CannotJudge("clipped", color.clipped_share, MOST_CLIPPED, advice)
+    if trouble is not None:
+        entry = partial(entry, status="judged", remark=Remark.of(trouble))
+    else:
+        entry = partial(entry, status="measured", scale=scale, remark=_print_check(page_check, scale))
+    return MeasuredPhoto(entry(color=color), counted, pictures, light)
 
 
 def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
@@ -132,15 +124,11 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[Found, Surface]:
         found = find_sheet(srgb, wanted, surface.corners_mm, surface.dictionary)
     if not found.markers:
         if is_mirrored(srgb, surface.all_ids, surface.dictionary):
-            raise CannotJudge(
-                "mirrored",
-                None,
-                None,
-                "the photo is mirrored: switch off the camera's mirror setting and save it again",
-            )
-        said = read_label(srgb)
-        if found.foreign or (said is not None and said != surface.label):
-            which = "another sheet" if said is None else f"sheet {said.sheet_id} ({said.printed})"
+            advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
+            raise CannotJudge("mirrored", None, None, advice)
+        label = read_label(srgb)
+        if found.foreign or (label is not None and label != surface.label):
+            which = "another sheet" if label is None else f"sheet {label.sheet_id} ({label.printed})"
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
             raise CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
         raise CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
@@ -192,71 +180,72 @@ def _is_uncut(fit: PageFit, found: Found, surface: Surface) -> bool:
     return bool(pages) or not (found.markers.keys() & surface.piece_ids)
 
 
-def _with_geometry(
-    entry: PhotoEntry, view: View, found: Found, fit: PageFit, light: FrameLight, surface: Surface
-) -> PhotoEntry:
+def _geometry(fit: PageFit, unrolled: Unrolled | None, found: Found, light: FrameLight, surface: Surface) -> Geometry:
     px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
-    figures = {
-        "residual_mm": fit.residual_mm,
-        "px_per_mm": px_per_mm,
-        "tilt_deg": tilt_deg,
-        "contrast": light.contrast,
-        "blur_px": blur_px(found.markers.values()),
-        "corner_uncertainty_mm": corner_uncertainty_mm(fit, surface.rect_mm),
-        "homography_px_from_mm": tuple(tuple(float(v) for v in row) for row in fit.px_from_mm),
-    }
-    if view.matrix_px is not None:
-        azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
-        angle, length = view_uncertainty(fit, view.matrix_px, surface.center_mm)
-        figures |= {
-            "azimuth_deg": azimuth if angle <= MOST_AZIMUTH_ERROR_DEG else None,
-            "azimuth_uncertainty_deg": angle,
-            "distance_mm": distance if length <= MOST_DISTANCE_ERROR * distance else None,
-        }
-    if view.calibrated:
+    shown = partial(
+        Geometry,
+        residual_mm=fit.residual_mm,
+        px_per_mm=px_per_mm,
+        tilt_deg=tilt_deg,
+        contrast=light.contrast,
+        blur_px=blur_px(found.markers.values()),
+    )
+    if unrolled is not None:  # no homography maps the page to the photograph
+        return shown(corner_uncertainty_mm=unrolled.uncertainty_mm, curl_radius_mm=unrolled.radius_mm)
+    return shown(
+        corner_uncertainty_mm=corner_uncertainty_mm(fit, surface.rect_mm), homography_px_from_mm=fit.px_from_mm.tolist()
+    )
+
+
+def _pose(view: View, fit: PageFit, flat: bool, surface: Surface) -> Pose | None:
+    """Where the camera stood; None where its focal length is not known."""
+    if view.matrix_px is None:
+        return None
+    azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
+    angle, length = view_uncertainty(fit, view.matrix_px, surface.center_mm)
+    ratio = None
+    if view.calibrated and flat:
         ratio, uncertainty = x_over_y(fit, view.matrix_px, FOCAL_ERROR)
-        figures["scale_x_over_y"] = ratio if uncertainty <= MOST_RATIO_ERROR else None
-    return entry.model_copy(update=figures)
+        ratio = ratio if uncertainty <= MOST_RATIO_ERROR else None
+    return Pose(
+        azimuth_uncertainty_deg=angle,
+        azimuth_deg=azimuth if angle <= MOST_AZIMUTH_ERROR_DEG else None,
+        distance_mm=distance if length <= MOST_DISTANCE_ERROR * distance else None,
+        scale_x_over_y=ratio,
+    )
 
 
-def _trouble(entry: PhotoEntry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
+def _trouble(geometry: Geometry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
     """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
-    side_mm = min(surface.rect_mm[2:])
-    module_px = float(np.median([b.module_px for b in found.markers.values()]))
-    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
-    uncertain = entry.corner_uncertainty_mm > most_uncertain
-    if entry.tilt_deg > MOST_TILT_DEG:
-        return CannotJudge("tilted", entry.tilt_deg, MOST_TILT_DEG, _ADVICE["tilted"])
-    if entry.blur_px > MOST_BLUR * module_px:
-        return CannotJudge("blurred", entry.blur_px, MOST_BLUR * module_px, _ADVICE["blurred"])
-    if side_mm * entry.px_per_mm < SMALLEST_DESIGN_PX:
-        return CannotJudge("too_small", side_mm * entry.px_per_mm, SMALLEST_DESIGN_PX, _ADVICE["too_small"])
-    agreeing = len(fit.inlier_ids)
+    tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
+    side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
+    most_blur = MOST_BLUR * float(np.median([b.module_px for b in found.markers.values()]))
+    side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
+    agreeing, markers = len(fit.inlier_ids), len(found.markers)
     least = min(LEAST_MARKERS, len(surface.piece_ids) or 1)
-    if agreeing < least:
-        advice = "too few markers agree to tell flat paper from bent: show all of the frame"
-        return CannotJudge("too_few_markers", agreeing, least, advice)
-    if entry.residual_mm > MOST_RESIDUAL * side_mm or agreeing < 0.5 * len(found.markers):
-        advice = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
-        return CannotJudge("curled", entry.residual_mm, MOST_RESIDUAL * side_mm, advice)
-    if uncertain and len(found.markers) < 3:
-        return CannotJudge(
-            "too_few_markers", len(found.markers), 3, "show more of the frame: its markers fix where the patch lies"
-        )
-    if uncertain:
-        return CannotJudge("too_small", entry.corner_uncertainty_mm, most_uncertain, _ADVICE["too_small"])
+    bent = residual > most_residual or agreeing < 0.5 * markers
+    most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
+    uncertain = uncertainty > most_uncertain
+    for wrong, code, figure, limit, advice in (
+        (tilt > MOST_TILT_DEG, "tilted", tilt, MOST_TILT_DEG, "look at the patch less from the side"),
+        (blur > most_blur, "blurred", blur, most_blur, "hold still, tap to focus on the patch, or use more light"),
+        (side_px < SMALLEST_DESIGN_PX, "too_small", side_px, SMALLEST_DESIGN_PX, _COME_CLOSER),
+        (agreeing < least, "too_few_markers", agreeing, least, _FEW_AGREE),
+        (bent, "curled", residual, most_residual, _BENT),
+        (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW),
+        (uncertain, "too_small", uncertainty, most_uncertain, _COME_CLOSER),
+    ):
+        if wrong:
+            return CannotJudge(code, figure, limit, advice)
     return None
 
 
-def _with_scale(entry: PhotoEntry, scale_x: float, scale_y: float) -> PhotoEntry:
-    entry = entry.model_copy(update={"scale_x": scale_x, "scale_y": scale_y})
-    worst = max((scale_x, scale_y), key=lambda scale: abs(scale - 1))
-    if abs(worst - 1) <= MOST_SCALE_ERROR:
-        return entry
-    advice = f'it is printed {worst:.3f} times its size: print again at 100 %, "actual size", not "fit to page"'
-    return _coded(entry, CannotJudge("scale_off", worst, MOST_SCALE_ERROR, advice))
-
-
-def _coded(entry: PhotoEntry, cannot: CannotJudge) -> PhotoEntry:
-    codes = {"code": cannot.code, "figure": cannot.figure, "threshold": cannot.threshold, "advice": cannot.advice}
-    return entry.model_copy(update=codes)
+def _print_check(page_check: bool, scale: Scale | None) -> Remark | None:
+    """What a photograph that is not counted says of the print; None for one that is."""
+    if scale is not None:
+        worst = max((scale.scale_x, scale.scale_y), key=lambda scale: abs(scale - 1))
+        if abs(worst - 1) > MOST_SCALE_ERROR:
+            advice = f'it is printed {worst:.3f} times its size: print again at 100 %, "actual size", not "fit to page"'
+            return Remark(code="scale_off", figure=worst, threshold=MOST_SCALE_ERROR, advice=advice)
+        return Remark(advice="a scan checks the print and is not counted")
+    return Remark(advice="a photo of the uncut page checks the print and is not counted") if page_check else None

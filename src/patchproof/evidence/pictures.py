@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
-from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.surface import Surface
 from patchproof.geometry import apply_homography, rect_corners
 
@@ -13,15 +13,15 @@ THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its densi
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 
 
-def thumbnail(srgb: np.ndarray, entry: PhotoEntry, surface: Surface) -> np.ndarray:
-    """The photograph reduced, with the outline of the design and of the piece's markers where they were found."""
+def thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
+    """The photograph reduced, with the outline of the design and of the piece's markers where they are known to lie."""
     shrink = min(1.0, THUMBNAIL_PX / max(srgb.shape[:2]))
     size = max(1, round(srgb.shape[1] * shrink)), max(1, round(srgb.shape[0] * shrink))
     sparse = max(1, int(0.5 / shrink))  # all of 12 megapixels took a tenth of the whole measurement's time
     small = cv2.resize(srgb[::sparse, ::sparse], size, interpolation=cv2.INTER_AREA)
-    if entry.homography_px_from_mm is None:
+    if px_from_mm is None:
         return small
-    small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.array(entry.homography_px_from_mm)
+    small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.asarray(px_from_mm)
     for marker_id in sorted(surface.piece_ids):
         _outline(small, small_from_mm, surface.corners_mm[marker_id], _MARKER_COLOR, 1)
     _outline(small, small_from_mm, rect_corners(surface.rect_mm), _DESIGN_COLOR, 2)

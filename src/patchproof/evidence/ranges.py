@@ -7,7 +7,7 @@ every photograph at one size, so a photograph with more pixels than the promised
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,6 @@ MARGIN = 0.10  # of the range's width
 _LEAST_ANGLE_MARGIN_DEG = 3.0  # a nearly frontal view's tilt is no better known than this
 _LEAST_SCALE_MARGIN = 0.10  # of the value itself
 _NEAREST = 15  # conditions per photo: enough to smooth single draws, few enough to stay near
-_MATCHED_ON = ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast", "blur_px")
 _ADVICE = {
     "px_per_mm": ("come closer", "step back"),
     "tilt_deg": ("look more from the side", "look less from the side"),
@@ -40,13 +39,13 @@ class PromisedRanges:
 
     def violated(self, entry: PhotoEntry, trust_angles: bool) -> CannotJudge | None:
         """The first figure of the photo that the promise does not cover."""
-        entry = at_side(entry, self.side_px)
+        figures = _figures(entry, self.side_px)
         for name, (low, high) in self.limits.items():
-            value = getattr(entry, name)
+            value = figures.get(name)
             if value is None or (name != "px_per_mm" and not trust_angles):
                 continue
-            if name == "azimuth_deg":  # a photograph is left out only where it is sure to lie outside
-                low, high = low - (entry.azimuth_uncertainty_deg or 0), high + (entry.azimuth_uncertainty_deg or 0)
+            if name == "azimuth_deg" and entry.pose is not None:  # left out only where it is sure to lie outside
+                low, high = low - entry.pose.azimuth_uncertainty_deg, high + entry.pose.azimuth_uncertainty_deg
             if low <= value <= high:
                 continue
             below = value < low
@@ -61,17 +60,9 @@ def promised_side_px(manifest: Manifest) -> float | None:
     """Pixels of the shorter side of the photographs that were promised; None where the settings do not say."""
     camera = manifest.settings.get("camera")
     sides = camera.get("photo_px") if isinstance(camera, dict) else None
-    known = isinstance(sides, list | tuple) and sides and all(isinstance(v, int | float) and v >= 1 for v in sides)
-    return float(min(sides)) if known else None
-
-
-def at_side(entry: PhotoEntry, side_px: float | None) -> PhotoEntry:
-    """The entry with pixels per millimetre and blur as a photograph of that shorter side would show them."""
-    if side_px is None or entry.photo_px is None:
-        return entry
-    figures = {name: getattr(entry, name) for name in ("px_per_mm", "blur_px")}
-    scale = side_px / min(entry.photo_px)
-    return entry.model_copy(update={name: scale * value for name, value in figures.items() if value is not None})
+    if not isinstance(sides, list | tuple) or not sides:
+        return None
+    return float(min(sides)) if all(isinstance(v, int | float) and v >= 1 for v in sides) else None
 
 
 def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None = None) -> PromisedRanges:
@@ -91,15 +82,28 @@ def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None 
     return PromisedRanges(limits, side_px)
 
 
-def matched_rate(entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim]) -> float | None:
+def matched_rate(
+    entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim], side_px: float | None = None
+) -> float | None:
     """Mean over photos of the rate at their nearest promised conditions; None where nothing can be compared."""
-    rates = [_rate_near(entry, conditions) for entry in entries]
+    rates = [_rate_near(_figures(entry, side_px), conditions) for entry in entries]
     rates = [rate for rate in rates if rate is not None]
     return float(np.mean(rates)) if rates else None
 
 
-def _rate_near(entry: PhotoEntry, conditions: Sequence[ConditionClaim]) -> float | None:
-    names = [n for n in _MATCHED_ON if getattr(entry, n) is not None]
+def _figures(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
+    """The known ones of the figures that conditions have, pixels as a photograph of that shorter side shows them."""
+    geometry, azimuth_deg = entry.geometry, entry.pose and entry.pose.azimuth_deg
+    if geometry is None:
+        return {}
+    scale = 1.0 if side_px is None or entry.photo_px is None else side_px / min(entry.photo_px)
+    figures = {"px_per_mm": scale * geometry.px_per_mm, "tilt_deg": geometry.tilt_deg}
+    figures |= {} if azimuth_deg is None else {"azimuth_deg": azimuth_deg}
+    return figures | {"contrast": geometry.contrast, "blur_px": scale * geometry.blur_px}
+
+
+def _rate_near(figures: Mapping[str, float], conditions: Sequence[ConditionClaim]) -> float | None:
+    names = list(figures)
     full = [c for c in conditions if all(getattr(c, n) is not None for n in names)]
     if len(full) < len(conditions) / 2:  # the promise does not have all of the photo's figures: use those it has
         names = [n for n in names if sum(getattr(c, n) is not None for c in conditions) > len(conditions) / 2]
@@ -108,6 +112,6 @@ def _rate_near(entry: PhotoEntry, conditions: Sequence[ConditionClaim]) -> float
         return None
     table = np.array([[getattr(c, n) for n in names] for c in full])
     spread = np.maximum(table.std(0), 1e-9)
-    distance = np.linalg.norm((table - [getattr(entry, n) for n in names]) / spread, axis=1)
+    distance = np.linalg.norm((table - [figures[n] for n in names]) / spread, axis=1)
     nearest = np.argsort(distance, kind="stable")[:_NEAREST]
     return float(np.mean([full[i].recognized for i in nearest]))

@@ -17,11 +17,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
-from patchproof.color import LUMINANCE, linear_from_srgb, srgb_from_linear
-from patchproof.evidence.appearance import piece_only, seen_swatches
-from patchproof.evidence.results import PhotoEntry
+from patchproof.color import LUMINANCE, srgb_from_linear
+from patchproof.evidence.appearance import LINEAR, part_around, piece_only, seen_swatches
+from patchproof.evidence.classify import square_of
 from patchproof.evidence.surface import Promised, Surface
+from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
@@ -35,7 +37,6 @@ _LEAST_AGREEMENT = 0.6  # of marker cells with the print, where right homographi
 _LEAST_NOISE = 0.004  # of linear light: code values and JPEG
 _DARKEST, _PATCH = 0.002, 5  # share of a photograph that noise may bring under its veil, in means over so many pixels
 _SUPERSAMPLE = 2
-_LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -65,32 +66,36 @@ class Reference:
     noise: float
 
 
-def shot_of(srgb: np.ndarray, entry: PhotoEntry, light: FrameLight, surface: Surface, input_px: int) -> Shot | None:
-    """What the ledger keeps of an uint8 photograph whose entry has a homography and a blur.
+def shot_of(
+    file: str,
+    srgb: np.ndarray,
+    px_from_mm: ArrayLike,
+    blur_px: float,
+    light: FrameLight,
+    surface: Surface,
+    size_px: int,
+) -> Shot | None:
+    """What the ledger keeps of an uint8 photograph for a network of that input size.
 
     None where the markers do not lie where the homography says: few blurred corners can turn it far away.
     """
-    height, width = srgb.shape[:2]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    work = min(side, FINER * input_px)
-    square = srgb[top : top + side, left : left + side]
-    if work < side:
+    square, (left, top) = square_of(srgb)
+    work = min(len(square), FINER * size_px)
+    scale = work / len(square)
+    if scale < 1:
         square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
-    scale = work / side
-    homography = np.array(entry.homography_px_from_mm)
+    homography = np.asarray(px_from_mm)
     to_square = np.array([[scale, 0, -left * scale], [0, scale, -top * scale], [0, 0, 1.0]])
     part, part_from_mm = piece_only(srgb, homography, surface)
-    blur_px = entry.blur_px
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
-    unmixed = pattern_light(srgb, homography, on_piece, surface.dictionary, entry.blur_px)
+    unmixed = pattern_light(srgb, homography, on_piece, surface.dictionary, blur_px)
     if unmixed is not None:
         if unmixed.agreement < _LEAST_AGREEMENT:
             return None
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
-    swatches = seen_swatches(part, _LINEAR[part], part_from_mm, surface, blur_px, light.paper)
+    swatches = seen_swatches(part, LINEAR[part], part_from_mm, surface, blur_px, light.paper)
     square = np.ascontiguousarray(square)
-    return Shot(entry.file, square, to_square @ homography, light, blur_px * scale, noise_of(square), swatches, scale)
+    return Shot(file, square, to_square @ homography, light, blur_px * scale, noise_of(square), swatches, scale)
 
 
 def noise_of(srgb: np.ndarray) -> float:
@@ -99,7 +104,7 @@ def noise_of(srgb: np.ndarray) -> float:
     Immerkaer, Fast Noise Variance Estimation, CVIU 64 (1996) 300-302, with a low quantile in place of the mean: a
     fifth of most photographs is smooth, and texture would count as noise.
     """
-    luminance = (_LINEAR[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
+    luminance = (LINEAR[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # of white noise, it makes 6 times as much
     detail = np.abs(cv2.filter2D(luminance, -1, mask)[1:-1, 1:-1])
     return float(np.quantile(detail, 0.2) / 0.2533 / 6)
@@ -113,7 +118,7 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
     """
     paper, ink = shot.light.paper, shot.light.ink
     # means, since noise that is cut off at zero lifts dark ink as it lifts them
-    darkest = np.quantile(cv2.blur(_LINEAR[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
+    darkest = np.quantile(cv2.blur(LINEAR[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
     veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
@@ -121,15 +126,14 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
 def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:
     """Print, light and camera together, from the design's own coarse colors; paper and ink where these do not do."""
     cells_per_mm = _CELLS / min(surface.rect_mm[2:])
-    seen = rectify(_LINEAR[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
+    seen = rectify(LINEAR[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
     expected = cv2.resize(promised.design, seen.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
-    inner = np.s_[1:-1, 1:-1]  # the rim has the white of the frame in it
-    frame = [[shot.light.paper, shot.light.ink], [np.ones(3), promised.ink]]  # which is put back, too
-    sides = [
-        np.concatenate([a[inner].reshape(-1, 3), *[f] * _CELLS]) for a, f in zip((seen, expected), frame, strict=True)
-    ]
-    fit = affine12(*sides)
-    return fit or light_fit(shot, promised)
+    # the rim has the white of the frame in it, which is put back, too
+    frame = [shot.light.paper, shot.light.ink], [np.ones(3), promised.ink]
+    pairs = zip((seen, expected), frame, strict=True)
+    return affine12(*(np.concatenate([c[1:-1, 1:-1].reshape(-1, 3), *[f] * _CELLS]) for c, f in pairs)) or light_fit(
+        shot, promised
+    )
 
 
 def squares_with(
@@ -146,13 +150,13 @@ def squares_with(
     light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
     """
     box = _box(shot, rect_mm)
-    seen = _LINEAR[shot.square]
+    seen = LINEAR[shot.square]
     around = {}
     for blur, picture in ((True, seen), (False, deblurred(seen, shot.blur_px, reference.blur_px, shot.noise))):
         around[True, blur] = picture
         around[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
     coded = {key: srgb_from_linear(picture) for key, picture in around.items()}
-    grain = np.random.default_rng(0).standard_normal((*box.shape, 3), np.float32)
+    grain = np.random.default_rng(0).standard_normal(seen[box].shape, np.float32)
     lit = {True: _inverse(print_light), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
     out = {}
     for (gamut, printed), look in looks.items():
@@ -162,13 +166,13 @@ def squares_with(
             share = layer[..., 3:]
             for light, matrix in lit.items():
                 color = layer[..., :3] @ matrix[:, :3].T + share * matrix[:, 3]
-                mixed = color + (1 - share) * around[light, blur][box.slices]
+                mixed = color + (1 - share) * around[light, blur][box]
                 # what the photograph's noise is at the reference's light, and the other way round
                 level = float(np.clip(np.mean(mixed), 0, 1))
                 noise = shot.noise if blur else reference.noise * np.sqrt(level + _READ_SHARE_SQUARE)
                 mixed = mixed + share * noise * grain
                 picture = coded[light, blur].copy()
-                picture[box.slices] = srgb_from_linear(np.clip(mixed, 0, 1))
+                picture[box] = srgb_from_linear(np.clip(mixed, 0, 1))
                 out[gamut, printed, light, blur] = picture
     return out
 
@@ -182,7 +186,7 @@ def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) ->
     if from_px <= to_px:
         return _blurred(linear, float(np.sqrt(to_px**2 - from_px**2)))
     margin = int(np.ceil(6 * from_px))
-    wide = cv2.copyMakeBorder(linear, *[margin] * 4, cv2.BORDER_REFLECT)
+    wide = cv2.copyMakeBorder(linear, margin, margin, margin, margin, cv2.BORDER_REFLECT)
     height, width = wide.shape[:2]
     square = np.fft.fftfreq(height)[:, None] ** 2 + np.fft.rfftfreq(width) ** 2  # cycles per pixel, squared
     power = np.maximum(linear.var(), 1e-4) / (2 * np.pi * np.log(min(height, width) / 2))
@@ -193,44 +197,20 @@ def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) ->
     return np.clip(back[margin:-margin, margin:-margin], 0, 1).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class _Box:
-    """A part of a square."""
-
-    x0: int
-    y0: int
-    x1: int
-    y1: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.y1 - self.y0, self.x1 - self.x0
-
-    @property
-    def slices(self):
-        return np.s_[self.y0 : self.y1, self.x0 : self.x1]
-
-
-def _box(shot: Shot, rect_mm) -> _Box:
+def _box(shot: Shot, rect_mm) -> tuple[slice, slice]:
     """The part of the square that holds the piece and what blur carries beyond it."""
-    from patchproof.geometry import apply_homography, rect_corners
-
-    quad, side = apply_homography(shot.px_from_mm, rect_corners(rect_mm)), shot.square.shape[0]
-    margin = 3 + int(4 * max(shot.blur_px, 2.0))
-    low = np.clip(np.floor(quad.min(0)).astype(int) - margin, 0, side - 1)
-    high = np.clip(np.ceil(quad.max(0)).astype(int) + margin, low + 1, side)
-    return _Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    quad = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
+    return part_around(quad, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape[:2])
 
 
-def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: _Box) -> np.ndarray:
+def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, slice]) -> np.ndarray:
     """H×W×4: the look's light times its share of each pixel, and the share."""
     x, y, w, h = rect_mm
-    height, width = box.shape
+    top, left = box[0].start, box[1].start
+    height, width = box[0].stop - top, box[1].stop - left
     look = _no_finer_than(look, px_from_mm, rect_mm)
     mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
-    to_fine = np.array(
-        [[_SUPERSAMPLE, 0, -_SUPERSAMPLE * box.x0], [0, _SUPERSAMPLE, -_SUPERSAMPLE * box.y0], [0, 0, 1]]
-    )
+    to_fine = np.array([[_SUPERSAMPLE, 0, -_SUPERSAMPLE * left], [0, _SUPERSAMPLE, -_SUPERSAMPLE * top], [0, 0, 1]])
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centers
     matrix = np.linalg.inv(half) @ to_fine @ px_from_mm @ mm_from_texel @ half
     # one texel of margin repeats the rim, so that interpolation does not darken it; the share cuts it off again
@@ -244,12 +224,10 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: _Box) -> np.n
 
 def _no_finer_than(look: np.ndarray, px_from_mm: np.ndarray, rect_mm) -> np.ndarray:
     """The look averaged to about a texel per supersampled pixel, so that warping it does not alias."""
-    from patchproof.geometry import apply_homography, rect_corners
-
     quad = apply_homography(px_from_mm, rect_corners(rect_mm))
     sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1) * _SUPERSAMPLE
-    width, height = int(np.ceil(max(sides[0], sides[2]))), int(np.ceil(max(sides[1], sides[3])))
-    width, height = min(look.shape[1], max(width, 2)), min(look.shape[0], max(height, 2))
+    width, height = (max(2, int(np.ceil(side))) for side in sides.reshape(2, 2).max(0))
+    width, height = min(look.shape[1], width), min(look.shape[0], height)
     return cv2.resize(look.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 

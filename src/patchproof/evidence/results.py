@@ -6,15 +6,17 @@ except in page checks.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from patchproof.photo.cannot import CannotJudge
 from patchproof.strict import Finite, Strict
 
 Status = Literal["judged", "measured", "rejected"]
+Word = Literal["kept", "broken", "cannot_tell"]
+Effect = Literal["shown", "not_shown", "not_tested"]
 Row = tuple[Finite, Finite, Finite]
 
 
@@ -36,39 +38,116 @@ class SwatchSeen(Strict):
     delta_e00: Finite
 
 
+class Geometry(Strict):
+    """Where the sheet lies in a photograph, how sure that is, and how sharp and bright the print's frame came out."""
+
+    residual_mm: Finite
+    px_per_mm: Finite
+    tilt_deg: Finite
+    contrast: Finite
+    blur_px: Finite
+    corner_uncertainty_mm: Finite
+    curl_radius_mm: Finite | None = None  # of paper that was unrolled; negative where it is hollow
+    homography_px_from_mm: tuple[Row, Row, Row] | None = None  # null for paper that was unrolled
+
+
+class Pose(Strict):
+    """What a camera of known focal length says besides; null where it cannot tell."""
+
+    azimuth_uncertainty_deg: Finite  # 95 %, from the corners alone
+    azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right
+    distance_mm: Finite | None = None
+    scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
+
+
+class Scale(Strict):
+    """Printed length over intended length along the page."""
+
+    scale_x: Finite
+    scale_y: Finite
+
+
+class Color(Strict):
+    """The design's color against its promise after a fit; no difference where too much of it is clipped."""
+
+    color_fit: str
+    clipped_share: Finite  # of the design
+    glossy_share: Finite
+    swatches: tuple[SwatchSeen, ...] = ()
+    delta_e00_mean: Finite | None = None
+    delta_e00_p95: Finite | None = None
+
+
+class Remark(Strict):
+    """What to do about a photograph; where something is wrong with it, its code, the figure that decided, its limit."""
+
+    advice: str
+    code: str | None = None
+    figure: Finite | None = None
+    threshold: Finite | None = None
+
+    @classmethod
+    def of(cls, cannot: CannotJudge) -> Remark:
+        """The remark that says why."""
+        return cls(code=cannot.code, figure=cannot.figure, threshold=cannot.threshold, advice=cannot.advice)
+
+
+_PARTS: dict[str, type[Strict]] = {
+    "geometry": Geometry,
+    "pose": Pose,
+    "scale": Scale,
+    "color": Color,
+    "remark": Remark,
+}
+# one photograph in report.json, in this order
+KEYS = """
+    file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
+    scale_x_over_y tilt_deg azimuth_deg azimuth_uncertainty_deg distance_mm contrast blur_px corner_uncertainty_mm
+    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share swatches homography_px_from_mm
+    predictions""".split()
+
+
 class PhotoEntry(Strict):
-    """One photograph; a rejected one is not counted."""
+    """One photograph in the parts that were measured; a rejected one is not counted.
+
+    As JSON the figures of all parts lie side by side, null where a part is not there.
+    """
 
     file: str
     status: Status
     sha256: str | None = None  # of the file's bytes
     photo_px: tuple[int, int] | None = None  # width and height, upright
-    code: str | None = None
-    figure: Finite | None = None
-    threshold: Finite | None = None
-    advice: str | None = None
     markers_found: int = 0
-    residual_mm: Finite | None = None
-    px_per_mm: Finite | None = None
-    scale_x: Finite | None = None
-    scale_y: Finite | None = None
-    scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
-    tilt_deg: Finite | None = None
-    azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right
-    azimuth_uncertainty_deg: Finite | None = None  # 95 %, from the corners alone
-    distance_mm: Finite | None = None
-    contrast: Finite | None = None
-    blur_px: Finite | None = None
-    corner_uncertainty_mm: Finite | None = None
-    curl_radius_mm: Finite | None = None  # of paper that was unrolled; negative where it is hollow
-    delta_e00_mean: Finite | None = None
-    delta_e00_p95: Finite | None = None
-    color_fit: str | None = None
-    clipped_share: Finite | None = None  # of the design
-    glossy_share: Finite | None = None
-    swatches: tuple[SwatchSeen, ...] = ()
-    homography_px_from_mm: tuple[Row, Row, Row] | None = None
+    geometry: Geometry | None = None
+    pose: Pose | None = None
+    scale: Scale | None = None
+    color: Color | None = None
+    remark: Remark | None = None
     predictions: dict[str, Prediction] = Field(default_factory=dict)
+
+    @property
+    def code(self) -> str | None:
+        """What is wrong with it."""
+        return None if self.remark is None else self.remark.code
+
+    @model_validator(mode="before")
+    @classmethod
+    def _parts_of(cls, data: Any) -> Any:
+        """A part is there where its first figure is, which is never null."""
+        if not isinstance(data, dict):
+            return data
+        data = dict(data)
+        for name, kind in _PARTS.items():
+            figures = {key: data.pop(key) for key in kind.model_fields if key in data}
+            if figures.get(next(iter(kind.model_fields))) is not None:
+                data[name] = figures
+        return data
+
+    @model_serializer(mode="wrap")
+    def _side_by_side(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        parts = plain(self)
+        figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
+        return {key: [] if key == "swatches" and self.color is None else figures.get(key) for key in KEYS}
 
 
 class ModelRate(Strict):
@@ -85,8 +164,7 @@ class LedgerShare(Strict):
     interval: tuple[Finite, Finite] | None
 
 
-@dataclass(frozen=True)
-class Ledger:
+class Ledger(Strict):
     """Shares by step in their order, mean confidence of the ideal pictures and of the photographs, and their number.
 
     `culprit` is the step that clearly costs the most, None where none does.
@@ -108,8 +186,8 @@ class Summary(Strict):
     rate: Finite | None
     interval: tuple[Finite, Finite] | None
     prediction_interval: tuple[int, int] | None
-    verdict: Literal["kept", "broken", "cannot_tell"]
-    effect: Literal["shown", "not_shown", "not_tested"]
+    verdict: Word
+    effect: Effect
     matched_rate: Finite | None
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
@@ -149,10 +227,6 @@ class Report(Strict):
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
 
-    def dump(self) -> str:
-        """Its JSON text: the same report gives the same bytes."""
-        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -160,9 +234,3 @@ class Evidence:
 
     report: Report
     ledger: Ledger | None = None
-
-    def notes(self) -> dict[str, Any]:
-        """The ledger as plain data, for the page."""
-        if self.ledger is None:
-            return {}
-        return {"ledger": vars(self.ledger) | {"shares": {k: v.model_dump() for k, v in self.ledger.shares.items()}}}

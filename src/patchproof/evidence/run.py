@@ -12,43 +12,29 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from patchproof.claims import wilson
-from patchproof.evidence.classify import check_primary, predict, target_indices
+from patchproof.evidence.batch import WITH_PICTURES, Item, KeptPhoto, measure_all, shot_again
+from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.journal import Journal, settings_key
-from patchproof.evidence.ledger import Ledger, ledger_of
-from patchproof.evidence.look import Glanced, Task, glance_at_all, in_ledger, look_at_all, set_task, shot_again
-from patchproof.evidence.ranges import at_side, matched_rate, promised_side_px
-from patchproof.evidence.reproject import Shot
-from patchproof.evidence.results import Control, Evidence, ModelRate, Prediction, Report, Summary
-from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
-from patchproof.goal import Goal
+from patchproof.evidence.ledger import ledger_of
+from patchproof.evidence.ranges import matched_rate, promised_side_px
+from patchproof.evidence.results import Control, Effect, Evidence, Ledger, ModelRate, PhotoEntry, Report, Scale, Summary
+from patchproof.evidence.task import Options, task_of
+from patchproof.evidence.verdict import Comparison, Verdict, compare, effect_of, judge
 from patchproof.photo.read import list_photos, pictures_in
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
 from patchproof.workers import open_workers
 
-if TYPE_CHECKING:
-    from patchproof.channel.lens import Camera
-    from patchproof.channel.printer import Printer
-    from patchproof.classifier import Classifier
-
-LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
-
 
 def gather_evidence(
     photos: str | Path,
     manifest: Manifest,
+    options: Options,
     *,
-    models: Sequence[Classifier],
-    printer: Printer | None = None,
-    scan_dpi: float | None = None,
-    controls: str | Path | None = None,
-    camera: Camera | None = None,
-    ledger_photos: int = LEDGER_PHOTOS,
     jobs: int = 1,
     cluster: str | None = None,
     journal: Path | None = None,
@@ -58,45 +44,40 @@ def gather_evidence(
 ) -> Evidence:
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
-    `printer` is the appearance model that the promise was made with (None: the manifest's profile by its name).
-    `camera` replaces the EXIF focal length and takes out the lens.
-    `ledger_photos` of the photographs at most, spread evenly, go into the gap ledger (0: no ledger). Photographs are
-    measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is finished;
-    with `resume`, what it has of an earlier run is not done again. `on_pictures` gets the pictures of each photograph
-    that is (of the first `look.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where it was
-    measured); `progress` is called with (done, all).
+    Photographs are measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is
+    finished; with `resume`, what it has of an earlier run is not done again. `on_pictures` gets the pictures of each
+    photograph that is (of the first `batch.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where
+    it was measured); `progress` is called with (done, all).
     """
-    paths = list_photos(photos)
-    control_paths = _list_controls(controls) if controls is not None else {}
-    if manifest.promise:
-        check_primary(models, manifest.promise)
-    indices = {m.name: target_indices(m, manifest) for m in models} if manifest.promise else {}
-    task = set_task(manifest, models, printer, scan_dpi, camera)
-    judge_all = partial(_predictions, models, indices)
-    total, done = len(paths) + sum(map(len, control_paths.values())), 0
-    options = {"scan_dpi": scan_dpi, "camera": camera and camera.model_dump(mode="json")}
-    kept = Journal(journal, settings_key(manifest, models, printer, options), resume) if journal is not None else None
-    with closing(kept) if kept is not None else nullcontext(), open_workers(jobs, cluster) as workers:
-        step = lambda more: progress(done + more, total)  # noqa: E731
-        seen = look_at_all(task, paths, judge_all, workers, kept, on_pictures, step)
-        glances: dict[str, list[Glanced]] = {}
-        for name, files in control_paths.items():
-            done = len(paths) + sum(map(len, glances.values()))
-            glances[name] = glance_at_all(task, name, files, judge_all, workers, kept, step)
-        chosen = [n for n in sorted(_spread(len(paths), ledger_photos)) if task.ledger_px and in_ledger(seen[n])]
-        shots = list(workers.map(partial(shot_again, task), [(paths[n], seen[n].entry, seen[n].light) for n in chosen]))
-    entries = [one.entry for one in seen]
-    ledger = _ledger(task, manifest, models, indices, entries, shots)
-    return _evidence(manifest, models, indices, entries, [one.counted for one in seen], glances, ledger)
+    paths, control_paths = list_photos(photos), _list_controls(options.controls)
+    judges = judges_of(options.models, manifest)
+    task = task_of(manifest, options, judges)
+    items = [Item(path, with_pictures=number < WITH_PICTURES) for number, path in enumerate(paths)]
+    items += [Item(path, control) for control, files in control_paths.items() for path in files]
+    kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
+    with kept as open_journal, open_workers(jobs, cluster) as workers:
+        results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
+        shots, most = [], min(len(paths), options.ledger_photos)
+        if judges and task.promised:
+            chosen = [number * len(paths) // most for number in range(most)]  # evenly spread
+            again = partial(shot_again, task, judges.primary.input_px)
+            shots = workers.map(again, [(paths[number], results[number]) for number in chosen])
+    shots, own = [shot for shot in shots if shot is not None], results[: len(paths)]
+    ledger, controls = None, {}
+    if judges and task.promised:
+        name = judges.primary.name
+        confidence = {k.entry.file: k.entry.predictions[name].target_confidence for k in own if k.entry.predictions}
+        ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
+    for item, result in zip(items, results, strict=True):
+        if item.control is not None:
+            controls.setdefault(item.control, []).append(result.entry)
+    return Evidence(_report(manifest, judges, own, controls, ledger, options.ruler_mm), ledger)
 
 
-def _spread(count: int, most: int) -> frozenset[int]:
-    """At most `most` of `count` numbers from 0, evenly spread."""
-    return frozenset(range(count)) if count <= most else frozenset(i * count // most for i in range(most))
-
-
-def _list_controls(folder: str | Path) -> dict[str, list[Path]]:
+def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
     """Photographs by control: the folder's own pictures, or one control for each folder in it."""
+    if folder is None:
+        return {}
     folder = Path(folder)
     if not folder.is_dir():
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
@@ -109,75 +90,64 @@ def _list_controls(folder: str | Path) -> dict[str, list[Path]]:
     return inside
 
 
-def _predictions(models, indices, squares: Mapping[int, np.ndarray]) -> dict[str, Prediction]:
-    """What every network says of one photograph; nothing where the sheet promises nothing."""
-    if not indices:
-        return {}
-    return {model.name: predict(model, indices[model.name], squares[model.input_px]) for model in models}
-
-
-def _ledger(task: Task, manifest, models, indices, entries, shots: Iterable[Shot | None]) -> Ledger | None:
-    shots = [shot for shot in shots if shot is not None]
-    if not shots:
-        return None
-    model = next(m for m in models if m.name == manifest.promise.models[0].name)
-    confidence = {e.file: e.predictions[model.name].target_confidence for e in entries if e.predictions}
-    return ledger_of(shots, manifest, task.surface, task.promised, model, indices[model.name], confidence)
-
-
-def _evidence(manifest, models, indices, entries, counts: Sequence[bool], glances, ledger) -> Evidence:
-    counted = [entry for entry, counts_too in zip(entries, counts, strict=True) if counts_too]
-    verdict, effect, controls = Verdict("cannot_tell", None, "The sheet promises nothing."), "not_tested", ()
-    rate, matched = ModelRate(rate=None, interval=None), None
-    rates = {m.name: _rate([e.predictions[m.name].recognized for e in counted]) for m in models} if indices else {}
-    if manifest.promise:
-        promise, primary = manifest.promise, manifest.promise.models[0].name
-        results = {e.file: e.predictions[primary].recognized for e in counted}
+def _report(
+    manifest: Manifest,
+    judges: Judges | None,
+    photos: Sequence[KeptPhoto],
+    controls: Mapping[str, Sequence[PhotoEntry]],
+    ledger: Ledger | None,
+    ruler_mm: tuple[float, float] | None,
+) -> Report:
+    """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
+    entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
+    verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
+    effect: Effect = "not_tested"
+    compared, rates, rate = (), {}, _rate({})
+    if judges and manifest.promise:
+        promise, primary = manifest.promise, judges.primary.name
+        rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
+        rate, recognized = rates[primary], _recognized(counted, primary)
         without = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
         goal = promise.target.goal
-        verdict = judge(sum(results.values()), len(results), promise.rate, promise.n, goal, without)
-        side_px = promised_side_px(manifest)
-        measured = (at_side(entry, side_px) for entry in counted if entry.status == "measured")
-        rate, matched = rates[primary], matched_rate(measured, promise.conditions)
-        controls, effect = _compared(primary, results, glances, goal)
+        verdict = judge(sum(recognized.values()), len(recognized), promise.rate, promise.n, goal, without)
+        measured = (entry for entry in counted if entry.status == "measured")
+        matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
+        answers = {name: _recognized(shown, primary) for name, shown in controls.items()}
+        comparisons = {name: compare(recognized, answer, goal) for name, answer in answers.items()}
+        effect = effect_of(list(comparisons.values()))
+        compared = tuple(_control(name, answers[name], comparison) for name, comparison in comparisons.items())
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
-        measured=sum(e.status == "measured" for e in entries),
+        measured=sum(entry.status == "measured" for entry in entries),
         rate=rate.rate,
         interval=rate.interval,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
         effect=effect,
         matched_rate=matched,
-        ledger=ledger.shares if ledger else None,
-        culprit=ledger.culprit if ledger else None,
+        ledger=ledger and ledger.shares,
+        culprit=ledger and ledger.culprit,
         reason=verdict.reason,
         models=rates,
     )
-    return Evidence(
-        Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=controls), ledger
-    )
+    if ruler_mm is not None:
+        x, y = (measured / nominal for measured, nominal in zip(ruler_mm, manifest.ruler_mm, strict=True))
+        scale = Scale(scale_x=x, scale_y=y)
+        entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
+    return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=compared)
 
 
-def _rate(results: list[bool]) -> ModelRate:
-    if not results:
-        return ModelRate(rate=None, interval=None)
-    return ModelRate(rate=sum(results) / len(results), interval=wilson(sum(results), len(results)))
+def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:
+    """Whether the network recognized the target, by file."""
+    return {entry.file: entry.predictions[network].recognized for entry in entries if entry.predictions}
 
 
-def _compared(primary: str, results: dict[str, bool], glances: Mapping[str, Sequence[Glanced]], goal: Goal):
-    """Controls with their comparison, and the effect that they show together."""
-    controls, comparisons = [], []
-    for name, looked in glances.items():
-        seen = {one.file: one.predictions[primary].recognized for one in looked if one.predictions}
-        comparison, k = compare(results, seen, goal), sum(seen.values())
-        comparisons.append(comparison)
-        control = Control(name, k, len(seen), wilson(k, len(seen)))
-        if comparison is not None:
-            c = comparison
-            control = Control(
-                name, k, len(seen), control.interval, c.pairs, c.difference, c.interval, c.p_value, c.shown
-            )
-        controls.append(control)
-    return tuple(controls), effect_of(comparisons)
+def _rate(recognized: Mapping[str, bool]) -> ModelRate:
+    k, n = sum(recognized.values()), len(recognized)
+    return ModelRate(rate=k / n, interval=wilson(k, n)) if n else ModelRate(rate=None, interval=None)
+
+
+def _control(name: str, recognized: Mapping[str, bool], comparison: Comparison | None) -> Control:
+    k, n = sum(recognized.values()), len(recognized)
+    return Control(name, k, n, wilson(k, n), **(vars(comparison) if comparison else {}))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from patchproof.evidence.results import Scale
 from patchproof.evidence.surface import Surface
 from patchproof.geometry import apply_homography, rect_corners
 
@@ -15,20 +16,19 @@ _MOST_PERSPECTIVE = 0.005  # relative change of length between opposite sides; s
 _SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
 
 
-def is_scan(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> bool:
-    """Whether the picture has the stated resolution and no perspective; prints stretched along one axis included."""
+def scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Scale | None:
+    """The print's scale through the middle of the design; None where the picture has perspective or another
+    resolution. Prints stretched along one axis are scans, too.
+    """
     corners = apply_homography(px_from_mm, rect_corners(surface.rect_mm))
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     perspective = max(abs(sides[0] / sides[2] - 1), abs(sides[1] / sides[3] - 1))
-    scales = page_scales(px_from_mm, surface, scan_dpi)
-    return perspective < _MOST_PERSPECTIVE and all(_SIZES[0] < scale < _SIZES[1] for scale in scales)
-
-
-def page_scales(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> tuple[float, float]:
-    """Printed length over intended length along x and along y, through the middle of the design."""
     x, y, w, h = surface.rect_mm
     ends = np.array([[x, y + h / 2], [x + w, y + h / 2], [x + w / 2, y], [x + w / 2, y + h]])
     px = apply_homography(px_from_mm, ends)
     px_per_mm = scan_dpi / 25.4
     across, down = np.linalg.norm(px[1] - px[0]), np.linalg.norm(px[3] - px[2])
-    return float(across / w / px_per_mm), float(down / h / px_per_mm)
+    scales = float(across / w / px_per_mm), float(down / h / px_per_mm)
+    if perspective < _MOST_PERSPECTIVE and all(_SIZES[0] < scale < _SIZES[1] for scale in scales):
+        return Scale(scale_x=scales[0], scale_y=scales[1])
+    return None

@@ -8,6 +8,7 @@ the design's page; each of its pages is another, by which scans and photographs 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,7 +17,10 @@ from patchproof.color import linear_from_srgb
 from patchproof.geometry import rect_corners
 from patchproof.photo.detect import cells_of
 from patchproof.photo.label import Label, label_of
-from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.manifest import Manifest, Rect
+
+if TYPE_CHECKING:
+    from patchproof.channel.printer import Printer
 
 _LARGEST_PX = 512  # of the design as it is compared; photographs never resolve more
 _LARGEST_PIECE_PX = 1024  # of the piece as it is put back
@@ -29,14 +33,19 @@ class Surface:
     dictionary: str
     corners_mm: dict[int, np.ndarray]
     piece_ids: frozenset[int]
-    rect_mm: tuple[float, float, float, float]
-    center_mm: tuple[float, float]
-    piece_mm: tuple[float, float, float, float]
-    swatch_rects_mm: tuple[tuple[float, float, float, float], ...]
+    rect_mm: Rect
+    piece_mm: Rect
+    swatch_rects_mm: tuple[Rect, ...]
     swatches_srgb: np.ndarray
     label: Label  # what the page's code says
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
+
+    @property
+    def center_mm(self) -> tuple[float, float]:
+        """The middle of the design."""
+        x, y, w, h = self.rect_mm
+        return x + w / 2, y + h / 2
 
     @property
     def all_ids(self) -> frozenset[int]:
@@ -51,9 +60,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Promised:
-    """Linear light as the printer model has it: design H×W×3 (None on pages without), swatches N×3, marker ink (3,)."""
+    """Linear light as the printer model has it: design H×W×3, swatches N×3, marker ink (3,)."""
 
-    design: np.ndarray | None
+    design: np.ndarray
     swatches: np.ndarray
     ink: np.ndarray
 
@@ -63,54 +72,48 @@ def surface_of(manifest: Manifest) -> Surface:
     if manifest.tiles:
         return _assembled(manifest)
     page = manifest.design.page if manifest.design else min(m.page for m in manifest.markers)
-    corners = {m.id: np.array(m.corners_mm) for m in _known(manifest) if m.page == page}
+    corners = _corners_by_page(manifest)[page]
     piece = frozenset(i for i, c in corners.items() if _inside(manifest.cut_mm, c))
     swatches = [s for s in manifest.chart if s.page == page and _inside(manifest.cut_mm, rect_corners(s.rect_mm))]
-    rect = manifest.design.rect_mm if manifest.design else manifest.cut_mm
-    rects, colors = [s.rect_mm for s in swatches], [s.srgb for s in swatches]
-    return _surface(manifest, corners, piece, rect, rects, colors)
+    return _surface(manifest, corners, piece, _design_rect(manifest), [(s.rect_mm, s.srgb) for s in swatches])
 
 
 def _assembled(manifest: Manifest) -> Surface:
     """The piece glued together, in the millimetres of the design's page (the first tile's without a design)."""
     page = manifest.design.page if manifest.design else manifest.tiles[0].page
-    to_page, cuts = _page_from_pages(manifest, page), {tile.page: tile.cut_mm for tile in manifest.tiles}
-    markers = [m for m in _known(manifest) if m.page in cuts]
-    carried = {m.id: _carry(to_page[m.page], m.corners_mm) for m in markers}
-    shown = frozenset(m.id for m in markers if _inside(cuts[m.page], np.array(m.corners_mm)))
-    swatches = [s for s in manifest.chart if s.page in cuts]
-    pages = [
-        _surface(manifest, {m.id: carried[m.id] for m in markers if m.page == number}, frozenset(), rect)
-        for number, rect in ((n, _carry_rect(to_page[n], cut)) for n, cut in cuts.items())
-    ]
-    for number in sorted({m.page for m in _known(manifest)} - set(cuts)):  # the page with the chart
-        corners = {m.id: np.array(m.corners_mm) for m in _known(manifest) if m.page == number}
-        low, high = np.concatenate(list(corners.values())).min(0), np.concatenate(list(corners.values())).max(0)
-        pages.append(_surface(manifest, corners, frozenset(), tuple(float(v) for v in (*low, *(high - low)))))
-    piece = {i: c for i, c in carried.items() if i in shown}
-    rect = manifest.design.rect_mm if manifest.design else manifest.cut_mm
-    rects, colors = [_carry_rect(to_page[s.page], s.rect_mm) for s in swatches], [s.srgb for s in swatches]
-    return _surface(manifest, piece, shown, rect, rects, colors, tuple(pages))
+    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
+    to_page = {number: (square[page] @ np.linalg.inv(matrix))[:2] for number, matrix in square.items()}
+    cuts, corners = {tile.page: tile.cut_mm for tile in manifest.tiles}, _corners_by_page(manifest)
+    piece, pages = {}, []
+    for number, cut in cuts.items():
+        carried = {i: _carry(to_page[number], c) for i, c in corners.get(number, {}).items()}
+        piece |= {i: carried[i] for i, c in corners.get(number, {}).items() if _inside(cut, c)}
+        pages.append(_surface(manifest, carried, frozenset(), _carry_rect(to_page[number], cut)))
+    for number in sorted(corners.keys() - cuts.keys()):  # the page with the chart
+        points = np.concatenate(list(corners[number].values()))
+        x, y, w, h = (float(v) for v in (*points.min(0), *np.ptp(points, axis=0)))
+        pages.append(_surface(manifest, corners[number], frozenset(), (x, y, w, h)))
+    swatches = [(_carry_rect(to_page[s.page], s.rect_mm), s.srgb) for s in manifest.chart if s.page in cuts]
+    return _surface(manifest, piece, frozenset(piece), _design_rect(manifest), swatches, tuple(pages))
 
 
-def _surface(manifest, corners, piece, rect, swatch_rects=(), colors=(), pages=()) -> Surface:
+def _surface(manifest: Manifest, corners, piece_ids, rect_mm, swatches=(), pages=()) -> Surface:
     return Surface(
-        manifest.markers[0].dictionary,
-        corners,
-        piece,
-        rect,
-        (rect[0] + rect[2] / 2, rect[1] + rect[3] / 2),
-        manifest.cut_mm,
-        tuple(swatch_rects),
-        np.array(colors).reshape(-1, 3),
-        label_of(manifest),
-        None if manifest.tiles else manifest.page_mm,
-        pages,
+        dictionary=manifest.markers[0].dictionary,
+        corners_mm=corners,
+        piece_ids=piece_ids,
+        rect_mm=rect_mm,
+        piece_mm=manifest.cut_mm,
+        swatch_rects_mm=tuple(rect for rect, _ in swatches),
+        swatches_srgb=np.array([srgb for _, srgb in swatches]).reshape(-1, 3),
+        label=label_of(manifest),
+        page_mm=None if manifest.tiles else manifest.page_mm,
+        pages=pages,
     )
 
 
-def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
-    """How design, swatches and ink should look; `printer.apply` maps sRGB tensors N×3×H×W to media-relative sRGB."""
+def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:
+    """How design, swatches and ink should look; None on pages without a design."""
     import torch
 
     def printed(srgb: np.ndarray) -> np.ndarray:
@@ -118,12 +121,10 @@ def promised_of(manifest: Manifest, surface: Surface, printer) -> Promised:
         with torch.inference_mode():
             return linear_from_srgb(printer.apply(tensor)[0].numpy().transpose(1, 2, 0).astype(float))
 
-    colors = np.concatenate([surface.swatches_srgb, [[0.0, 0.0, 0.0]]])[None]
-    swatches = printed(colors)[0]
-    design = None
-    if manifest.design:
-        design = reduced(printed(manifest.design.pixels() / 255.0).astype(np.float32))
-    return Promised(design, swatches[:-1], swatches[-1])
+    if manifest.design is None:
+        return None
+    swatches = printed(np.concatenate([surface.swatches_srgb, [[0.0, 0.0, 0.0]]])[None])[0]
+    return Promised(reduced(printed(manifest.design.pixels() / 255.0)), swatches[:-1], swatches[-1])
 
 
 def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, ink: np.ndarray) -> np.ndarray:
@@ -154,7 +155,8 @@ def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, in
 
 
 def reduced(linear: np.ndarray) -> np.ndarray:
-    """A design's light H×W×3 at the size at which it is compared."""
+    """A design's light H×W×3 at the size at which it is compared, float32."""
+    linear = linear.astype(np.float32)
     shrink = _LARGEST_PX / max(linear.shape[:2])
     if shrink >= 1:
         return linear
@@ -162,25 +164,28 @@ def reduced(linear: np.ndarray) -> np.ndarray:
     return cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
 
 
-def _known(manifest: Manifest) -> list:
-    return [m for m in manifest.markers if m.dictionary == manifest.markers[0].dictionary]
+def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
+    """Corners by page and id of the markers of the first one's dictionary."""
+    pages: dict[int, dict[int, np.ndarray]] = {}
+    for marker in manifest.markers:
+        if marker.dictionary == manifest.markers[0].dictionary:
+            pages.setdefault(marker.page, {})[marker.id] = np.array(marker.corners_mm)
+    return pages
 
 
-def _inside(rect, points: np.ndarray) -> bool:
+def _design_rect(manifest: Manifest) -> Rect:
+    return manifest.design.rect_mm if manifest.design else manifest.cut_mm
+
+
+def _inside(rect: Rect, points: np.ndarray) -> bool:
     x, y, w, h = rect
     return bool((points >= [x, y]).all() and (points <= [x + w, y + h]).all())
 
 
-def _carry_rect(matrix, rect) -> tuple[float, float, float, float]:
+def _carry_rect(matrix: np.ndarray, rect: Rect) -> Rect:
     (x0, y0), _, (x1, y1), _ = _carry(matrix, rect_corners(rect)).tolist()
     return x0, y0, x1 - x0, y1 - y0
 
 
-def _carry(matrix, points) -> np.ndarray:
-    return np.asarray(points, float) @ matrix[:, :2].T + matrix[:, 2]
-
-
-def _page_from_pages(manifest: Manifest, page: int) -> dict[int, np.ndarray]:
-    """2×3 maps from each tile's millimetres to those of `page`."""
-    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
-    return {number: (square[page] @ np.linalg.inv(matrix))[:2] for number, matrix in square.items()}
+def _carry(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:, :2].T + matrix[:, 2]

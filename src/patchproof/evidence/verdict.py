@@ -14,9 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 from patchproof.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, prediction_interval
+from patchproof.evidence.results import Effect, Word
 from patchproof.goal import Goal
 
 LEAST_JUDGED = 5
@@ -29,7 +29,7 @@ LEAST_PAIRS = 5  # fewer pairs can never reach 5 % in McNemar's test; the unpair
 class Verdict:
     """The word, the counts that the promise allows, and one sentence with the figures that decided it."""
 
-    verdict: Literal["kept", "broken", "cannot_tell"]
+    verdict: Word
     prediction_interval: tuple[int, int] | None
     reason: str
 
@@ -61,7 +61,7 @@ class Comparison:
     """Patch against one control; `difference` is patch minus control, `pairs` 0 where photographs are not paired."""
 
     difference: float
-    interval: tuple[float, float]
+    difference_interval: tuple[float, float]
     pairs: int
     p_value: float | None
     shown: bool
@@ -83,7 +83,7 @@ def compare(patch: Mapping[str, bool], control: Mapping[str, bool], goal: Goal) 
     return Comparison(difference, interval, 0, None, shown)
 
 
-def effect_of(comparisons: Sequence[Comparison | None]) -> Literal["shown", "not_shown", "not_tested"]:
+def effect_of(comparisons: Sequence[Comparison | None]) -> Effect:
     """`shown` only where every control was beaten; controls without a judged photograph are not tests."""
     tested = [c for c in comparisons if c is not None]
     if not tested:

@@ -37,6 +37,7 @@ _SHEET_PX, _SHEET_VIEWS = 160, 4
 class DeceiveSettings(TrainedSettings):
     """As in all studies of trained designs; each network trains alone and all of them test."""
 
+    # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
         min_length=1,

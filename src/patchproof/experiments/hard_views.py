@@ -18,29 +18,18 @@ follow the design, but it costs passes in every step. Poses that fail: Alcorn et
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
+from patchproof.channel.effects import EFFECT
 from patchproof.experiments.stress_map import clean
 from patchproof.optimizer.problem import Problem
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
 
 # What of a draw is the pose and the light; the rest is background, print and camera.
-POSE = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset")
-LIGHT = (
-    "ambient",
-    "directional",
-    "light_azimuth_deg",
-    "light_elevation_deg",
-    "exposure_ev",
-    "point",
-    "point_azimuth_deg",
-    "point_elevation_deg",
-    "point_distance_mm",
-    "sh2",
-    "sh2_coefficients",
-)
+POSE = EFFECT["viewpoint"].fields
+_LIGHT = ("ambient light", "directional light", "exposure", "lamp", "uneven ambient")
+LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
 CANDIDATES = 8
 _RIDGE = 1.0  # beside features of unit variance: as much as one try
 
@@ -62,7 +51,8 @@ def training_conditions(problem: Problem, tries: int) -> Conditions:
 def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str] = POSE + LIGHT) -> Conditions:
     """The fields `names` of each row of `tried`, with all else from each row of `rest`: row by row of `tried`."""
     rows = np.tile(np.arange(len(rest)), len(tried))
-    return replace(rest[rows], **{name: getattr(tried, name).repeat(len(rest), 0) for name in names})
+    fields = fields_of(tried)
+    return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
 
 
 def expected_losses(tried: Conditions, losses: np.ndarray, others: Conditions) -> np.ndarray:
@@ -85,17 +75,18 @@ def with_pose_and_light(conditions: Conditions, hard: Conditions) -> Conditions:
     """`conditions`, every other row with pose and light of the next row of `hard`, over and over."""
     rows = np.arange(1, len(conditions), 2)
     source = (rows // 2) % len(hard)
-    changed = {name: getattr(conditions, name).copy() for name in POSE + LIGHT}
-    for name, values in changed.items():
-        values[rows] = getattr(hard, name)[source]
-    return replace(conditions, **changed)
+    changed, fields = fields_of(conditions), fields_of(hard)
+    for name in POSE + LIGHT:
+        changed[name] = changed[name].copy()
+        changed[name][rows] = fields[name][source]
+    return of_fields(changed)
 
 
 def _features(conditions: Conditions) -> np.ndarray:
     """N×F: what the loss is fitted by."""
-    columns = []
+    columns, fields = [], fields_of(conditions)
     for name in POSE + LIGHT:
-        for values in np.asarray(getattr(conditions, name), float).reshape(len(conditions), -1).T:
+        for values in fields[name].reshape(len(conditions), -1).T:
             if name.endswith("azimuth_deg"):
                 angle = np.radians(values)
                 columns += [np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)]

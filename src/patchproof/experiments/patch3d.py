@@ -91,7 +91,7 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return {
         **recorded(responses(problem, things_of(problem, designs), conditions)),
         "in_images": recorded(responses(twin, things_of(twin, designs), in_images)),
-        "azimuth_deg": conditions.azimuth_deg.tolist(),
+        "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
         "passes": {name: views_seen(one.scene.settings.optimize) for name, one in (("3d", problem), ("2d", twin))},
         "share": twin.scene.settings.view.patch_share,

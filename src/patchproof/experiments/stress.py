@@ -12,7 +12,6 @@ for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,7 +35,7 @@ from patchproof.experiments.stress_map import (
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, ask, in_parts, joined
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, fields_of, with_values
 from patchproof.strict import Share, Strict
 from patchproof.study.figures import picture_sheet
 from patchproof.study.grid import Count, GridSettings, problem_of, who
@@ -84,7 +83,7 @@ def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
     (pose, of_pose), (light, of_light) = (worst_case(problem, names, settings.search, seed) for names in (POSE, LIGHT))
     occlusion, hidden = occluded(problem, settings.occlusion, seed)
     typical = problem.scene.draw("select", 1, seed)
-    views = [_photographs(problem, _with(typical, changed))[0] for changed in ({}, pose, light)]
+    views = [_photographs(problem, with_values(typical, **changed))[0] for changed in ({}, pose, light)]
     return {
         "maps": [_mapped(problem, asked, seed) for asked in settings.maps],
         "occlusion": occlusion,
@@ -190,28 +189,24 @@ def worst_case(
     for number in range(settings.rounds):
         drawn = scene.draw("select", settings.tries, seed, settings.draws + number * settings.tries)
         # between two points of a box all lies within it
-        drawn = replace(drawn, **{n: v + 0.5**number * (getattr(drawn, n) - v) for n, v in best.items()})
+        fields = fields_of(drawn)
+        drawn = with_values(drawn, **{n: v + 0.5**number * (fields[n] - v) for n, v in best.items()})
         losses = clean(problem, each_before_all(drawn, rest, names), problem.training_px).loss.mean(0)
         losses = losses.reshape(settings.tries, settings.draws).mean(1)
         if losses.max() > best_loss:
             best_loss, row = float(losses.max()), int(losses.argmax())
-            best = {name: getattr(drawn, name)[row : row + 1] for name in names}
+            best = {name: fields_of(drawn)[name][row : row + 1] for name in names}
         course.append(best_loss)
     fresh = scene.draw("evaluate", settings.n, seed + _MEASURING)
     condition = {name: float(best[name][0]) for name in _varied(scene.draw("select", 64, seed), names)}
-    return best, {"condition": condition, "losses": course} | _again(problem, _with(fresh, best), fresh)
+    return best, {"condition": condition, "losses": course} | _again(problem, with_values(fresh, **best), fresh)
 
 
 def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
     """Fields of one figure whose range is more than a value; a lamp's only where there are lamps."""
-    lamps = drawn.point.max() > 0
-    figures = {name: getattr(drawn, name) for name in names if lamps or not name.startswith("point")}
+    lamps, fields = drawn.light.point.max() > 0, fields_of(drawn)
+    figures = {name: fields[name] for name in names if lamps or not name.startswith("point")}
     return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
-
-
-def _with(conditions: Conditions, values: Mapping[str, np.ndarray]) -> Conditions:
-    """`conditions` with the same one row of some fields everywhere."""
-    return replace(conditions, **{name: row.repeat(len(conditions), 0) for name, row in values.items()})
 
 
 # -------------------------------------------------------------------------------------------- tables and figures

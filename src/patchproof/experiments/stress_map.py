@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from patchproof.channel.effects import EFFECTS
 from patchproof.goal import Goal
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, responses
-from patchproof.scene.conditions import LIGHT_AZIMUTH_DEG, LIGHT_ELEVATION_DEG, Conditions
+from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, Strict
 from patchproof.study.grid import Count, GridSettings, cell_of, pairs
@@ -67,16 +68,9 @@ def mesh_cells(settings: GridSettings, base: Path) -> list[Cell]:
 
 def axes_of(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:
     """The map's axes, pose and light, over the scene's ranges; refused where a range is a single value."""
-    ranges = {
-        "light_azimuth_deg": LIGHT_AZIMUTH_DEG,
-        "light_elevation_deg": LIGHT_ELEVATION_DEG,
-        "exposure_ev": settings.camera.exposure_ev,
-        "ambient": settings.light.ambient,
-        "directional": settings.light.directional,
-    }
 
     def axis(name: str, count: int) -> Axis:
-        low, high = ranges[name] if name in ranges else getattr(settings.view, name)
+        low, high = next(effect.range(settings, name) for effect in EFFECTS if name in effect.columns)
         if low == high:
             do = "widen it, or choose another axis"
             raise Refused(f"a range of {name} that a map can be cut from", f"[{low:g}, {high:g}]", do)
@@ -92,20 +86,19 @@ def axes_values(axes: tuple[Axis, Axis]) -> dict[str, Any]:
 
 def in_cell(conditions: Conditions, axes: tuple[Axis, Axis], place: Place) -> Conditions:
     """`conditions` with pose and light moved into a cell, each as far in as it lay in its range."""
-    changed = {}
+    changed, fields = {}, fields_of(conditions)
     for axis, number in zip(axes, place, strict=True):
         first, last, low, high = axis.edges[0], axis.edges[-1], axis.edges[number], axis.edges[number + 1]
-        share = (getattr(conditions, axis.name) - first) / (last - first)
+        share = (fields[axis.name] - first) / (last - first)
         changed[axis.name] = low + (high - low) * share
-    return replace(conditions, **changed)
+    return with_values(conditions, **changed)
 
 
 def in_cells(conditions: Conditions, axes: tuple[Axis, Axis], places: Sequence[Place]) -> Conditions:
     """`conditions` moved into cells, an equal share of the rows into each, in order; no draw serves two cells."""
     n = len(conditions) // len(places)
-    parts = [in_cell(conditions[i * n : (i + 1) * n], axes, place) for i, place in enumerate(places)]
-    names = vars(parts[0])
-    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    parts = [fields_of(in_cell(conditions[i * n : (i + 1) * n], axes, place)) for i, place in enumerate(places)]
+    return of_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Answers:

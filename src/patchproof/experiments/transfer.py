@@ -86,7 +86,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if isinstance(problem.scene, MeshScene):
         fixed = three_views(problem, settings.lights)
         answers["views"] = recorded(responses(problem, things, fixed))["hits"]
-        answers["azimuths"] = fixed.azimuth_deg[:: settings.lights].tolist()
+        answers["azimuths"] = fixed.pose.azimuth_deg[:: settings.lights].tolist()
     return answers
 
 

@@ -8,19 +8,17 @@ the log of the target's confidence, so that they say what of the change did it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.channel.effects import EFFECT, Light, Pose, Sensor
 from patchproof.color import srgb_from_linear
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, shade
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.mesh_scene import MeshScene
-from patchproof.strict import Refused
 from patchproof.study.pictures import photographs
 
 _PATH_STEPS = 24  # of the integral; builtin's attributions then add up to within a few percent
@@ -28,24 +26,16 @@ _PATH_STEPS = 24  # of the integral; builtin's attributions then add up to withi
 
 def from_sides(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
     """Views from these azimuths at the middle of the scene's other ranges, in even light, before one background."""
-    drawn = problem.scene.draw("evaluate", 1)[np.zeros(len(azimuth_deg), int)]
-    view, even = problem.scene.settings.view, np.zeros(len(azimuth_deg))
-    still = {name: even for name in ("roll_deg", "directional", "exposure_ev", "blur_px", "noise", "motion_px")}
-    return replace(
-        drawn,
-        **still,
+    drawn, view = problem.scene.draw("evaluate", 1), problem.scene.settings.view
+    pose = Pose(
         azimuth_deg=np.asarray(azimuth_deg, float),
-        elevation_deg=even + np.mean(view.elevation_deg),
-        distance_mm=even + np.mean(view.distance_mm),
-        look_at_offset=np.zeros((len(even), 3)),
-        ambient=even + 1.0,
-        white_balance=np.ones((len(even), 3)),
-        jpeg=np.full(len(even), 95),
-        point=even,
-        sh2=even,
-        gloss=even,
-        vignetting=even,
+        elevation_deg=np.array([np.mean(view.elevation_deg)]),
+        distance_mm=np.array([np.mean(view.distance_mm)]),
+        background=drawn.pose.background,
+        printed_scale=drawn.pose.printed_scale,
     )
+    light, sensor = Light(ambient=np.ones(1)), Sensor(jpeg=np.array([95]), noise_seed=drawn.sensor.noise_seed)
+    return Conditions(pose=pose, light=light, print=drawn.print, sensor=sensor)
 
 
 def sides(problem: Problem, count: int) -> Conditions:
@@ -62,8 +52,7 @@ def three_views(problem: Problem, lights: int) -> Conditions:
     """
     poses = sides(problem, 3)[np.repeat(np.arange(3), lights)]
     drawn = problem.scene.draw("evaluate", 3 * lights)
-    names = ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset")
-    return replace(drawn, **{name: getattr(poses, name) for name in names})
+    return with_values(drawn, **{name: getattr(poses.pose, name) for name in EFFECT["viewpoint"].fields})
 
 
 def turn(problem: Problem, shown: Shown, views: int, side_px: int) -> Tensor:
@@ -74,10 +63,8 @@ def turn(problem: Problem, shown: Shown, views: int, side_px: int) -> Tensor:
 def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
     """sRGB codes of the mean light of the object's pixels over a full turn in even white light."""
     seen = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
-    if seen.object is None:
-        raise Refused("an object of its own", "a picture", "name a mesh")
     with torch.no_grad():
-        light = shade(seen, shown).permute(0, 2, 3, 1).reshape(-1, 3)[seen.object.pixel]
+        light = shade(seen, shown).permute(0, 2, 3, 1).reshape(-1, 3)[seen.on_object.pixel]
     red, green, blue = (srgb_from_linear(light.double().mean(0)) * 255).round().clamp(0, 255).int().tolist()
     return red, green, blue
 

@@ -78,7 +78,7 @@ def run_demo(
         run = optimize_scene(
             scene,
             folder / "run",
-            on_step=lambda step, total: on_stage("optimise", step.state.number, total),
+            on_step=lambda step, total: on_stage("optimize", step.state.number, total),
             on_promise=lambda done, total: on_stage("promise", done, total),
         )
         sheet_of(run, folder / "sheet.pdf")

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
-from patchproof.evidence.look import WITH_PICTURES
-from patchproof.evidence.results import Evidence, Origin, Report
-from patchproof.evidence.run import LEDGER_PHOTOS, gather_evidence
+from patchproof.evidence.batch import WITH_PICTURES
+from patchproof.evidence.results import Origin, Report
+from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.output import check_folder
 from patchproof.report.images import save_pictures
 from patchproof.report.write import write_report
@@ -56,16 +57,19 @@ def verify_photos(
     out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
     _check_out(out, resume, overwrite)
     networks = [load_classifier(name, base) for name in _names(manifest, models)]
-    printer = manifest.settings.get("printer")
+    options = Options(
+        models=networks,
+        printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
+        camera=None if camera is None else load_camera(camera),
+        scan_dpi=scan_dpi,
+        ruler_mm=ruler_mm,
+        controls=controls,
+        ledger_photos=ledger_photos,
+    )
     evidence = gather_evidence(
         photos,
         manifest,
-        models=networks,
-        printer=None if printer is None else load_printer(printer["profile"], base),
-        scan_dpi=scan_dpi,
-        controls=controls,
-        ledger_photos=ledger_photos,
-        camera=None if camera is None else load_camera(camera),
+        options,
         jobs=jobs,
         cluster=cluster,
         journal=out / _JOURNAL,
@@ -73,15 +77,14 @@ def verify_photos(
         on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
         progress=on_photo,
     )
-    if ruler_mm is not None:
-        evidence = _with_ruler(evidence, manifest, ruler_mm)
-    options = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "camera": camera and Path(camera).name}
+    given = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "camera": camera and Path(camera).name}
     hashes = {"manifest": hashlib.sha256(Path(sheet).read_bytes()).hexdigest()}
     hashes |= {f"network {network.name}": network.sha256 for network in networks}
-    origin = Origin(options=options | {"ledger_photos": ledger_photos}, sha256=hashes, versions=_versions())
-    report = evidence.report.model_copy(update={"origin": origin})
+    origin = Origin(options=given | {"ledger_photos": ledger_photos}, sha256=hashes, versions=_versions())
+    report = evidence.report.changed(origin=origin)
     _drop_pictures(out / "pictures", {photo.file for photo in report.photos[:WITH_PICTURES]})
-    write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, evidence.notes())
+    ledger = evidence.ledger and evidence.ledger.model_dump()
+    write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
     return report
 
 
@@ -104,13 +107,11 @@ def _drop_pictures(folder: Path, files: set[str]) -> None:
 
 
 def _versions() -> dict[str, str]:
-    found = {}
+    versions = {}
     for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # run from a checkout, or another of OpenCV's four wheels
-            continue
-    return found
+        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
+            versions[name] = version(name)
+    return versions
 
 
 def _names(manifest: Manifest, models: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -123,13 +124,3 @@ def _names(manifest: Manifest, models: tuple[str, ...] | None) -> tuple[str, ...
         return models
     promised = tuple(model.name for model in manifest.promise.models)
     return tuple(dict.fromkeys((promised[0], *(models or promised))))
-
-
-def _with_ruler(evidence: Evidence, manifest: Manifest, ruler_mm: tuple[float, float]) -> Evidence:
-    """The scale that a ruler on the print shows, for every photograph of it that shows none itself."""
-    scale = [measured / nominal for measured, nominal in zip(ruler_mm, manifest.ruler_mm, strict=True)]
-    photos = tuple(
-        photo if photo.scale_x is not None else photo.model_copy(update={"scale_x": scale[0], "scale_y": scale[1]})
-        for photo in evidence.report.photos
-    )
-    return replace(evidence, report=evidence.report.model_copy(update={"photos": photos}))

@@ -1,7 +1,8 @@
-"""A mesh by its name: a file's (`mesh_file`) or a procedural object's (`primitives`).
+"""A mesh by its name: a file's (`mesh_file`), a procedural object's (`primitives`), or one given in Python.
 
-In: a path or `primitive:NAME`, and the object's longest extent. Out: a `Mesh` in the scene's frame. Textures larger
-than any photograph shows are reduced.
+In: a path, `primitive:NAME` or `python:NAME`, and the object's longest extent. Out: a `Mesh` in the scene's frame.
+Textures larger than any photograph shows are reduced. A mesh in memory goes through GLB and the reader of files, so
+that it is what its run's folder will hold.
 """
 
 from __future__ import annotations
@@ -9,19 +10,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
+import trimesh
 
 from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
+from patchproof.strict import Refused
+
+GIVEN = "python:"
 
 # Larger textures are reduced: 8192 × 8192 took 4 GB and 5 s to set up, and no photograph of an object shows as much.
 LARGEST_TEXTURE_PX = 4096
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z") -> Mesh:
-    """The mesh of a file, or of `primitive:NAME`, with its longest extent `length_mm`.
+def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", given_glb: bytes | None = None) -> Mesh:
+    """The mesh of a file, of `primitive:NAME`, or of the GLB given for `python:NAME`, with its longest extent
+    `length_mm`.
 
     `up = "z"` turns (x, y, z) into (x, z, -y); primitives are y up already. Refused where nothing usable is left or a
     texture that the file names is missing.
@@ -33,9 +40,22 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z") -
         return replace(mesh, vertices=mesh.vertices * (length_mm / np.ptp(mesh.vertices, axis=0).max()))
     from patchproof.mesh.mesh_file import read_parts
 
-    parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
+    with TemporaryDirectory() as folder:
+        if str(path).startswith(GIVEN):
+            if given_glb is None:
+                raise Refused("a mesh beside the settings", f"{path} alone", "give it: make_scene(settings, mesh=...)")
+            path = Path(folder) / "given.glb"
+            path.write_bytes(given_glb)
+        parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
     parts, reduced = _within_limit(parts)
     return from_parts(parts, length_mm, (*warnings, *reduced))
+
+
+def glb_of(mesh: trimesh.Trimesh | trimesh.Scene) -> bytes:
+    """A mesh in memory as the bytes of a GLB file."""
+    return (
+        trimesh.Scene(mesh).export(file_type="glb") if isinstance(mesh, trimesh.Trimesh) else mesh.export(None, "glb")
+    )
 
 
 def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:

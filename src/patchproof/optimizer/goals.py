@@ -9,12 +9,14 @@ here. TV: Mahendran and Vedaldi, CVPR 2015.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from patchproof.goal import Goal
+
+Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
 
 
 def target_loss(logits: Tensor, indices: Sequence[int], goal: Goal) -> Tensor:

@@ -19,11 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
-from patchproof.render.views import Seen
+from patchproof.render.views import Views
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
@@ -111,7 +110,7 @@ def best_design(problem: Problem, conditions: Conditions | None = None) -> np.nd
     return problem.subject.pixels(state.best)
 
 
-def _step(problem: Problem, state: State, seen: Seen) -> Step:
+def _step(problem: Problem, state: State, seen: Views) -> Step:
     design = state.design.clone().requires_grad_()
     pictures = expose(seen, problem.subject.shown(design))
     losses, confidences, rates = _score(problem, pictures)
@@ -147,18 +146,17 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
 
 def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
     """Mean loss over classifiers and pictures; mean confidence and rate of the same."""
-    goal = problem.scene.settings.target.goal
     losses, confidence, rate = [], 0.0, 0.0
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
         logits = classifier.logits(pictures)
-        losses.append(target_loss(logits, indices, goal).mean())
+        losses.append(problem.loss(logits, indices).mean())
         confidence += float(classifier.confidence(logits.detach(), indices).mean())
         rate += float(classifier.recognized(logits.detach(), indices).double().mean())
     count = len(losses)
     return torch.stack(losses).mean(), confidence / count, rate / count
 
 
-def _selection(problem: Problem) -> list[Seen]:
+def _selection(problem: Problem) -> list[Views]:
     """The selection views, seen once and shaded anew for each design."""
     conditions = problem.scene.draw("select", SELECT_VIEWS)
     shown = problem.subject.shown(start(problem).design)
@@ -167,7 +165,7 @@ def _selection(problem: Problem) -> list[Seen]:
         return [problem.see(shown, part, problem.training_px) for part in parts]
 
 
-def _select(problem: Problem, selection: list[Seen], step: Step) -> Step:
+def _select(problem: Problem, selection: list[Views], step: Step) -> Step:
     """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
     state = step.state
     printed = from_pixels(as_pixels(state.design), problem.device)

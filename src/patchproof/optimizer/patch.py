@@ -1,8 +1,7 @@
 """A patch as the thing that is optimized: a design in its printed piece.
 
-In: a scene with a piece, and its printer. Out: `Patch`: where a design starts, what may become of it, how the whole
-piece looks on paper (design and printed frame, because that is what will hang there), and the pixels that go to the
-printer.
+In: a scene with a piece, and its printer. Out: `Patch`: where a design starts, what may become of it, what it costs,
+and the pixels that go to the printer. How the whole piece looks on paper stands in `render.designs`.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -21,9 +20,10 @@ from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.goals import total_variation
 from patchproof.optimizer.pixels import as_pixels
+from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.scene import Scene
-from patchproof.sheets.piece import FrameImage, control_design, frame_image, lay_out_piece
+from patchproof.sheets.piece import control_design
 
 # A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
 # and not by others, and the frame, drawn on the same grid, would lose its markers.
@@ -80,18 +80,8 @@ class Patch:
         return control_design(kind, pixels, self.scene.sheet_id)
 
     def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
-        """The printed piece round a design, on the design's own grid (the optimized one, or as printed);
-        differentiable.
-        """
-        height, width = design.shape[1:]
-        frame, printed_frame = self._frame(kind, (width, height))
-        x0, y0, *_ = frame.design_box_px
-        printed = self.printer.apply(design[None])[0].permute(1, 2, 0)
-        rows = torch.cat(
-            [printed_frame[y0 : y0 + height, :x0], printed, printed_frame[y0 : y0 + height, x0 + width :]], 1
-        )
-        picture = torch.cat([printed_frame[:y0], rows, printed_frame[y0 + height :]])
-        return PiecePicture(picture, frame.piece_box_px, (x0, y0, x0 + width, y0 + height))
+        """The printed piece round a design of any grid (the optimized one, or as printed); differentiable."""
+        return self._printed.shown(design, kind)
 
     @property
     def design_mm(self) -> tuple[float, float]:
@@ -105,13 +95,6 @@ class Patch:
         block = math.ceil(PRINTED_PX_PER_MM * max(self.design_mm[0] / width, self.design_mm[1] / height))
         return width * block, height * block
 
-    @lru_cache(maxsize=8)  # noqa: B019 - a patch lives as long as its run
-    def _frame(self, kind: str, design_px: tuple[int, int]) -> tuple[FrameImage, Tensor]:
-        """The frame of a kind of sheet, as drawn and as printed (H×W×3)."""
-        piece = self.scene.piece
-        if kind != "design":
-            # the control's own marker ids, as they will be printed
-            piece = lay_out_piece(self.design_mm, piece.module_mm * 7, self.scene.sheet_id, kind)
-        frame = frame_image(piece, design_px)
-        sent = torch.tensor(np.asarray(frame.srgb), dtype=torch.float32, device=self.device).permute(2, 0, 1)[None]
-        return frame, self.printer.apply(sent)[0].permute(1, 2, 0)
+    @cached_property
+    def _printed(self) -> PrintedPiece:
+        return PrintedPiece(self.scene.piece, self.scene.sheet_id, self.printer, self.device)

@@ -7,7 +7,9 @@ In: a scene, the names of its classifiers and its printer. Out: `Problem`, from 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
@@ -15,12 +17,13 @@ from patchproof.channel.printer import IN_GAMUT, Printer, load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
-from patchproof.render.views import Seen, see
+from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
 from patchproof.strict import Refused
@@ -40,6 +43,7 @@ class Problem:
     classifiers: tuple[Classifier, ...]
     indices: tuple[tuple[int, ...], ...]
     subject: Patch | Texture
+    loss: Loss
 
     @property
     def training_px(self) -> int:
@@ -51,7 +55,7 @@ class Problem:
         """The side at which views are rendered for figures that people will read."""
         return self._view_px(FIGURE_PX)
 
-    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Seen:
+    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
         piece = shown if isinstance(shown, PiecePicture) else None
         return see(self.stage, piece, conditions, (side_px, side_px))
@@ -67,8 +71,10 @@ class Problem:
         return self.stage.device
 
 
-def set_problem(scene: Scene, device: str = "cpu", models: tuple[str, ...] | None = None) -> Problem:
-    """The problem that a scene states; `models` replaces the scene's own classifiers."""
+def set_problem(
+    scene: Scene, device: str = "cpu", models: Sequence[str | Classifier] | None = None, loss: Loss | None = None
+) -> Problem:
+    """The problem that a scene states; `models` replaces the scene's own classifiers, `loss` that of its goal."""
     _check_device(device)
     settings = scene.settings
     classifiers = tuple(load_classifier(name, scene.base, device) for name in models or settings.target.models)
@@ -85,7 +91,8 @@ def set_problem(scene: Scene, device: str = "cpu", models: tuple[str, ...] | Non
     else:
         network_px = max(classifier.input_px for classifier in classifiers)
         subject = Patch(scene, printer, scene.design_px(network_px), stage.device)
-    return Problem(scene, stage, printer, classifiers, indices, subject)
+    loss = loss or partial(target_loss, goal=settings.target.goal)
+    return Problem(scene, stage, printer, classifiers, indices, subject, loss)
 
 
 def _check_device(device: str) -> None:

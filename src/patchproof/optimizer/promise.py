@@ -109,7 +109,7 @@ def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.n
     return tuple(
         ConditionClaim(
             **{name: _rounded(value[i]) for name, value in shows.items()},
-            blur_px=_rounded(conditions.blur_px[i]),
+            blur_px=_rounded(conditions.sensor.blur_px[i]),
             recognized=bool(recognized[i]),
         )
         for i in range(n)
@@ -118,7 +118,7 @@ def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.n
 
 def _contrasts(problem: Problem, conditions: Conditions) -> np.ndarray:
     """Paper white minus printed black in the photograph's linear light."""
-    exposed = problem.scene.white_light(conditions) * conditions.paper[:, 1] * 2**conditions.exposure_ev
+    exposed = problem.scene.white_light(conditions) * conditions.print.paper[:, 1] * 2**conditions.sensor.exposure_ev
     black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
     return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
 

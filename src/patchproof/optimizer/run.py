@@ -22,6 +22,8 @@ import torch
 from PIL import Image
 
 import patchproof
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, make_promise
@@ -33,7 +35,8 @@ from patchproof.sheets.manifest import Promise
 from patchproof.strict import Refused, validated
 
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
-OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, *RESULT_FILES, "evaluate.json", ".*.part")
+_GIVEN = "given.glb"
+OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *RESULT_FILES, "evaluate.json", ".*.part")
 
 
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
@@ -54,6 +57,8 @@ def optimize_scene(
     scene: str | Path | Scene,
     out: str | Path,
     *,
+    models: Sequence[str | Classifier] | None = None,
+    loss: Loss | None = None,
     seed: int | None = None,
     device: str = "cpu",
     resume: bool = False,
@@ -65,14 +70,15 @@ def optimize_scene(
 ) -> Run:
     """Optimize the patch of a scene or its file into the folder `out` and promise its rate.
 
-    `seed` replaces the file's; `resume` goes on from the checkpoint. A page names the best of `controls`, one at least.
+    `models` (names, or classifiers in memory) and `loss` replace the scene's networks and its goal's loss; `seed`
+    replaces the file's; `resume` goes on from the checkpoint. A page names the best of `controls`, one at least.
     """
     out = Path(out)
     if not resume:
         check_folder(out, OWN, overwrite)
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     on_scene(scene)
-    problem = set_problem(scene, device)
+    problem = set_problem(scene, device, models, loss)
     if not resume:
         _clear(out)
     make_folder(out)
@@ -226,13 +232,22 @@ def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict
         "python": platform.python_version(),
         "versions": {"patchproof": patchproof.__version__} | {name: version(name) for name in packages},
         "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
-        "settings": scene.settings.model_dump(mode="json"),
+        "settings": _settings(scene, out).model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
         "placement": _placement(scene),
         "warnings": list(scene.warnings),
         "select_after_views": SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }
+
+
+def _settings(scene: Scene, out: Path) -> SceneSettings:
+    """The scene's settings; of a mesh that was given in Python they name the run's own copy."""
+    glb = scene.given_glb
+    if glb is None:
+        return scene.settings
+    write_whole(out / _GIVEN, lambda path: path.write_bytes(glb))
+    return scene.settings.changed(object={"mesh": os.path.relpath(out.resolve() / _GIVEN, scene.base.resolve())})
 
 
 def _placement(scene: Scene) -> dict[str, Any] | None:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.render.designs import LearnedTextures
 from patchproof.render.photograph import ObjectTextures
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.sheets.piece import CELLS, control_design
@@ -37,7 +38,7 @@ class Texture:
 
     def start(self) -> Tensor:
         """The texels that the canvas starts from."""
-        return from_pixels(self.texels(self.scene.canvas.start_srgb), self.device)
+        return from_pixels(self.surface.texels(self.scene.canvas.start_srgb), self.device)
 
     def clipped(self, design: Tensor) -> Tensor:
         """The nearest design within the ball round the start."""
@@ -52,14 +53,14 @@ class Texture:
         """The gradient's pyramids, texture by texture."""
         return tuple(
             level
-            for image, mask in zip(self._images(gradient), self._masks, strict=True)
+            for image, mask in zip(self.surface.images(gradient), self.surface.masks, strict=True)
             for level in pyramid.levels(image, mask)
         )
 
     def joined(self, updates: Sequence[Tensor]) -> Tensor:
         """The update of a design that the pyramids' own add up to."""
         parts, first = [], 0
-        for mask in self._masks:
+        for mask in self.surface.masks:
             count = pyramid.level_count(mask.shape)
             whole = pyramid.joined(updates[first : first + count])
             parts.append(whole[:, mask])
@@ -73,7 +74,7 @@ class Texture:
             return 0.0
         changes = [
             (a - b).abs()[..., both].mean()
-            for texture, mask in zip(self._filled(design), self._masks, strict=True)
+            for texture, mask in zip(self.surface.filled(design), self.surface.masks, strict=True)
             for a, b, both in _neighbors(texture.permute(2, 0, 1), mask)
             if both.any()
         ]
@@ -92,7 +93,7 @@ class Texture:
         if kind != "noise":
             return control_design(kind, pixels, self.scene.sheet_id)
         textures = [np.zeros((*mask.shape, 3), np.uint8) for mask in self.scene.canvas.mask]
-        return self.texels([control_design(kind, texture, self.scene.sheet_id) for texture in textures])
+        return self.surface.texels([control_design(kind, texture, self.scene.sheet_id) for texture in textures])
 
     def _shuffled(self, pixels: np.ndarray) -> np.ndarray:
         """Each texture's texels moved cell by cell; cells that a mask cuts push the next ones along."""
@@ -110,49 +111,16 @@ class Texture:
 
     def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""
-        return ObjectTextures(tuple(self._filled(design)))
+        return self.surface.shown(design)
 
-    def texels(self, textures) -> np.ndarray:
-        """uint8 1×M×3: the changeable texels of uint8 textures."""
-        masks = self.scene.canvas.mask
-        return np.concatenate([texture[mask] for texture, mask in zip(textures, masks, strict=True)])[None]
-
-    def textures(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Whole uint8 textures with a design's pixels in them."""
-        result, first = [], 0
-        for original, mask in zip(self.scene.canvas.mesh.materials, self.scene.canvas.mask, strict=True):
-            texture, count = original.texture_srgb.copy(), int(mask.sum())
-            texture[mask] = pixels[0, first : first + count]
-            result.append(texture)
-            first += count
-        return tuple(result)
+    @cached_property
+    def surface(self) -> LearnedTextures:
+        """The textures with their changeable texels."""
+        return LearnedTextures(self.scene.canvas, self.device)
 
     @cached_property
     def _start(self) -> Tensor:
         return self.start()
-
-    @cached_property
-    def _masks(self) -> tuple[Tensor, ...]:
-        return tuple(torch.as_tensor(mask, device=self.device) for mask in self.scene.canvas.mask)
-
-    @cached_property
-    def _originals(self) -> tuple[Tensor, ...]:
-        materials = self.scene.canvas.mesh.materials
-        return tuple(torch.tensor(m.texture_srgb, dtype=torch.float32, device=self.device) / 255 for m in materials)
-
-    def _images(self, design: Tensor) -> list[Tensor]:
-        """3×H×W per material, 0 where nothing may change."""
-        parts = design[:, 0].split([int(mask.sum()) for mask in self._masks], 1)
-        return [
-            part.new_zeros(3, *mask.shape).masked_scatter(mask, part)
-            for mask, part in zip(self._masks, parts, strict=True)
-        ]
-
-    def _filled(self, design: Tensor) -> list[Tensor]:
-        """H×W×3 per material."""
-        parts = design[:, 0].T.split([int(mask.sum()) for mask in self._masks])
-        both = zip(self._originals, self._masks, parts, strict=True)
-        return [original.masked_scatter(mask[..., None], part) for original, mask, part in both]
 
 
 def _neighbors(texture: Tensor, mask: Tensor):

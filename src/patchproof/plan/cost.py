@@ -10,16 +10,17 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
-from patchproof.render.fragments import Cameras
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import Shown, expose
 from patchproof.render.raster import rasterize
-from patchproof.render.views import NEAR_SHARE, see
+from patchproof.render.views import Views, cameras, near_mm, see
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
 from patchproof.strict import Strict
 
 REPEATS = 5
@@ -71,7 +72,7 @@ def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tens
     for number in range(REPEATS + 1):
         conditions = problem.scene.draw("train", views, start=number * views)
         for name, other in others.items():
-            own_ms, other_ms = (sum(_step_ms(one, design, conditions).values()) for one in (problem, other))
+            own_ms, other_ms = (sum(_step_ms(each, design, conditions).values()) for each in (problem, other))
             ratios[name].append(other_ms / own_ms)
     return {name: statistics.median(values[1:]) for name, values in ratios.items()}
 
@@ -80,11 +81,11 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     """Milliseconds of each part of one step, in the order of the loop."""
     clock = _Clock(problem.device)
     design = design.clone().requires_grad_()
-    parts, seen = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
+    parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
     clock.start()
     shown = problem.subject.shown(design)
     parts["printer" if problem.scene.piece is not None else "textures"] = clock.lap()
-    pictures = expose(seen, shown)
+    pictures = expose(views, shown)
     parts["light, piece and camera"] = clock.lap()
     leaf = pictures.detach().requires_grad_()
     losses = [
@@ -101,30 +102,25 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     return parts
 
 
-def _see_ms(problem: Problem, shown, conditions: Conditions):
+def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dict[str, float], Views]:
     """(milliseconds of the parts of `see`, the views)."""
-    clock, size = _Clock(problem.device), (problem.training_px,) * 2
+    clock, size = _Clock(problem.device), (problem.training_px, problem.training_px)
     clock.start()
-    seen = problem.see(shown, conditions, problem.training_px)
+    views = problem.see(shown, conditions, problem.training_px)
     whole = clock.lap()
     see(problem.stage, None, conditions, size)
     parts = {"see: background": clock.lap()}
-    if problem.stage.object is not None:
-        _rasterize_object(problem, conditions, size)
+    scene = problem.scene
+    if isinstance(scene, MeshScene):
+        poses, surface = scene.camera_from_world(conditions), problem.stage.object_surface
+        matrices = np.broadcast_to(scene.matrix_px(size), (len(poses), 3, 3))
+        rasterize(surface.vertices, surface.faces, cameras(poses, matrices, size, problem.stage), near_mm(scene))
         rasterizing = min(clock.lap(), parts["see: background"])
         rest = parts.pop("see: background") - rasterizing
         parts |= {"see: rasterize object": rasterizing, "see: object's texels, background": rest}
-    if seen.piece is not None:
+    if views.piece is not None:
         parts["see: piece's footprints"] = max(0.0, whole - sum(parts.values()))
-    return parts, seen
-
-
-def _rasterize_object(problem: Problem, conditions: Conditions, size_px: tuple[int, int]) -> None:
-    scene, surface, device = problem.scene, problem.stage.object, problem.device
-    poses = torch.as_tensor(scene.camera_from_world(conditions), device=device)
-    matrices = torch.as_tensor(scene.matrix_px(size_px), device=device).expand(len(poses), 3, 3)
-    near_mm = NEAR_SHARE * scene.settings.object.length_mm
-    rasterize(surface.vertices, surface.faces, Cameras(poses, matrices, size_px), near_mm)
+    return parts, views
 
 
 class _Clock:

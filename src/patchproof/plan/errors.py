@@ -23,8 +23,9 @@ from patchproof.classifier.view import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
-from patchproof.render.photograph import expose, photograph
-from patchproof.render.views import PiecePicture, Seen, relit, see
+from patchproof.render.photograph import Shown, expose, photograph
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.views import Views, relit, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.placement import Placement
 from patchproof.strict import Strict
@@ -78,8 +79,8 @@ def measure_terms(
     """
     base = Setup(problem.stage, problem.subject.shown(design), conditions)
     terms = scene_terms(problem, design, other_surface)
-    changed = {term.name: term.change(base) for term in terms}
-    on = [term for term in terms if changed[term.name] is not None]
+    changed = {term.name: setup for term in terms if (setup := term.change(base)) is not None}
+    on = [term for term in terms if term.name in changed]
     photo = Album(problem, base, min(problem.scene.settings.camera.photo_px))
     advance = _counter(on_view, 3 * len(conditions))
     with torch.no_grad():
@@ -93,8 +94,8 @@ def measure_terms(
         for term, pictures in zip(on, small[1:], strict=True):
             rows[term.name] = _row(problem, term, small[0], pictures)
         for term, pictures in zip(wholes, whole[1:], strict=True):
-            shows = rows[term.name].codes_mean > 0
-            rows[term.name] = _row(problem, term, whole[0], pictures).model_copy(update={"in_training": shows})
+            shows = bool(rows[term.name].codes_mean)
+            rows[term.name] = _row(problem, term, whole[0], pictures).changed(in_training=shows)
         for term in _RENDERED:
             if term.name in points:
                 rows[term.name] = _row(problem, term, points[""], points[term.name])
@@ -113,8 +114,9 @@ def measure_terms(
 def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: float) -> list[TermError]:
     """The rows of all terms, with verdicts; terms without a row are off."""
     terms, verdicts, sum_of_gone = (*terms, *(t for t in _RENDERED if t.name in rows)), {}, 0.0
-    for term in sorted((t for t in terms if t.name in rows), key=lambda t: rows[t.name].confidence):
-        change = rows[term.name].confidence
+    changes = {name: row.confidence or 0.0 for name, row in rows.items()}
+    for term in sorted((t for t in terms if t.name in rows), key=lambda t: changes[t.name]):
+        change = changes[term.name]
         small = change < threshold or change == 0
         if not term.modeled:
             verdicts[term.name] = "left out" if small else "missing"
@@ -124,7 +126,7 @@ def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: floa
             sum_of_gone += change
         verdicts[term.name] = "can go" if small else "keep"
     return [
-        rows[t.name].model_copy(update={"verdict": verdicts[t.name]})
+        rows[t.name].changed(verdict=verdicts[t.name])
         if t.name in rows
         else TermError(name=t.name, key=t.key, verdict="off")
         for t in terms
@@ -187,29 +189,27 @@ class Album:
         """(1 + len(setups))×N×3×S×S: the base setup's pictures, then those of each other one."""
         stack = []
         for rows in _chunks(len(self.base.conditions), self.side_px):
-            base = self._seen(self.base, self.base.conditions[rows])
+            base = self._views(self.base, self.base.conditions[rows])
             parts = []
             for setup in (self.base, *setups):
                 conditions = setup.conditions[rows]
                 same = setup.stage is self.base.stage and setup.supersample == self.base.supersample
-                same = same and (conditions.printed_scale == base.conditions.printed_scale).all()
-                seen = relit(base, conditions) if same else self._seen(setup, conditions)
-                parts.append(self._pictures(seen, setup))
+                same = same and (conditions.pose.printed_scale == base.conditions.pose.printed_scale).all()
+                views = relit(base, conditions) if same else self._views(setup, conditions)
+                parts.append(self._pictures(views, setup.shown))
             stack.append(torch.stack(parts))
             on_view(len(base.conditions))
         return torch.cat(stack, 1)
 
-    def _seen(self, setup: Setup, conditions: Conditions) -> Seen:
+    def _views(self, setup: Setup, conditions: Conditions) -> Views:
         piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
         return see(setup.stage, piece, conditions, (self.side_px, self.side_px), setup.supersample)
 
-    def _pictures(self, seen: Seen, setup: Setup) -> Tensor:
+    def _pictures(self, views: Views, shown: Shown) -> Tensor:
         """A whole photograph goes through a real JPEG, a training view as training exposes it."""
-        if seen.reduced:
-            pictures = expose(seen, setup.shown, setup.jpeg)
-        else:
-            pictures = expose(seen, setup.shown, jpeg=False)
-            pictures = _stored(pictures, seen.conditions.jpeg) if setup.jpeg else pictures
+        pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
+        if not views.reduced and quality.any():
+            pictures = _stored(pictures, quality)
         return center_square(pictures, self.problem.classifiers[0].input_px)
 
 
@@ -222,9 +222,9 @@ def _chunks(views: int, side_px: int) -> list[slice]:
 def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
     """Pictures N×3×H×W that were JPEG files in between."""
     stored = []
-    for picture, one in zip(pictures, quality, strict=True):
+    for picture, stored_at in zip(pictures, quality, strict=True):
         file = io.BytesIO()
-        Image.fromarray(as_pixels(picture)).save(file, "JPEG", quality=int(one))
+        Image.fromarray(as_pixels(picture)).save(file, "JPEG", quality=int(stored_at))
         stored.append(from_pixels(np.asarray(Image.open(file)), pictures.device))
     return torch.stack(stored)
 
@@ -238,11 +238,11 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
     for rows in _chunks(len(base.conditions), _FINE * side):
         conditions = setup.conditions[rows]
         piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
-        seen = see(setup.stage, piece, conditions, (side, side))
+        views = see(setup.stage, piece, conditions, (side, side))
         fine = photograph(setup.stage, setup.shown, conditions, (_FINE * side, _FINE * side), jpeg=False)
         points = fine[..., _FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
-        rendered = expose(seen, setup.shown, jpeg=False)
-        inside, edge = (_mask(which, len(rendered), side) for which in _pixels(seen))
+        rendered = expose(views, setup.shown, jpeg=False)
+        inside, edge = (_mask(which, len(rendered), side) for which in _pixels(views))
         parts.append(
             torch.stack([rendered, torch.where(inside, points, rendered), torch.where(edge, points, rendered)])
         )
@@ -252,12 +252,12 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
     return named if scene.piece is None else named | {"piece's edges": edge}
 
 
-def _pixels(seen: Seen) -> tuple[Tensor, Tensor]:
+def _pixels(views: Views) -> tuple[Tensor, Tensor]:
     """Pixels that lie within the piece (or on the object), and those that the piece covers in part."""
-    if seen.piece is None:
-        return seen.object.pixel, seen.object.pixel[:0]
-    whole = seen.piece.share[:, 0] >= _WHOLE
-    return seen.piece.pixel[whole], seen.piece.pixel[~whole]
+    if views.piece is None:
+        return views.on_object.pixel, views.on_object.pixel[:0]
+    whole = views.piece.share[:, 0] >= _WHOLE
+    return views.piece.pixel[whole], views.piece.pixel[~whole]
 
 
 def _mask(pixel: Tensor, views: int, side_px: int) -> Tensor:

@@ -11,7 +11,6 @@ Left out on purpose: deciding for the user. The plan says what can go; the scene
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +20,17 @@ from patchproof.geometry import local_scale
 from patchproof.optimizer.loop import SELECT_VIEWS, selects, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.texture import Texture
 from patchproof.plan.cost import Cost, measure_cost
-from patchproof.plan.errors import TermError, Terms, measure_terms
-from patchproof.plan.samples import Sample, sample_lines, sample_plan
+from patchproof.plan.errors import Terms, measure_terms
+from patchproof.plan.samples import Sample, sample_plan
 from patchproof.scene.bend import place_bent
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.photo_scene import PhotoScene
 from patchproof.scene.placement import Placement, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.scene import Scene, load_scene
-from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
+from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM, Piece
 from patchproof.strict import Refused, Strict
 
 TERM_VIEWS = 16
@@ -134,7 +134,7 @@ def plan_scene(
         models=tuple(classifier.name for classifier in problem.classifiers),
         surface=surface_plan(scene, sentence),
         resolution=resolution_plan(problem),
-        markers=None if scene.piece is None else marker_plan(scene),
+        markers=None if scene.piece is None else marker_plan(scene, scene.piece),
         draft=draft,
         terms=terms,
         samples=sample_plan(draft.rate, terms.threshold),
@@ -149,7 +149,7 @@ def other_surface(scene: Scene) -> tuple[Placement | None, str | None]:
 
     No placement where it is refused or would be the same card; no sentence where there is no surface to lie on.
     """
-    if not isinstance(scene, MeshScene) or scene.placement is None:
+    if not isinstance(scene, MeshScene) or scene.placement is None or scene.piece is None:
         return None, None
     patch, placement = scene.settings.patch, scene.placement
     place, flag = (place_card, "false") if patch.bend else (place_bent, "true")
@@ -189,9 +189,9 @@ def resolution_plan(problem: Problem) -> Resolution:
     network_px = max(classifier.input_px for classifier in problem.classifiers)
     photo_px = scene.settings.camera.photo_px
     closest = scene.closest_px_per_mm((network_px, network_px))
-    if scene.piece is None:
+    if isinstance(subject, Texture):
         design_px = printed_px = printed = None
-        texels, per_mm = _texture_texels(scene)
+        texels, per_mm = _texture_texels(subject.scene)
     else:
         design_px, printed_px, width_mm = subject.design_px, subject.printed_px, subject.design_mm[0]
         printed, per_mm, texels = printed_px[0] / width_mm, design_px[0] / width_mm, design_px[0] * design_px[1]
@@ -209,12 +209,12 @@ def resolution_plan(problem: Problem) -> Resolution:
     )
 
 
-def marker_plan(scene: Scene) -> Markers:
+def marker_plan(scene: Scene, piece: Piece) -> Markers:
     """The marker rule on this scene's views."""
     px_per_mm = np.quantile(scales(scene, scene.settings.camera.photo_px, shorter=True), 1 - READABLE_SHARE)
     return Markers(
         needed_mm=max(MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
-        printed_mm=scene.piece.module_mm * MODULES,
+        printed_mm=piece.module_mm * MODULES,
         unreadable_share=scene.unreadable_share,
     )
 
@@ -225,13 +225,15 @@ def scales(scene: Scene, size_px: tuple[int, int], shorter: bool = False) -> np.
     """
     conditions = scene.draw("select", _VIEWS, 0)
     if scene.piece is None:
-        return scene.matrix_px(size_px)[0, 0] / conditions.distance_mm
+        if not isinstance(scene, MeshScene):
+            raise ValueError("pictures without a piece have no scale")
+        return scene.matrix_px(size_px)[0, 0] / conditions.pose.distance_mm
     faces = ~(np.abs(scene.piece_azimuth_deg(conditions)) >= 90)  # unknown angles are of pictures that show it
-    middle, found = np.array(scene.piece.size_mm) / 2, []
+    middle, px_per_mm = np.array(scene.piece.size_mm) / 2, []
     for homography in scene.piece_homographies(conditions[faces], size_px):
         mean, tilt_deg = local_scale(homography, middle)
-        found.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) if shorter else mean)
-    return np.array(found)
+        px_per_mm.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) if shorter else mean)
+    return np.array(px_per_mm)
 
 
 def _quantiles(values: np.ndarray) -> tuple[float, float]:
@@ -241,112 +243,28 @@ def _quantiles(values: np.ndarray) -> tuple[float, float]:
 
 def _texture_texels(scene: MeshScene) -> tuple[int, float]:
     """(number of texels that may change, texels per millimetre of the surface on average)."""
-    mesh, sizes = scene.mesh, np.array([m.texture_srgb.shape[1::-1] for m in scene.mesh.materials])
+    mesh, masks = scene.mesh, scene.canvas.mask if scene.canvas else ()
+    sizes = np.array([mask.shape[1::-1] for mask in masks])
     uv = mesh.corner_uv.astype(float) * sizes[mesh.face_material][:, None]
     flat = np.abs(np.linalg.det(uv[:, 1:] - uv[:, :1])).sum()
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     surface = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-    return int(sum(mask.sum() for mask in scene.canvas.mask)), float(np.sqrt(flat / surface))
+    return int(sum(mask.sum() for mask in masks)), float(np.sqrt(flat / surface))
 
 
 def _draft(problem: Problem, on_stage: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
     """The loop's design when it is first tried on the selection set, in 8-bit colors."""
     settings = problem.scene.settings.optimize
     total = next(number for number in range(1, settings.steps + 1) if selects(settings, number))
-    for step in islice(steps(problem), total):
+    for step in steps(problem):
         on_stage("draft", step.state.number, total)
-    design = from_pixels(as_pixels(step.state.design), problem.device)
-    return design, Draft(steps=step.state.number, rate=step.select_rate)
+        if step.select_rate is not None:
+            design = from_pixels(as_pixels(step.state.design), problem.device)
+            return design, Draft(steps=step.state.number, rate=step.select_rate)
+    raise ValueError("the loop ended before it selected a design")
 
 
 def _kind(scene: Scene) -> str:
     if not isinstance(scene, MeshScene):
         return f"{len(scene.photos)} photographs" if isinstance(scene, PhotoScene) else f"{len(scene.images)} images"
     return f"a mesh of {len(scene.mesh.faces)} faces"
-
-
-def plan_lines(plan: Plan) -> list[str]:
-    """A plan for the terminal."""
-    lines = [f"{plan.scene}: {plan.target}, {plan.kind}, seen by {', '.join(plan.models)}"]
-    lines += ["surface", *_surface_lines(plan.surface)]
-    lines += ["resolution", *_resolution_lines(plan.resolution)]
-    if plan.markers is not None:
-        lines += ["markers", *_marker_lines(plan.markers)]
-    lines += _term_lines(plan)
-    lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)", *sample_lines(plan.samples)]
-    lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
-    return lines if plan.cost is None else [*lines, *_cost_lines(plan.cost)]
-
-
-def _surface_lines(surface: Surface) -> list[str]:
-    width, height = surface.size_mm
-    lines = [f"  {surface.family}, {width:.0f} × {height:.0f} mm: {surface.reason}"]
-    if surface.gap_mm is not None:
-        edge, area = min(width, height), width * height
-        lines.append(
-            f"  gap {surface.gap_mm:.2f} mm ({surface.gap_mm / edge:.1%} of the shorter edge), mean "
-            f"{surface.gap_mean_mm:.2f} mm; overhang {surface.overhang_share * area:.0f} mm² "
-            f"({surface.overhang_share:.1%}); stretch {surface.stretch * max(width, height):.2f} mm "
-            f"({surface.stretch:.2%})"
-        )
-    return lines + ([f"  {surface.other}"] if surface.other else [])
-
-
-def _resolution_lines(found: Resolution) -> list[str]:
-    (far, near), (far_photo, near_photo) = found.px_per_mm_network, found.px_per_mm_photo
-    lines = [
-        f"  {far:.2f} to {near:.2f} px/mm at the network's {found.network_px} px, {far_photo:.2f} to {near_photo:.2f} "
-        f"in photographs of {found.photo_px[0]} × {found.photo_px[1]} px (5 % and 95 % of the views)"
-    ]
-    if found.design_px is None:
-        return [
-            *lines,
-            f"  {found.texels} texels may change, {found.texels_per_px:.1f} per pixel along a side in the closest view",
-        ]
-    width, height = found.design_px
-    return [
-        *lines,
-        f"  design {width} × {height} texels, {found.texels_per_px:.1f} per pixel along a side in the closest possible "
-        f"view ({found.closest_px_per_mm:.2f} px/mm)",
-        f"  printed as {found.printed_px[0]} × {found.printed_px[1]} px, {found.printed_px_per_mm:.1f} per mm",
-    ]
-
-
-def _marker_lines(markers: Markers) -> list[str]:
-    fits = "" if markers.printed_mm > 0.95 * markers.needed_mm else " (all that page, object or blank allows)"
-    return [
-        f"  needed {markers.needed_mm:.1f} mm ({PX_PER_MODULE:g} px per module at the {READABLE_SHARE:.0%} point of "
-        f"the views), printed {markers.printed_mm:.1f} mm{fits}; unreadable in {markers.unreadable_share:.0%} of views"
-    ]
-
-
-def _term_lines(plan: Plan) -> list[str]:
-    terms = plan.terms
-    lines = [
-        f"error that leaving a term out leaves ({terms.views} views of a draft of {plan.draft.steps} steps, rate "
-        f"{plan.draft.rate:.0%}, before the first classifier)",
-        f"  {'':23} {'codes: mean':>11} {'95 %':>6}   {'confidence':<15}  (what adds up to less than "
-        f"{terms.threshold:.3f} can go: selection cannot tell)",
-    ]
-    lines += [_term_line(term) for term in terms.errors if term.verdict != "off"]
-    if terms.together is not None:
-        fits = "" if terms.together < terms.threshold else ": too much, keep some"
-        lines.append(f"  {'all that can go, at once':42}   {terms.together:.3f}{fits}")
-    off = [f"{term.name} ({term.key})" for term in terms.errors if term.verdict == "off" and term.key]
-    return [*lines, *([f"  off: {', '.join(off)}"] if off else [])]
-
-
-def _term_line(term: TermError) -> str:
-    said = {"keep": "keep", "can go": "can go", "missing": "missing in training", "left out": "rightly left out"}
-    verdict = said[term.verdict] if term.key or term.verdict != "can go" else "matters little"
-    key = f" ({term.key})" if term.key else ""
-    unseen = "; training's views do not show it" if term.in_training is False else ""
-    return (
-        f"  {term.name:23} {term.codes_mean:11.2f} {term.codes_p95:6.1f}   {term.confidence:.3f} ({term.bias:+.3f})"
-        f"   {verdict}{key}{unseen}"
-    )
-
-
-def _cost_lines(cost: Cost) -> list[str]:
-    lines = [f"cost of a step ({cost.views} views of {cost.side_px} px, {cost.threads} threads): {cost.ms:.0f} ms"]
-    return [*lines, *(f"  {part.name:32} {part.ms:7.0f} ms {part.share:6.1%}" for part in cost.parts)]

@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from patchproof.channel.effects import Light, Pose
 from patchproof.color import srgb_from_linear
 from patchproof.geometry import rect_corners
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.backgrounds import load_backgrounds
+from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.settings import BackgroundSettings
 from patchproof.sheets.plan_page import Hung
@@ -59,35 +61,23 @@ def hang(scene: MeshScene, template: Template) -> Hung:
 
 def _picture(scene: MeshScene, half_mm: np.ndarray) -> np.ndarray:
     """uint8 H×W×3: the object in even light on white, spanning ± half_mm."""
-    length = scene.settings.object.length_mm
-    distance = AWAY * length
+    distance = AWAY * scene.length_mm
     px_per_mm = PICTURE_PX / (2 * half_mm.max())
     size_px = tuple(int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
     fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
-    settings = scene.settings
-    settings = settings.model_copy(
-        update={
-            "view": settings.view.model_copy(update={"fov_deg": fov, "look_at": "object"}),
-            "camera": settings.camera.model_copy(update={"photo_px": size_px, "file": None}),
-        }
+    settings = scene.settings.changed(
+        view={"fov_deg": fov, "look_at": "object"}, camera={"photo_px": size_px, "file": None}
     )
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
     plain = replace(scene, settings=settings, backgrounds=white, camera=None)
-    zero = np.zeros(1)
-    conditions = replace(
-        scene.draw("select", 1),
-        azimuth_deg=zero,
-        elevation_deg=zero,
-        roll_deg=zero,
-        distance_mm=np.full(1, distance),
-        look_at_offset=np.zeros((1, 3)),
-        ambient=np.full(1, 0.55),
-        directional=np.full(1, 0.45),
-        light_azimuth_deg=np.full(1, -30.0),
-        light_elevation_deg=np.full(1, 45.0),
-        point=zero,
-        sh2=zero,
-        gloss=zero,
+    conditions = Conditions(
+        pose=Pose(distance_mm=np.array([distance])),
+        light=Light(
+            ambient=np.array([0.55]),
+            directional=np.array([0.45]),
+            light_azimuth_deg=np.array([-30.0]),
+            light_elevation_deg=np.array([45.0]),
+        ),
     )
     with torch.no_grad():
         light = see(set_stage(plain), None, conditions, size_px, supersample=2).bare

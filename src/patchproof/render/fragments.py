@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -74,8 +74,8 @@ class Fragments:
     def where(self, keep: Tensor) -> Fragments:
         """The fragments where `keep` (P, bool) is true."""
         index = keep.nonzero()[:, 0]
-        fields = (self.pixel, self.face, self.barycentric, self.depth, self.front, self.seen)
-        return Fragments(*(field.index_select(0, index) for field in fields), self.slopes, self.shape)
+        names = ("pixel", "face", "barycentric", "depth", "front", "seen")
+        return replace(self, **{name: getattr(self, name).index_select(0, index) for name in names})
 
 
 def columns(a: Tensor, b: Tensor, c: Tensor) -> Tensor:

@@ -29,8 +29,9 @@ from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, light_texels
 from patchproof.render.texture import Footprint, look_up, on_copies, texel_table
-from patchproof.render.views import Seen, see
+from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
 
 PAPER_BACK_LINEAR = 0.8  # plain white card seen from behind
 
@@ -62,41 +63,42 @@ def photograph(
     return expose(see(stage, piece, conditions, size_px, supersample), shown, jpeg)
 
 
-def shade(seen: Seen, shown: Shown) -> Tensor:
+def shade(views: Views, shown: Shown) -> Tensor:
     """N×3×H×W linear light before lens and sensor; differentiable in what is shown."""
     if isinstance(shown, ObjectTextures):
-        return _as_pictures(seen, seen.object_light(light_texels(shown.srgb, seen.reduced)))
-    image = seen.bare
+        return _as_pictures(views, views.object_light(light_texels(shown.srgb, views.reduced)))
+    image = views.bare
     if shown is None:
-        return _as_pictures(seen, image)
-    piece = seen.piece
-    image = _blend(image, piece.back_pixel, piece.back_share, image.new_full((1, 3), PAPER_BACK_LINEAR), seen.reduced)
-    if _own_blur(seen) or _own_noise(seen):
-        return _pasted(seen, image, _piece_light(seen, shown))
-    return _as_pictures(seen, _blend(image, piece.pixel, piece.share, _piece_light(seen, shown), seen.reduced))
+        return _as_pictures(views, image)
+    piece, own = views.on_piece, _own_blur_and_noise(views)
+    image = _blend(image, piece.back_pixel, piece.back_share, image.new_full((1, 3), PAPER_BACK_LINEAR), views.reduced)
+    light = _piece_light(views, shown)
+    if own is not None:
+        return _pasted(views, image, light, *own)
+    return _as_pictures(views, _blend(image, piece.pixel, piece.share, light, views.reduced))
 
 
-def expose(seen: Seen, shown: Shown, jpeg: bool = True) -> Tensor:
-    """The photographs of views already seen."""
-    stage, scale = seen.stage, _scale(seen)
-    bends = stage.camera is not None and stage.camera.bends
-    own = shown is not None and (_own_blur(seen) or _own_noise(seen))
-    alone = seen.reduced and is_pointwise(seen.conditions, scale, jpeg)
+def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
+    """The photographs of what was seen."""
+    camera, sensor, scale = views.stage.camera, views.conditions.sensor, _scale(views)
+    bends = camera is not None and camera.bends
+    own = shown is not None and _own_blur_and_noise(views) is not None
+    alone = views.reduced and is_pointwise(sensor, scale, jpeg)
     if bends or own or isinstance(shown, ObjectTextures) or not alone:
-        light = shade(seen, shown)
-        if bends:
-            light = distorted(light, stage.camera, seen.size_px)
-        share = diagonal_share_of(seen.size_px, stage.scene.settings.camera.photo_px)
-        return develop(light, seen.conditions, scale, jpeg, share)
-    image = seen.bare_exposed
+        light = shade(views, shown)
+        if camera is not None:
+            light = distorted(light, camera, views.size_px)
+        share = diagonal_share_of(views.size_px, views.stage.scene.settings.camera.photo_px)
+        return develop(light, sensor, scale, jpeg, share)
+    image = views.bare_exposed
     if shown is not None:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
-        piece, pixels = seen.piece, seen.frame_px[0] * seen.frame_px[1]
-        back = encoded(PAPER_BACK_LINEAR * seen.gains.index_select(0, piece.back_pixel // pixels))
+        piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
+        back = encoded(PAPER_BACK_LINEAR * views.gains.index_select(0, piece.back_pixel // pixels))
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
-        light = _piece_light(seen, shown) * seen.gains.index_select(0, piece.view)
+        light = _piece_light(views, shown) * views.gains.index_select(0, piece.view)
         image = _blend(image, piece.pixel, piece.share, encoded(light), False)
-    return _as_pictures(seen, image)
+    return _as_pictures(views, image)
 
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:
@@ -111,69 +113,64 @@ def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: 
     return image.index_copy(0, pixel, mixed)
 
 
-def _piece_light(seen: Seen, picture: PiecePicture) -> Tensor:
+def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     """The light P×3 that the piece's pixels send to the camera."""
-    drawn, view = seen.conditions, seen.piece.view
-    footprints, srgb = seen.piece.texels, [picture.srgb]
+    drawn, piece = views.conditions.print, views.on_piece
+    footprints, srgb = piece.texels, [picture.srgb]
     if drawn.misregistration_mm.any():
-        footprints, srgb = _misregistered(seen, picture)
-    table = torch.cat([texel_table([one if seen.reduced else linear_from_srgb(one)], wrap=False) for one in srgb])
+        footprints, srgb = _misregistered(views, picture)
+    table = torch.cat([texel_table([one if views.reduced else linear_from_srgb(one)], wrap=False) for one in srgb])
     reflectance = look_up(footprints, table)
-    if seen.reduced:
+    if views.reduced:
         reflectance = linear_from_srgb(reflectance)
     change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
     paper = torch.as_tensor(drawn.paper).to(reflectance)
-    light = vary(reflectance, change.index_select(0, view)) * paper.index_select(0, view) * seen.piece_white
-    return light if seen.piece_gloss is None else light + seen.piece_gloss
+    light = vary(reflectance, change.index_select(0, piece.view))
+    light = light * paper.index_select(0, piece.view) * views.piece_white
+    return light if views.piece_gloss is None else light + views.piece_gloss
 
 
-def _misregistered(seen: Seen, picture: PiecePicture) -> tuple[Footprint, list[Tensor]]:
+def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[Tensor]]:
     """Each view's own print of the picture, and footprints on all of them."""
     x0, y0, x1, y1 = picture.box_px
-    width_mm, height_mm = seen.stage.piece.size_mm
-    shifts = torch.as_tensor(seen.conditions.misregistration_mm).to(picture.srgb)
+    width_mm, height_mm = views.stage.piece_surface.size_mm
+    shifts = torch.as_tensor(views.conditions.print.misregistration_mm).to(picture.srgb)
     shifts = shifts * shifts.new_tensor([(x1 - x0) / width_mm, (y1 - y0) / height_mm])
     prints = [misregistered(picture.srgb, shift) for shift in shifts]
     height, width = picture.srgb.shape[:2]
     texels = sum((max(width >> k, 1) + 1) * (max(height >> k, 1) + 1) for k in range(max(width, height).bit_length()))
-    return on_copies(seen.piece.texels, seen.piece.view * texels), prints
+    return on_copies(views.on_piece.texels, views.on_piece.view * texels), prints
 
 
-def _pasted(seen: Seen, image: Tensor, light: Tensor) -> Tensor:
+def _pasted(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:
     """The piece put into photographs with their own blur and noise, which the photographs around it have already."""
-    piece, scene, scale = seen.piece, seen.stage.scene, _scale(seen)
-    layer = (
-        torch.zeros(len(image), 4)
-        .to(image)
-        .index_copy(0, piece.pixel, torch.cat([light, light.new_ones(len(light), 1)], 1) * piece.share)
-    )
-    layer = _as_pictures(seen, layer)
-    layer = blurred(layer, torch.as_tensor(scene.piece_blur_px(seen.conditions) * scale).to(image))
+    piece = views.on_piece
+    values = torch.cat([light, light.new_ones(len(light), 1)], 1) * piece.share
+    layer = _as_pictures(views, torch.zeros(len(image), 4).to(image).index_copy(0, piece.pixel, values))
+    layer = blurred(layer, torch.as_tensor(blur_px).to(image))
     share = layer[:, 3:]
-    whole = _as_pictures(seen, image) * (1 - share) + layer[:, :3]
-    noise = torch.as_tensor(scene.piece_noise(seen.conditions) * scale).to(image)
-    return torch.lerp(whole, noisy(whole, noise, seen.conditions.noise_seed + _OTHER_GRAIN), share)
+    whole = _as_pictures(views, image) * (1 - share) + layer[:, :3]
+    seeds = views.conditions.sensor.noise_seed + _OTHER_GRAIN
+    return torch.lerp(whole, noisy(whole, torch.as_tensor(noise).to(image), seeds), share)
 
 
 _OTHER_GRAIN = 1 << 40  # the photograph's own grain is not that of the camera that photographs it again
 
 
-def _own_blur(seen: Seen) -> bool:
-    """Whether the scene's photographs have a blur of their own that shows at this size."""
-    own = seen.object is None and seen.stage.scene.piece_blur_px(seen.conditions).max() * _scale(seen)
-    return bool(own >= SMALLEST_BLUR_PX)
+def _own_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
+    """What the scene's photographs have of their own, N at this size; None where neither shows."""
+    scene, scale = views.stage.scene, _scale(views)
+    if isinstance(scene, MeshScene):
+        return None
+    blur_px, noise = scene.piece_blur_px(views.conditions) * scale, scene.piece_noise(views.conditions) * scale
+    return (blur_px, noise) if blur_px.max() >= SMALLEST_BLUR_PX or noise.max() >= SMALLEST_NOISE else None
 
 
-def _own_noise(seen: Seen) -> bool:
-    own = seen.object is None and seen.stage.scene.piece_noise(seen.conditions).max() * _scale(seen)
-    return bool(own >= SMALLEST_NOISE)
-
-
-def _scale(seen: Seen) -> float:
+def _scale(views: Views) -> float:
     """The pictures' size over the photograph's."""
-    return min(seen.size_px) / min(seen.stage.scene.settings.camera.photo_px)
+    return min(views.size_px) / min(views.stage.scene.settings.camera.photo_px)
 
 
-def _as_pictures(seen: Seen, image: Tensor) -> Tensor:
-    width, height = seen.frame_px
-    return image.view(len(seen.conditions), height, width, -1).permute(0, 3, 1, 2)
+def _as_pictures(views: Views, image: Tensor) -> Tensor:
+    width, height = views.frame_px
+    return image.view(len(views.conditions), height, width, -1).permute(0, 3, 1, 2)

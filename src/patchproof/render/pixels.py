@@ -112,8 +112,9 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     where, parts = layout([(width, height)], wrap=False, device=at.device), []
     for which, taps, learned in ((inside, DESIGN_TAPS, True), (~inside, FRAME_TAPS, False)):
         index = which.nonzero()[:, 0]
-        one = (values.index_select(0, index) for values in (uv, uv_dx, uv_dy))
-        parts.append((index, footprint(where, at.new_zeros(len(index), dtype=torch.long), *one, taps, True, learned)))
+        at_index = [values.index_select(0, index) for values in (uv, uv_dx, uv_dy)]
+        texture = at.new_zeros(len(index), dtype=torch.long)
+        parts.append((index, footprint(where, texture, *at_index, taps=taps, blocks=True, learned=learned)))
     return joined(parts, len(at))
 
 
@@ -142,8 +143,8 @@ def _weighted(corner_values: Tensor, fragments: Fragments) -> Tensor:
 
 def _slopes(corner_values: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor]:
     """How the same change from pixel to pixel, to the right and down."""
-    weights = (fragments.barycentric_dx, fragments.barycentric_dy)
-    return tuple(_sum(corner_values, fragments.corner, weight) for weight in weights)
+    dx, dy = fragments.barycentric_dx, fragments.barycentric_dy
+    return _sum(corner_values, fragments.corner, dx), _sum(corner_values, fragments.corner, dy)
 
 
 def _sum(corner_values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:

@@ -88,6 +88,20 @@ class Stage:
     piece: PieceSurface | None
     camera: Camera | None  # a calibrated one
 
+    @property
+    def object_surface(self) -> ObjectSurface:
+        """The object's surface; a ValueError where there is none."""
+        if self.object is None:
+            raise ValueError("a scene made of pictures has no object's surface")
+        return self.object
+
+    @property
+    def piece_surface(self) -> PieceSurface:
+        """The piece's surface; a ValueError where nothing hangs on the object."""
+        if self.piece is None:
+            raise ValueError("nothing hangs on the object")
+        return self.piece
+
 
 def set_stage(scene: Scene, device: torch.device | str = "cpu") -> Stage:
     """Move a scene's mesh, textures and piece to a device."""

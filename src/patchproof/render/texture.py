@@ -125,17 +125,18 @@ def footprint(
     level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, most)
     level = level.minimum(where.levels.index_select(0, texture) - 1)
     size, offset = where.place(texture, level)
-    seen = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
+    at = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
     if most == 1:
-        return Footprint((Group(None, *_taps(*seen, 1, 1, where.wrap, blocks), learned),), len(uv))
+        return Footprint((Group(None, *_taps(*at, 1, 1, where.wrap, blocks), learned),), len(uv))
     texel_span = torch.exp2(-level.float())
-    columns, rows = ((side * texel_span).ceil().clamp(1, most).long() for side in (across, down))
-    count = columns * (most + 1) + rows
+    across, down = ((side * texel_span).ceil().clamp(1, most).long() for side in (across, down))
+    count = across * (most + 1) + down
     groups = []
     for key in count.bincount().nonzero()[:, 0].tolist():
         fragment = (count == key).nonzero()[:, 0]
-        one = (values.index_select(0, fragment) for values in seen)
-        texel, weight = _taps(*one, *divmod(key, most + 1), where.wrap, blocks)
+        center, dx, dy, level_size, first = (values.index_select(0, fragment) for values in at)
+        columns, rows = divmod(key, most + 1)
+        texel, weight = _taps(center, dx, dy, level_size, first, columns, rows, where.wrap, blocks)
         groups.append(Group(fragment, texel, weight, learned))
     return Footprint(tuple(groups), len(uv))
 
@@ -143,20 +144,20 @@ def footprint(
 def joined(parts: list[tuple[Tensor, Footprint]], fragments: int) -> Footprint:
     """One footprint of several, each of the fragments that its indices name."""
     groups = (
-        Group(index.index_select(0, group.fragment), group.texel, group.weight, group.learned)
+        replace(group, fragment=index if group.fragment is None else index.index_select(0, group.fragment))
         for index, part in parts
         for group in part.groups
     )
     return Footprint(tuple(groups), fragments)
 
 
-def on_copies(seen: Footprint, offset: Tensor) -> Footprint:
+def on_copies(footprint: Footprint, offset: Tensor) -> Footprint:
     """The same footprints on copies of their textures that begin `offset` texels on, P of them."""
     groups = []
-    for group in seen.groups:
+    for group in footprint.groups:
         own = offset if group.fragment is None else offset.index_select(0, group.fragment)
         groups.append(replace(group, texel=group.texel + own[:, None]))
-    return Footprint(tuple(groups), seen.fragments)
+    return Footprint(tuple(groups), footprint.fragments)
 
 
 def _length(vectors: Tensor) -> Tensor:
@@ -218,9 +219,9 @@ def _centered(count: int, like: Tensor) -> Tensor:
     return torch.arange(count, device=like.device) - (count - 1) / 2
 
 
-def look_up(seen: Footprint, texels: Tensor) -> Tensor:
+def look_up(footprint: Footprint, texels: Tensor) -> Tensor:
     """The P×3 that footprints see in a T×3 table; differentiable in `texels`."""
-    return _LookUp.apply(texels, seen)
+    return _LookUp.apply(texels, footprint)
 
 
 class _LookUp(torch.autograd.Function):
@@ -229,10 +230,10 @@ class _LookUp(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, texels: Tensor, seen: Footprint) -> Tensor:
-        ctx.seen, ctx.texels = seen, len(texels)
-        out = texels.new_zeros(seen.fragments, 3)
-        for group in seen.groups:
+    def forward(ctx, texels: Tensor, footprint: Footprint) -> Tensor:
+        ctx.footprint, ctx.texels = footprint, len(texels)
+        out = texels.new_zeros(footprint.fragments, 3)
+        for group in footprint.groups:
             weight = group.weight.to(texels.dtype)
             sums = F.embedding_bag(group.texel, texels, per_sample_weights=weight, mode="sum")
             if group.fragment is None:
@@ -241,13 +242,14 @@ class _LookUp(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):
+    def backward(ctx, *gradients: Tensor):
+        (gradient,) = gradients
         out = gradient.new_zeros(3, ctx.texels)
-        for group in ctx.seen.groups:
+        for group in ctx.footprint.groups:
             if not group.learned:
                 continue
             weight, texel = group.weight.to(gradient.dtype), group.texel.flatten()
-            one = gradient if group.fragment is None else gradient[group.fragment]
-            for channel, part in zip(out, one.unbind(1), strict=True):
+            own = gradient if group.fragment is None else gradient[group.fragment]
+            for channel, part in zip(out, own.unbind(1), strict=True):
                 channel.scatter_add_(0, texel, (weight * part[:, None]).flatten())
         return out.T, None

@@ -1,9 +1,9 @@
 """`see`: everything about a batch of views that what is optimized does not change.
 
-In: a stage, conditions and a picture's size. Out: `Seen`: for each pixel what lies behind the piece, and for each pixel
-of the piece how much of it the piece covers, which texels it looks at and what light falls there. Rasterizing happens
-here and nowhere else: views that were seen can be lit, printed and photographed anew (`relit`) at a fraction of the
-cost, and shaded with any number of designs.
+In: a stage, conditions and a picture's size. Out: `Views`: for each pixel what lies behind the piece, and for each
+pixel of the piece how much of it the piece covers, which texels it looks at and what light falls there. Rasterizing
+happens here and nowhere else: views that were seen can be lit, printed and photographed anew (`relit`) at a fraction of
+the cost, and shaded with any number of designs.
 
 The object's edges take one sample per pixel, or `supersample`² on demand; those of the piece are antialiased always
 (see `pixels`). Left out on purpose: transparency.
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from patchproof.channel.camera import encoded, gains
 from patchproof.channel.lens import Frame, pinhole_frame
-from patchproof.channel.light import Light, highlight, irradiance, light_of
+from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.fragments import Cameras, Fragments
 from patchproof.render.pixels import (
@@ -36,19 +36,22 @@ from patchproof.render.raster import rasterize
 from patchproof.render.stage import ObjectSurface, PieceSurface, Stage
 from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions, with_poses_of
+from patchproof.scene.image_scene import ImageScene
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.photo_scene import PhotoScene
 
-NEAR_SHARE = 1e-3  # of the object's length: nearer things are cut
+NEAR_SHARE = 1e-3  # of the object's length
 
 
 @dataclass(frozen=True)
-class Seen:
+class Views:
     """A batch of views of `size_px`, rendered at `frame_px` (larger where a lens will bend the picture)."""
 
     stage: Stage
     conditions: Conditions
     size_px: tuple[int, int]
     frame_px: tuple[int, int]
-    light: Light | None
+    light: Lighting | None  # None, like the eyes, where pictures bring their own
     eye_mm: Tensor | None  # N×3
     background: np.ndarray  # uint8 N×H×W×3 sRGB
     object: ObjectPixels | None
@@ -64,30 +67,50 @@ class Seen:
         """
         return min(self.size_px) < min(self.stage.scene.settings.camera.photo_px)
 
+    @property
+    def on_object(self) -> ObjectPixels:
+        """The object's pixels; a ValueError where a scene is made of pictures."""
+        if self.object is None:
+            raise ValueError("pictures have no object to look up")
+        return self.object
+
+    @property
+    def on_piece(self) -> PiecePixels:
+        """The piece's pixels; a ValueError where nothing was seen on the object."""
+        if self.piece is None:
+            raise ValueError("these views were seen without a piece")
+        return self.piece
+
     @cached_property
     def bare(self) -> Tensor:
         """The lit object without the piece, N·H·W × 3."""
-        if self.object is None:
-            return self._behind
-        return self.object_light(self.stage.object.texels(self.reduced))
+        return self._behind if self.object is None else self.object_light(self._own_texels)
 
     def object_light(self, texels: Tensor) -> Tensor:
         """The lit object with these texels before its background, N·H·W × 3; differentiable."""
-        seen, color = self.object, self._object_color(texels)
-        if seen.samples == 1:
-            return self._behind.index_copy(0, seen.pixel, color)
-        share = torch.full_like(color[:, :1], 1 / seen.samples**2)
-        covered = torch.zeros_like(self._behind[:, :1]).index_add_(0, seen.pixel, share)
+        pixels, color = self.on_object, self._object_color(texels)
+        if pixels.samples == 1:
+            return self._behind.index_copy(0, pixels.pixel, color)
+        share = torch.full_like(color[:, :1], 1 / pixels.samples**2)
+        covered = torch.zeros_like(self._behind[:, :1]).index_add_(0, pixels.pixel, share)
         if not self.reduced:
-            return (self._behind * (1 - covered)).index_add(0, seen.pixel, color * share)
+            return (self._behind * (1 - covered)).index_add(0, pixels.pixel, color * share)
         codes = srgb_from_linear(self._behind) * (1 - covered)
-        return linear_from_srgb(codes.index_add(0, seen.pixel, srgb_from_linear(color) * share))
+        return linear_from_srgb(codes.index_add(0, pixels.pixel, srgb_from_linear(color) * share))
 
     def _object_color(self, texels: Tensor) -> Tensor:
         """The light P×3 of the object's fragments."""
-        seen = self.object
-        light = irradiance(seen.normal, seen.view, self.light, seen.position_mm)[:, None]
-        return look_up(seen.texels, texels) * (seen.color * light)
+        return look_up(self.on_object.texels, texels) * (self.on_object.color * self._irradiance(self.on_object))
+
+    def _irradiance(self, pixels: ObjectPixels | PiecePixels) -> Tensor:
+        """The light P×1 that falls on pixels."""
+        if self.light is None:
+            raise ValueError("pictures bring their own light")
+        return irradiance(pixels.normal, pixels.view, self.light, pixels.position_mm)[:, None]
+
+    @property
+    def _own_texels(self) -> Tensor:
+        return self.stage.object_surface.texels(self.reduced)
 
     @cached_property
     def _behind(self) -> Tensor:
@@ -106,94 +129,98 @@ class Seen:
         image = _looked_up(self.background, srgb_from_linear(light.clip(0, 1)), self.stage.device)
         if self.object is None:
             return image
-        color = self._object_color(self.stage.object.texels(self.reduced))
-        color = color * self.gains.index_select(0, self.object.view)
+        color = self._object_color(self._own_texels) * self.gains.index_select(0, self.object.view)
         return image.index_copy(0, self.object.pixel, encoded(color))
 
     @cached_property
     def gains(self) -> Tensor:
         """The camera's factors, N×3."""
-        return gains(self.conditions, torch.zeros(0, device=self.stage.device))
+        return gains(self.conditions.sensor, torch.zeros(0, device=self.stage.device))
 
     @cached_property
     def piece_white(self) -> Tensor:
         """The light on white paper at the piece's pixels, P×3 or P×1."""
-        seen = self.piece
-        if seen.white is not None:
-            return seen.white
-        return irradiance(seen.normal, seen.view, self.light, seen.position_mm)[:, None]
+        white = self.on_piece.white
+        return self._irradiance(self.on_piece) if white is None else white
 
     @cached_property
     def piece_gloss(self) -> Tensor | None:
         """What glossy paper reflects on top, P×1; None where it is matte."""
-        if self.light is None or self.light.gloss is None:
+        if self.light is None or self.eye_mm is None:
             return None
-        seen = self.piece
-        return highlight(seen.normal, seen.position_mm, self.eye_mm, seen.view, self.light)[:, None]
+        pixels = self.on_piece
+        shine = highlight(pixels.normal, pixels.position_mm, self.eye_mm, pixels.view, self.light)
+        return None if shine is None else shine[:, None]
 
 
 def see(
     stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int], supersample: int = 1
-) -> Seen:
+) -> Views:
     """The views of `conditions`, with nothing on the object where `piece` is None. Any picture of the same size as
     `piece` can be shown in them; the object behind it is seen, too.
     """
-    if stage.object is None:
-        return _see_pictures(stage, piece, conditions, size_px)
     scene = stage.scene
+    if not isinstance(scene, MeshScene):
+        return _see_pictures(stage, scene, piece, conditions, size_px)
     frame = Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
     if stage.camera is not None:
         frame = pinhole_frame(stage.camera, size_px)
-    frame_px, matrix = frame.size_px, frame.matrix_px
     poses = scene.camera_from_world(conditions)
-    near_mm = NEAR_SHARE * scene.settings.object.length_mm
-    light = _light(stage, conditions)
+    light = _light(scene, stage.device, conditions)
     eye = torch.as_tensor(-(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], dtype=torch.float32)
 
-    def drawn(surface: ObjectSurface | PieceSurface, samples: int) -> Fragments:
-        fine = np.diag([samples, samples, 1]) @ matrix
-        own = poses if surface is stage.object else scene.camera_from_print(conditions)
-        cameras = _cameras(stage, own, fine, (frame_px[0] * samples, frame_px[1] * samples))
-        return rasterize(surface.vertices, surface.faces, cameras, near_mm)
+    def drawn(surface: ObjectSurface | PieceSurface, poses: np.ndarray, samples: int) -> Fragments:
+        width, height = frame.size_px
+        fine = np.diag([samples, samples, 1]) @ frame.matrix_px
+        matrices = np.broadcast_to(fine, (len(poses), 3, 3))
+        placed = cameras(poses, matrices, (width * samples, height * samples), stage)
+        return rasterize(surface.vertices, surface.faces, placed, near_mm(scene))
 
-    fine = drawn(stage.object, supersample)
+    fine = drawn(stage.object_surface, poses, supersample)
     parts, taps = None, OBJECT_TAPS if scene.canvas is None else OBJECT_LEARNED_TAPS
     if piece is not None:
-        surface = drawn(stage.piece, 1)
-        covering = surface if supersample == 1 else drawn(stage.piece, supersample)
+        printed = scene.camera_from_print(conditions)
+        surface = drawn(stage.piece_surface, printed, 1)
+        covering = surface if supersample == 1 else drawn(stage.piece_surface, printed, supersample)
         hidden = _hidden_share(surface, covering, fine, supersample)
-        parts = piece_pixels(stage.piece, piece, surface, hidden, needs_position=_local(light))
-    return Seen(
+        parts = piece_pixels(stage.piece_surface, piece, surface, hidden, needs_position=_local(light))
+    pixel, local = _coarse_pixel(fine, supersample), light.lamp is not None
+    return Views(
         stage,
         conditions,
         size_px,
-        frame_px,
+        frame.size_px,
         light,
         eye.to(stage.device),
-        _background(stage, conditions, size_px, frame),
-        object_pixels(stage.object, fine, _coarse_pixel(fine, supersample), supersample, light.lamp is not None, taps),
+        _background(scene, conditions, size_px, frame),
+        object_pixels(stage.object_surface, fine, pixel, supersample, local, taps),
         parts,
     )
 
 
-def relit(seen: Seen, conditions: Conditions) -> Seen:
+def relit(views: Views, conditions: Conditions) -> Views:
     """The same views under other light, with another print and camera; poses and backgrounds stay."""
-    conditions = with_poses_of(conditions, seen.conditions)
-    light = None if seen.light is None else _light(seen.stage, conditions)
-    return replace(seen, conditions=conditions, light=light)
+    conditions, scene = with_poses_of(conditions, views.conditions), views.stage.scene
+    light = _light(scene, views.stage.device, conditions) if isinstance(scene, MeshScene) else None
+    return replace(views, conditions=conditions, light=light)
 
 
-def _cameras(stage: Stage, poses: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -> Cameras:
-    matrix = torch.as_tensor(matrix, device=stage.device).expand(len(poses), 3, 3)
-    return Cameras(torch.as_tensor(poses, device=stage.device), matrix, size_px)
+def cameras(poses: np.ndarray, matrices: np.ndarray, size_px: tuple[int, int], stage: Stage) -> Cameras:
+    """Cameras N×4×4 with matrices N×3×3 on a stage's device."""
+    poses_on, matrices_on = (torch.as_tensor(part.copy(), device=stage.device) for part in (poses, matrices))
+    return Cameras(poses_on, matrices_on, size_px)
 
 
-def _light(stage: Stage, conditions: Conditions) -> Light:
-    scene = stage.scene
-    return light_of(conditions, scene.frame.normal, scene.frame.up, scene.middle_mm, stage.device)
+def near_mm(scene: MeshScene) -> float:
+    """What is nearer to a camera is cut."""
+    return NEAR_SHARE * scene.length_mm
 
 
-def _local(light: Light) -> bool:
+def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Lighting:
+    return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, scene.middle_mm, device)
+
+
+def _local(light: Lighting) -> bool:
     """Whether the light on the piece depends on where one is and where one looks from."""
     return light.lamp is not None or light.gloss is not None
 
@@ -224,22 +251,28 @@ def _hidden_share(piece: Fragments, covering: Fragments, front: Fragments, sampl
     return (sums[0] / sums[1].clamp_min(1)).index_select(0, piece.pixel)
 
 
-def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Seen:
+def _see_pictures(
+    stage: Stage,
+    scene: PhotoScene | ImageScene,
+    piece: PiecePicture | None,
+    conditions: Conditions,
+    size_px: tuple[int, int],
+) -> Views:
     """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
-    scene, device, parts = stage.scene, stage.device, None
+    parts = None
     if piece is not None:
-        homographies = torch.as_tensor(scene.piece_homographies(conditions, size_px), device=device)
-        poses = torch.eye(4, dtype=torch.float64, device=device).expand(len(homographies), 4, 4)
-        fragments = rasterize(stage.piece.vertices, stage.piece.faces, Cameras(poses, homographies, size_px), 1e-9)
-        coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=device)
-        parts = piece_pixels(stage.piece, piece, fragments, None, white_coefficients=coefficients)
-    return Seen(stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts)
+        homographies, surface = scene.piece_homographies(conditions, size_px), stage.piece_surface
+        flat = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)
+        fragments = rasterize(surface.vertices, surface.faces, flat, 1e-9)
+        coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=stage.device)
+        parts = piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
+    return Views(stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts)
 
 
-def _background(stage: Stage, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
+def _background(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
     """What lies behind N views, uint8 N×H×W×3 before exposure; its edge goes on in a lens's margin."""
-    photo_px = stage.scene.settings.camera.photo_px
-    pictures = [stage.scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.background]
+    photo_px = scene.settings.camera.photo_px
+    pictures = [scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.pose.background]
     margin = ((0, 0), (frame.top, frame.bottom), (frame.left, frame.right), (0, 0))
     return np.pad(np.stack(pictures), margin, mode="edge")
 

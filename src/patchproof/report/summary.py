@@ -5,6 +5,7 @@ In: a promise, an evaluation or a report. Out: lines of text.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -48,10 +49,7 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.culprit is not None:
         share = summary.ledger[summary.culprit].share
         lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
-    codes: dict[str, int] = {}
-    for photo in report.photos:
-        if photo.code:
-            codes[photo.code] = codes.get(photo.code, 0) + 1
+    codes = Counter(photo.code for photo in report.photos if photo.code)
     return lines + [f"  {code}: {count}" for code, count in sorted(codes.items())]
 
 

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,8 +20,9 @@ from PIL import Image
 
 from patchproof import geometry
 from patchproof.channel.camera import develop
+from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
-from patchproof.channel.light import Lamp, Light, irradiance
+from patchproof.channel.light import Lamp, Lighting, irradiance
 from patchproof.channel.tone import codes_of_light
 from patchproof.color import linear_from_srgb
 from patchproof.photo.detect import DICTIONARY, cells_of
@@ -105,11 +105,9 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     exposure = rng.uniform(0.5, 0.85) / (brightest.max() * white_balance.max())
     light = _light_in_picture(px_from_mm, page_mm / 2, sources)
     seen = _warped(page, px_from_mm) * light[..., None]
-    drawn = SimpleNamespace(
+    sensor = Sensor(
         vignetting=np.array([rng.uniform(0, 0.2)]),
         blur_px=np.array([rng.uniform(0, 1)]),
-        motion_px=np.zeros(1),
-        motion_deg=np.zeros(1),
         exposure_ev=np.array([np.log2(exposure)]),
         white_balance=white_balance[None],
         noise=np.array([rng.uniform(0, 0.01)]),
@@ -117,9 +115,9 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
         jpeg=np.array([rng.uniform(60, 95)]),
     )
     picture = torch.tensor(seen.transpose(2, 0, 1)[None], dtype=torch.float32)
-    picture = develop(picture, drawn, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
+    picture = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     codes = codes_of_light(linear_from_srgb(picture), camera)
-    return Shot(_stored(codes, int(drawn.jpeg[0])), at_middle * exposure * white_balance)
+    return Shot(_stored(codes, int(sensor.jpeg[0])), at_middle * exposure * white_balance)
 
 
 def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
@@ -127,7 +125,7 @@ def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
     page[y : y + h, x : x + w] = value[..., None] if value.ndim == 2 else value
 
 
-def _light(rng: np.random.Generator) -> Light:
+def _light(rng: np.random.Generator) -> Lighting:
     """Ambient light, sun, and a lamp 300 to 600 mm away, so that one side of the page is up to twice as light."""
 
     def on(*values) -> torch.Tensor:
@@ -139,17 +137,17 @@ def _light(rng: np.random.Generator) -> Light:
     toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), (0, 0, -1.0), (0, -1.0, 0))
     near = Lamp(on(rng.uniform(0.2, 0.8)), on(np.linalg.norm(lamp)), torch.tensor(lamp[None], dtype=torch.float32))
     direction = torch.tensor(toward[None], dtype=torch.float32)
-    return Light(on(rng.uniform(0.3, 0.7)), on(rng.uniform(0, 0.5)), direction, lamp=near)
+    return Lighting(on(rng.uniform(0.3, 0.7)), on(rng.uniform(0, 0.5)), direction, lamp=near)
 
 
-def _falling(from_middle_mm: np.ndarray, sources: Light) -> np.ndarray:
+def _falling(from_middle_mm: np.ndarray, sources: Lighting) -> np.ndarray:
     """Light N on points N×2 of the page's plane."""
     position = torch.tensor(np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))]), dtype=torch.float32)
     normal, view = torch.tensor([[0.0, 0.0, -1.0]]).expand_as(position), torch.zeros(len(position), dtype=torch.long)
     return irradiance(normal, view, sources, position).numpy().astype(float)
 
 
-def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: Light) -> np.ndarray:
+def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: Lighting) -> np.ndarray:
     """Light H×W on the page's plane as the photograph sees it; computed at every 8th pixel, since it is smooth."""
     width, height = PHOTO_PX
     x, y = np.meshgrid(np.arange(4.0, width, 8), np.arange(4.0, height, 8))

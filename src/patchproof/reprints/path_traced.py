@@ -24,6 +24,7 @@ from torch import Tensor
 
 from patchproof import geometry
 from patchproof.channel.camera import develop
+from patchproof.channel.effects import Light, Print
 from patchproof.channel.lens import Frame, distorted, pinhole_frame
 from patchproof.channel.light import irradiance_basis
 from patchproof.channel.printer import misregistered, vary
@@ -60,7 +61,7 @@ class Optics:
 
 def draw_optics(conditions: Conditions) -> Optics:
     """One view's light and lens, evenly drawn; they follow from the view's noise seed."""
-    u = np.random.default_rng([int(conditions.noise_seed[0]), 1]).random(2)
+    u = np.random.default_rng([int(conditions.sensor.noise_seed[0]), 1]).random(2)
     ends = zip((LIGHT_RADIUS_DEG, APERTURE_MM), u, strict=True)
     return Optics(*(float(low + (high - low) * share) for (low, high), share in ends))
 
@@ -72,7 +73,7 @@ def photograph_traced(
     light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
     if stage.camera is not None:
         light = distorted(light, stage.camera, stage.scene.settings.camera.photo_px)
-    return develop(light, conditions, 1.0, jpeg=False)
+    return develop(light, conditions.sensor, 1.0, jpeg=False)
 
 
 def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
@@ -86,14 +87,14 @@ def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Condition
         "type": "scene",
         "integrator": {"type": "path", "max_depth": MOST_BOUNCES, "hide_emitters": True},
         "sensor": _sensor(mi, scene, conditions, frame, box, optics.aperture_mm),
-        **_lights(mi, scene, conditions, optics.light_radius_deg),
+        **_lights(mi, scene, conditions.light, optics.light_radius_deg),
         **{f"object{i}": part for i, part in enumerate(_object(mi, stage))},
     }
     if piece is not None:
         parts["piece"] = _piece(mi, scene, piece, conditions)
     traced, total = mi.load_dict(parts), 0.0
     for i in range(PASSES):  # seeds of one view are its own
-        seed = (int(conditions.noise_seed[0]) * PASSES + i) % 2**32
+        seed = (int(conditions.sensor.noise_seed[0]) * PASSES + i) % 2**32
         total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
     whole = linear_from_srgb(_background(scene, conditions, frame) / 255.0)
     left, top, width, height = box
@@ -142,7 +143,7 @@ def _frame(stage: Stage) -> Frame:
 
 def _background(scene: MeshScene, conditions: Conditions, frame: Frame) -> np.ndarray:
     photo_px = scene.settings.camera.photo_px
-    picture = scene.backgrounds.picture(conditions.background[0], photo_px, photo_px)
+    picture = scene.backgrounds.picture(conditions.pose.background[0], photo_px, photo_px)
     return np.pad(picture, ((frame.top, frame.bottom), (frame.left, frame.right), (0, 0)), mode="edge")
 
 
@@ -153,7 +154,7 @@ def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: fl
     if not np.isfinite(seen).all():  # some of it lies behind the camera
         return 0, 0, *frame.size_px
     # out of focus and printed larger it reaches farther
-    margin = 8 + 0.05 * np.ptp(seen, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.distance_mm[0]
+    margin = 8 + 0.05 * np.ptp(seen, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.pose.distance_mm[0]
     size = np.array(frame.size_px)
     low = np.clip(np.floor(seen.min(0) - margin), 0, size - 1).astype(int)
     high = np.clip(np.ceil(seen.max(0) + margin), low + 1, size).astype(int)
@@ -192,15 +193,15 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
     }
 
 
-def _lights(mi: ModuleType, scene: MeshScene, conditions: Conditions, radius_deg: float) -> dict:
+def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -> dict:
     """The surroundings, a disk far away for the directional light, and a small sphere for the lamp.
 
     An outgoing radiance of 1 is white: paper of reflectance ρ gives ρ·E/π, so that E is π where our light is 1.
     """
-    found = {"sky": _sky(mi, conditions)}
+    found = {"sky": _sky(mi, light)}
     frame, middle = scene.frame, scene.middle_mm
-    if conditions.directional[0] > 0:
-        toward = geometry.orbit(conditions.light_azimuth_deg, conditions.light_elevation_deg, frame.normal, frame.up)[0]
+    if light.directional[0] > 0:
+        toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)[0]
         far, angle = _FAR * scene.settings.object.length_mm, np.radians(radius_deg)
         place = mi.ScalarTransform4f().look_at(
             (middle + far * toward).tolist(), middle.tolist(), _across(toward).tolist()
@@ -208,17 +209,17 @@ def _lights(mi: ModuleType, scene: MeshScene, conditions: Conditions, radius_deg
         found["sun"] = {
             "type": "disk",
             "to_world": place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle))),
-            "emitter": _emitter(conditions.directional[0] / np.sin(angle) ** 2),
+            "emitter": _emitter(light.directional[0] / np.sin(angle) ** 2),
         }
-    if conditions.point[0] > 0:
-        away = geometry.orbit(conditions.point_azimuth_deg, conditions.point_elevation_deg, frame.normal, frame.up)[0]
-        distance = float(conditions.point_distance_mm[0])
+    if light.point[0] > 0:
+        away = geometry.orbit(light.point_azimuth_deg, light.point_elevation_deg, frame.normal, frame.up)[0]
+        distance = float(light.point_distance_mm[0])
         radius = min(LAMP_RADIUS_MM, distance / 4)
         found["lamp"] = {
             "type": "sphere",
             "center": (middle + distance * away).tolist(),
             "radius": radius,
-            "emitter": _emitter(conditions.point[0] * (distance / radius) ** 2),
+            "emitter": _emitter(light.point[0] * (distance / radius) ** 2),
         }
     return found
 
@@ -232,9 +233,9 @@ def _across(direction: np.ndarray) -> np.ndarray:
     return np.eye(3)[np.abs(direction).argmin()]
 
 
-def _sky(mi: ModuleType, conditions: Conditions) -> dict:
+def _sky(mi: ModuleType, light: Light) -> dict:
     """Light from all around; almost no paths are sent to it: those that surfaces scatter find it anyway."""
-    picture = np.repeat(sky_radiance(sky_directions(), conditions)[..., None], 3, -1).astype(np.float32)
+    picture = np.repeat(sky_radiance(sky_directions(), light)[..., None], 3, -1).astype(np.float32)
     return {"type": "envmap", "bitmap": mi.Bitmap(picture), "sampling_weight": _SKY_WEIGHT}
 
 
@@ -246,49 +247,50 @@ def sky_directions() -> np.ndarray:
     return np.stack([level * np.sin(phi), up, -level * np.cos(phi)], -1)
 
 
-def sky_radiance(toward: np.ndarray, conditions: Conditions) -> np.ndarray:
+def sky_radiance(toward: np.ndarray, light: Light) -> np.ndarray:
     """Radiance of the surroundings in directions ...×3, whose irradiance is `channel.light`'s ambient light.
 
     A surface sees first orders with 2/3 and second with 1/4 of the weight of an even light (A1/π and A2/π in
     Ramamoorthi and Hanrahan, 2001). Light that would be negative is 0 here by direction, there by surface.
     """
-    ambient, even = conditions.ambient[0], np.ones(toward.shape[:-1])
-    if not conditions.sh2.any():
+    ambient, even = light.ambient[0], np.ones(toward.shape[:-1])
+    if not light.sh2.any():
         return ambient * even
     basis = irradiance_basis(torch.tensor(toward)).numpy() / np.repeat([2 / 3, 1 / 4], [3, 5])
-    return (ambient * (even + conditions.sh2[0] * basis @ conditions.sh2_coefficients[0])).clip(0)
+    return (ambient * (even + light.sh2[0] * basis @ light.sh2_coefficients[0])).clip(0)
 
 
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
     """The printed piece as large as it came out of the printer, plain paper on its back."""
     placement = scene.placement
-    scale = geometry.scaled_about(scene.middle_mm, conditions.printed_scale[0])
+    scale = geometry.scaled_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
-    front = _glossy(_diffuse(_texture(mi, _printed(picture, placement.size_mm, conditions), "clamp")), conditions)
+    printed = _printed(picture, placement.size_mm, conditions.print)
+    front = _glossy(_diffuse(_texture(mi, printed, "clamp")), conditions.light)
     back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
     uv = placement.piece_mm / np.array(placement.size_mm)
     bsdf = {"type": "twosided", "front": front, "back": back}
     return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
 
 
-def _printed(picture: PiecePicture, size_mm, conditions: Conditions) -> np.ndarray:
+def _printed(picture: PiecePicture, size_mm, drawn: Print) -> np.ndarray:
     """H×W×3 light of this print under white light, beside the sheet that light is measured by."""
     srgb = picture.srgb
-    if conditions.misregistration_mm.any():
+    if drawn.misregistration_mm.any():
         height, width = srgb.shape[:2]
-        shift = conditions.misregistration_mm[0] * [width / size_mm[0], height / size_mm[1]]
+        shift = drawn.misregistration_mm[0] * [width / size_mm[0], height / size_mm[1]]
         srgb = misregistered(srgb, torch.tensor(shift).to(srgb))
-    change = torch.tensor([conditions.dot_gain[0], conditions.density[0], conditions.black[0]]).to(srgb)
-    return vary(linear_from_srgb(srgb), change).numpy() * conditions.paper[0]
+    change = torch.tensor([drawn.dot_gain[0], drawn.density[0], drawn.black[0]]).to(srgb)
+    return vary(linear_from_srgb(srgb), change).numpy() * drawn.paper[0]
 
 
-def _glossy(diffuse: dict, conditions: Conditions) -> dict:
+def _glossy(diffuse: dict, light: Light) -> dict:
     """A surface that mirrors the drawn share of the light, roughly; Beckmann's slopes match Blinn's exponent."""
-    if not conditions.gloss[0]:
+    if not light.gloss[0]:
         return diffuse
-    rough = float(np.sqrt(2 / (conditions.shininess[0] + 2)))
+    rough = float(np.sqrt(2 / (light.shininess[0] + 2)))
     mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": rough}
-    return {"type": "blendbsdf", "weight": float(conditions.gloss[0] * PAPER_REFLECTANCE), "a": diffuse, "b": mirror}
+    return {"type": "blendbsdf", "weight": float(light.gloss[0] * PAPER_REFLECTANCE), "a": diffuse, "b": mirror}
 
 
 def _object(mi: ModuleType, stage: Stage) -> list:

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.reprints.path_traced import photograph_traced
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import Scene, build_scene
 from patchproof.sheets.manifest import Manifest
@@ -142,7 +143,7 @@ def _take(stage: Stage, piece: PiecePicture | None, path_traced: bool, condition
     buffer = BytesIO()
     if path_traced:
         picture = photograph_traced(stage, piece, conditions)[0].permute(1, 2, 0)
-        save_photo(picture, stage.scene, int(conditions.jpeg[0]), buffer)
+        save_photo(picture, stage.scene, int(conditions.sensor.jpeg[0]), buffer)
     else:
         take_photo(stage, piece, conditions, buffer)
     return buffer.getvalue()
@@ -258,7 +259,7 @@ def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions,
     photo_px = stage.scene.settings.camera.photo_px
     with torch.no_grad():
         picture = photograph(stage, piece, conditions, photo_px, jpeg=False)[0].permute(1, 2, 0)
-    save_photo(picture, stage.scene, int(conditions.jpeg[0]), path)
+    save_photo(picture, stage.scene, int(conditions.sensor.jpeg[0]), path)
 
 
 def save_photo(picture: torch.Tensor, scene: Scene, quality: int, path: Path | BytesIO) -> None:
@@ -273,8 +274,8 @@ def save_photo(picture: torch.Tensor, scene: Scene, quality: int, path: Path | B
 
 def _truth(scene: Scene, manifest: Manifest | None, conditions: Conditions, print_scale) -> dict:
     """Where the page's millimetres fall in this photograph, and what it was taken under."""
-    drawn = {field.name: np.asarray(getattr(conditions, field.name)[0]).tolist() for field in fields(conditions)}
-    drawn["print_scale"] = [scale * float(conditions.printed_scale[0]) for scale in print_scale]
+    drawn: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
+    drawn["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in print_scale]
     if manifest is None:
         return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
     surface, homography = surface_of(manifest), _homography(scene, manifest, conditions)

@@ -123,7 +123,7 @@ def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.n
 def prints(piece: Piece, conditions: Conditions) -> np.ndarray:
     """N×3×3 from the sheet's millimetres to those of a print of another size about the same middle."""
     middle = np.array(piece.size_mm) / 2
-    return np.stack([scaled_about(middle, scale) for scale in conditions.printed_scale])
+    return np.stack([scaled_about(middle, scale) for scale in conditions.pose.printed_scale])
 
 
 def turned(roll_deg: float, zoom: float, shift_px, about_px) -> np.ndarray:

@@ -18,6 +18,7 @@ import csv
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class ImageScene:
     images: tuple[flat.Picture, ...]
     warnings: tuple[str, ...]
     unreadable_share: float = 0.0
+    given_glb: ClassVar[bytes | None] = None
 
     @property
     def photo_px(self) -> tuple[int, int]:
@@ -71,14 +73,14 @@ class ImageScene:
         `background[:, 4]` is 1, which erases nothing, in all but training.
         """
         drawn = draw(self.settings, stream, n, self.seed if seed is None else seed, start)
-        background = drawn.background.copy()
+        background = drawn.pose.background.copy()
         if len(self.images) >= SPLIT_FROM:
             middle = (len(self.images) // 2) / len(self.images)
             low, high = (0.0, middle) if stream in _OPTIMIZED_ON else (middle, 1.0)
             background[:, 0] = low + (high - low) * background[:, 0]
         if stream != "train":
             background[:, 4] = 1.0
-        return replace(drawn, background=background)
+        return replace(drawn, pose=replace(drawn.pose, background=background))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimetres to pixels."""
@@ -88,8 +90,8 @@ class ImageScene:
         matrices = []
         for scale, roll, place in zip(
             px_per_mm(self.settings, self.piece, conditions),
-            conditions.roll_deg,
-            conditions.background[:, 2:4],
+            conditions.pose.roll_deg,
+            conditions.pose.background[:, 2:4],
             strict=True,
         ):
             room = side - _extent(piece_mm * scale, roll)
@@ -99,9 +101,9 @@ class ImageScene:
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×H×W×3 uint8 sRGB: the images, some with a box of random values."""
-        chosen = flat.pick(conditions.background[:, 0], len(self.images))
+        chosen = flat.pick(conditions.pose.background[:, 0], len(self.images))
         shown = [flat.show(self.images[i], np.eye(3), self.photo_px, size_px) for i in chosen]
-        for picture, chance in zip(shown, conditions.background[:, 4], strict=True):
+        for picture, chance in zip(shown, conditions.pose.background[:, 4], strict=True):
             if chance < self.settings.background.erasing:
                 erase(picture, int(chance * 2**53))  # its own digits: a view kept for other lights keeps its box
         return np.stack(shown)
@@ -286,7 +288,7 @@ def _widest(roll_deg: tuple[float, float]) -> float:
 
 def _shares(settings: SceneSettings, conditions: Conditions) -> np.ndarray:
     low, high = settings.view.patch_share
-    return low * (high / low) ** conditions.background[:, 1]
+    return low * (high / low) ** conditions.pose.background[:, 1]
 
 
 def _extent(size: np.ndarray, roll_deg: float) -> np.ndarray:

@@ -7,6 +7,7 @@ piece lies, and the camera of every drawn view. Where the object's own texture i
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 from patchproof import geometry
 from patchproof.channel import lens
+from patchproof.channel.effects import Pose
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
@@ -51,10 +53,18 @@ class MeshScene:
     warnings: tuple[str, ...]
     canvas: Canvas | None = None  # what of the object's own texture may change
     camera: lens.Camera | None = field(default=None)  # a calibrated one
+    given_glb: bytes | None = None  # the mesh, where it was given in Python
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
         return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+
+    @property
+    def length_mm(self) -> float:
+        """The object's longest extent."""
+        if self.settings.object.length_mm is None:
+            raise ValueError("a mesh has a length")
+        return self.settings.object.length_mm
 
     @property
     def middle_mm(self) -> np.ndarray:
@@ -63,13 +73,13 @@ class MeshScene:
 
     def camera_from_world(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 poses of the drawn cameras."""
-        return camera_poses(self.settings, self.mesh, self.frame, self.middle_mm, conditions)
+        return camera_poses(self.settings, self.mesh, self.frame, self.middle_mm, conditions.pose)
 
     def camera_from_print(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as large as it was
         printed: all about the piece's middle is scaled, which keeps a card in its plane.
         """
-        scales = [geometry.scaled_about(self.middle_mm, scale) for scale in conditions.printed_scale]
+        scales = [geometry.scaled_about(self.middle_mm, scale) for scale in conditions.pose.printed_scale]
         return self.camera_from_world(conditions) @ np.stack(scales)
 
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
@@ -91,9 +101,9 @@ class MeshScene:
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
         """N: the light on white paper at the piece's middle, without lamps."""
-        frame = self.frame
-        toward = geometry.orbit(conditions.light_azimuth_deg, conditions.light_elevation_deg, frame.normal, frame.up)
-        return conditions.ambient + conditions.directional * np.clip(toward @ self.placement.normal, 0, None)
+        frame, light = self.frame, conditions.light
+        toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)
+        return light.ambient + light.directional * np.clip(toward @ self.placement.normal, 0, None)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
         """Pixels per millimetre of the piece in the closest view."""
@@ -106,15 +116,18 @@ class MeshScene:
         return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
 
 
-def load_mesh_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> MeshScene:
+def load_mesh_scene(
+    settings: SceneSettings, base: Path, seed: int, identity: str | None = None, given_glb: bytes | None = None
+) -> MeshScene:
     """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
     settings_object, camera = settings.object, settings.camera
-    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up)
-    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings), seed)
+    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
+    own = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
+    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(identifying(settings) | own, seed)
     backgrounds = load_backgrounds(settings.background, base)
     calibrated = None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px)
     ground = {"settings": settings, "base": base, "seed": seed, "frame": frame, "backgrounds": backgrounds}
-    ground |= {"sheet_id": identity, "camera": calibrated}
+    ground |= {"sheet_id": identity, "camera": calibrated, "given_glb": given_glb}
     if settings.patch.kind != "patch":
         canvas = texture_canvas(mesh, settings.patch, base)
         notes = (*mesh.warnings, *canvas.warnings)
@@ -155,20 +168,20 @@ def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) ->
     return MeshScene(settings, Path(), seed, mesh, frame, None, None, backgrounds, "", 0.0, mesh.warnings)
 
 
-def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, conditions: Conditions) -> np.ndarray:
+def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, pose: Pose) -> np.ndarray:
     """`camera_from_world` N×4×4: on an orbit about what the camera looks at, azimuth 0 facing the patch's side."""
     center = np.zeros(3) if settings.view.look_at == "object" else np.asarray(patch_mm)
-    targets = center + conditions.look_at_offset * settings.object.length_mm
-    directions = geometry.orbit(conditions.azimuth_deg, conditions.elevation_deg, frame.normal, frame.up)
-    eyes = targets + conditions.distance_mm[:, None] * directions
+    targets = center + pose.look_at_offset * settings.object.length_mm
+    directions = geometry.orbit(pose.azimuth_deg, pose.elevation_deg, frame.normal, frame.up)
+    eyes = targets + pose.distance_mm[:, None] * directions
     _refuse_inside(mesh, eyes)
-    return geometry.look_at(eyes, targets, conditions.roll_deg, frame.up)
+    return geometry.look_at(eyes, targets, pose.roll_deg, frame.up)
 
 
 def _smallest_scales(settings: SceneSettings, mesh: Mesh, frame: Frame, card: Placement, camera) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
     conditions = draw(settings, "select", _VIEWS_TRIED, 0)
-    poses = camera_poses(settings, mesh, frame, card.center_mm, conditions)
+    poses = camera_poses(settings, mesh, frame, card.center_mm, conditions.pose)
     photo_px = settings.camera.photo_px
     matrix = (
         geometry.intrinsics(settings.view.fov_deg, photo_px) if camera is None else lens.matrix_px(camera, photo_px)

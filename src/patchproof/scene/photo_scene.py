@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -48,7 +49,7 @@ _UNEVEN = 0.05  # of the light: what the quadratic leaves; from here on a reader
 
 
 @dataclass(frozen=True)
-class Seen:
+class BasePhoto:
     """One usable photograph: homography to its pixels at the scene's `photo_px`, and what was measured on its paper."""
 
     name: str
@@ -67,9 +68,10 @@ class PhotoScene:
     seed: int
     sheet_id: str
     piece: Piece
-    photos: tuple[Seen, ...]
+    photos: tuple[BasePhoto, ...]
     warnings: tuple[str, ...]
     unreadable_share: float = 0.0
+    given_glb: ClassVar[bytes | None] = None
 
     @property
     def photo_px(self) -> tuple[int, int]:
@@ -121,17 +123,17 @@ class PhotoScene:
         """N NaN: nobody knows where the camera stood."""
         return np.full(len(conditions), np.nan)
 
-    def _chosen(self, conditions: Conditions) -> list[Seen]:
-        return [self.photos[i] for i in flat.pick(conditions.background[:, 0], len(self.photos))]
+    def _chosen(self, conditions: Conditions) -> list[BasePhoto]:
+        return [self.photos[i] for i in flat.pick(conditions.pose.background[:, 0], len(self.photos))]
 
     def _zoom(self, conditions: Conditions) -> np.ndarray:
         low, high = self.settings.view.zoom
-        return low * (high / low) ** conditions.background[:, 1]
+        return low * (high / low) ** conditions.pose.background[:, 1]
 
     def _view_from_photo(self, conditions: Conditions) -> list[np.ndarray]:
         middle, side = np.array(self.photo_px) / 2, min(self.photo_px)
-        shifts = conditions.look_at_offset[:, :2] * side
-        views = zip(conditions.roll_deg, self._zoom(conditions), shifts, strict=True)
+        shifts = conditions.pose.look_at_offset[:, :2] * side
+        views = zip(conditions.pose.roll_deg, self._zoom(conditions), shifts, strict=True)
         return [flat.turned(roll, zoom, shift, middle) for roll, zoom, shift in views]
 
 
@@ -159,7 +161,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     return flat.with_unreadable_share(PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings)))
 
 
-def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> Seen:
+def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
     """What one photograph of the blank sheet says; `CannotJudge` where it cannot be used."""
     srgb = read_photo(path).srgb
     fit, blur = _locate(srgb, manifest, min(piece.design_rect_mm[2:]))
@@ -173,7 +175,7 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
     height, width = picture.srgb.shape[:2]
     picture_from_photo = np.linalg.inv(flat.photo_from((width, height), photo_px))
     light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
-    return Seen(path.name, picture, photo_from_piece, light, blur)
+    return BasePhoto(path.name, picture, photo_from_piece, light, blur)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -188,7 +190,7 @@ def _digest(folder: Path) -> str:
     return whole.hexdigest()
 
 
-def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[Seen, ...], dict[str, str]]:
+def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[tuple[BasePhoto, ...], dict[str, str]]:
     """The usable photographs of a folder in the order of their names, and why others are not."""
     files, photos, skipped = _files(folder), [], {}
     for path in files:

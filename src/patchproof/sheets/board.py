@@ -30,22 +30,22 @@ KIND = "board"
 class BoardGrid(Strict):
     """The pattern; its first square, top-left, is black."""
 
-    corner_mm: Point
-    columns: Annotated[int, Field(ge=4, le=40)]
-    rows: Annotated[int, Field(ge=4, le=40)]
-    square_mm: Annotated[Positive, Field(ge=8)]
-    marker_mm: Annotated[Positive, Field(ge=6)]
+    corner_mm: Point  # its top-left corner
+    columns: Annotated[int, Field(ge=4, le=40)]  # squares side by side
+    rows: Annotated[int, Field(ge=4, le=40)]  # squares one above the other
+    square_mm: Annotated[Positive, Field(ge=8)]  # side of a square
+    marker_mm: Annotated[Positive, Field(ge=6)]  # side of a marker, at least a module less than the square
 
 
 class BoardTemplate(Strict):
     """A whole template file of a board page."""
 
-    page_mm: tuple[Positive, Positive]
-    margin_mm: NotNegative
+    page_mm: tuple[Positive, Positive]  # width, height of the paper
+    margin_mm: NotNegative  # nothing is printed nearer to the edge
     board: BoardGrid
     ruler: Rulers
-    qr: QrCode
-    text: tuple[TextLine, ...] = ()
+    qr: QrCode  # names sheet and board
+    text: tuple[TextLine, ...] = ()  # also {columns}, {rows}, {square}, {marker} and {dictionary} are filled in
 
 
 @dataclass(frozen=True)

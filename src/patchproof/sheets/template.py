@@ -23,52 +23,53 @@ Count = Annotated[int, Field(ge=1)]
 class PieceZone(Strict):
     """Where on the page the piece may lie."""
 
-    zone_mm: Rect
+    zone_mm: Rect  # [x, y, width, height]; the piece lies in its middle
 
 
 class ChartGrid(Strict):
-    """The colour chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
+    """The color chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
 
-    corner_mm: Point
-    columns: Annotated[int, Field(ge=4)]
-    rows: Annotated[int, Field(ge=2)]
-    swatch_mm: Annotated[Positive, Field(ge=4)]  # below this a phone's photograph of a whole page has too few pixels
-    gap_mm: NotNegative
+    corner_mm: Point  # its top-left corner
+    columns: Annotated[int, Field(ge=4)]  # swatches side by side
+    rows: Annotated[int, Field(ge=2)]  # swatches one above the other
+    swatch_mm: Annotated[Positive, Field(ge=4)]  # side; below 4 a phone's photograph of a whole page has too few pixels
+    gap_mm: NotNegative  # between swatches
 
 
 class Rulers(Strict):
     """A ruler to the right and one downwards, from their zero ticks."""
 
-    length_mm: Positive
-    x_start_mm: Point
-    y_start_mm: Point
+    length_mm: Positive  # of both
+    x_start_mm: Point  # zero tick of the ruler to the right
+    y_start_mm: Point  # zero tick of the ruler downwards
 
 
 class QrCode(Strict):
     """The QR code's black square; its quiet zone of 4 modules lies outside."""
 
-    corner_mm: Point
-    size_mm: Positive
+    corner_mm: Point  # its top-left corner
+    size_mm: Positive  # its side, without the quiet zone
 
 
 class PageMarkers(Strict):
     """The page's own markers by the top-left corners of their black squares; fewer than two would be a poor fix."""
 
-    size_mm: Annotated[Positive, Field(ge=8)]
-    corners_mm: Annotated[tuple[Point, ...], Field(min_length=2)]
+    size_mm: Annotated[Positive, Field(ge=8)]  # side of a black square
+    corners_mm: Annotated[tuple[Point, ...], Field(min_length=2)]  # top-left, one per marker
 
 
 class BlankPiece(Strict):
     """The piece of a page that is printed without a design, before there is a scene."""
 
-    design_mm: tuple[Positive, Positive]
+    design_mm: tuple[Positive, Positive]  # of the design that will take its place
     marker_mm: Annotated[Positive, Field(ge=8)]  # of the frame; smaller ones are lost in photographs
 
 
 class TilePages(Strict):
     """The pages of a piece larger than the page; each tile's markers lie to the left, the right and below its part."""
 
-    zone_mm: Rect  # a tile's part of the piece at its largest; what is printed of it starts at the corner
+    # [x, y, width, height]: a tile's part of the piece at its largest; what is printed of it starts at the corner.
+    zone_mm: Rect
     overlap_mm: Annotated[Positive, Field(ge=8)]  # the flap that the next tile is glued on; it holds a marker
     marker_mm: Annotated[Positive, Field(ge=5)]  # for scans and photographs of single pages
 
@@ -76,27 +77,27 @@ class TilePages(Strict):
 class TextLine(Strict):
     """One line of text; {sheet_id}, {kind}, {design} and {piece} are filled in; gray 0 is black."""
 
-    at_mm: Point
-    size_mm: Positive
-    text: str
-    bold: bool = False
-    gray: Share = 0.0
+    at_mm: Point  # left end of its baseline
+    size_mm: Positive  # of the letters
+    text: str  # what it says
+    bold: bool = False  # in the bold font
+    gray: Share = 0.0  # 0 is black, 1 white
 
 
 class Template(Strict):
     """A whole template file."""
 
-    page_mm: tuple[Positive, Positive]
-    margin_mm: NotNegative
+    page_mm: tuple[Positive, Positive]  # width, height of the paper
+    margin_mm: NotNegative  # nothing is printed nearer to the edge; home printers need 3 to 6
     piece: PieceZone | None = None  # none on a page that is a chart alone
-    chart: ChartGrid
+    chart: ChartGrid  # at least 48 swatches
     ruler: Rulers
-    qr: QrCode
-    marker: PageMarkers
-    blank: BlankPiece | None = None
-    tiles: TilePages | None = None
+    qr: QrCode  # names sheet and design
+    marker: PageMarkers  # beside those of the piece
+    blank: BlankPiece | None = None  # on a page that is made without a run
+    tiles: TilePages | None = None  # on templates for a piece larger than the page
     plan_page: bool = False  # a last page that says where the piece goes and how to photograph it
-    text: tuple[TextLine, ...] = ()
+    text: tuple[TextLine, ...] = ()  # all that is written
 
 
 def load_template(name_or_file: str | Path) -> Template:

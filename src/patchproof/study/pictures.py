@@ -52,5 +52,5 @@ def object_file(problem: Problem, design: np.ndarray) -> tuple[str, bytes]:
         return "png", png(design)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "object.glb"
-        write_glb(canvas.mesh, problem.subject.textures(design), path)
+        write_glb(canvas.mesh, problem.subject.surface.textures(design), path)
         return "glb", path.read_bytes()

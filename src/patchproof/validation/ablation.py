@@ -4,7 +4,7 @@ It is left out of training, and the design is tried in the whole world.
 In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect how much rate and
 confidence designs lose that were trained without it, against designs trained with all, under the same conditions; by
 our renderer, and in path-traced photographs (`path_traced`), whose light is not ours. What takes an effect's place is
-what `plan` puts there (`plan_terms`): even light for the sun, not darkness. Effects joined by " + " go together.
+what `plan` puts there (`plan.terms`): even light for the sun, not darkness. Effects joined by " + " go together.
 
 All designs of a scene, network and seed share their draws, but each is another design: its own luck is in every
 difference, so intervals are over such groups, not over conditions. Views keep their poses for one step. What an effect
@@ -29,10 +29,10 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import ask, joined, responses
 from patchproof.plan.cost import relative_costs
-from patchproof.plan.terms import Setup, scene_terms
+from patchproof.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
-from patchproof.render.views import Seen, see
+from patchproof.render.views import Views, see
 from patchproof.report.tables import Drawing, Table
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
@@ -45,23 +45,21 @@ from patchproof.study.study import Cell, Result, Study
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ALL, PRINTER = "all", "printer's colors"
-EFFECTS = (
-    "directional light",
-    "ambient light",
-    "lamp",
-    "uneven ambient",
-    "gloss",
-    PRINTER,
-    "dot gain + ink density + printed black + paper white",
-    "misregistration",
-    "print scale",
-    "exposure",
-    "white balance",
-    "vignetting",
-    "blur + motion blur",
-    "noise",
-)
+ALL = "all"
+# What goes together, because alone it is too little to tell.
+_TOGETHER = ("dot gain + ink density + printed black + paper white", "blur + motion blur")
+_UNSEEN = "JPEG"  # training's views are too small to show it
+
+
+def _default_effects() -> tuple[str, ...]:
+    """All effects that `plan` can switch off, in its order."""
+    printed = (PRINTER, *(term.name for term in effect_terms("printer")))
+    names = (*(term.name for term in effect_terms("light")), *printed, *(term.name for term in effect_terms("camera")))
+    joined = {name: group for group in _TOGETHER for name in group.split(" + ")}
+    return tuple(dict.fromkeys(joined.get(name, name) for name in names if name != _UNSEEN))
+
+
+EFFECTS = _default_effects()
 WORLDS = ("modeled", "path_traced")  # whose photographs: our renderer's, or the path tracer's
 
 
@@ -79,7 +77,7 @@ class Without(Problem):
 
     changes: tuple[Callable[[Setup], Setup | None], ...] = ()
 
-    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Seen:
+    def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Views in which what is left out is as in the simpler model."""
         setup = Setup(self.stage, shown, conditions)
         for change in self.changes:
@@ -104,9 +102,8 @@ def without(problem: Problem, effect: str) -> Problem:
         if not isinstance(subject, Patch):
             raise Refused("a printed patch", "a texture", f'leave "{PRINTER}" out')
         subject = replace(subject, printer=identity_printer())
-    parts = {"scene": problem.scene, "stage": problem.stage, "printer": problem.printer, "subject": subject}
     changes = tuple(terms[name].change for name in on if name != PRINTER)
-    return Without(**parts, classifiers=problem.classifiers, indices=problem.indices, changes=changes)
+    return Without(**vars(replace(problem, subject=subject)), changes=changes)
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:

@@ -51,12 +51,12 @@ _COLORS = {"measured": "#2a9d6f", "judged": "#e0a030", "rejected": "#d1495b"}
 
 
 class DetectionSettings(Strict):
-    """A scene of one object with a patch, how many photographs of it, and how many of them are partly hidden."""
+    """What is photographed, and how often."""
 
-    scene: str
-    photos: Annotated[int, Field(ge=1, le=100_000)] = 200
-    hidden: Share = 0.4
-    seed: int = 0
+    scene: str  # a scene file of one object with a patch
+    photos: Annotated[int, Field(ge=1, le=100_000)] = 200  # how many are taken
+    hidden: Share = 0.4  # share of them in which something hides a part of the sheet
+    seed: int = 0  # of everything that is drawn
 
 
 def cells(settings: DetectionSettings, base: Path) -> list[Cell]:
@@ -76,9 +76,9 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     taken = {
         "tilt_deg": tilt_deg,
         "module_px": px_per_mm * hall.module_mm,
-        "blur_px": float(conditions.blur_px[0]),
-        "noise": float(conditions.noise[0]),
-        "jpeg": int(conditions.jpeg[0]),
+        "blur_px": float(conditions.sensor.blur_px[0]),
+        "noise": float(conditions.sensor.noise[0]),
+        "jpeg": int(conditions.sensor.jpeg[0]),
         "hidden": share,
     }
     return taken | hall.found(srgb, focal_px, truth)
@@ -123,7 +123,7 @@ class _Hall:
             picture = picture + cover[..., None] * (rng.uniform(0.05, 0.8, 3).astype(np.float32) - picture)
         buffer = io.BytesIO()
         pixels = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=int(conditions.jpeg[0]))
+        Image.fromarray(pixels).save(buffer, "JPEG", quality=int(conditions.sensor.jpeg[0]))
         return np.asarray(Image.open(buffer).convert("RGB")), self.scene.matrix_px(photo_px)[0, 0], share
 
     def found(self, srgb, focal_px, truth) -> dict[str, Any]:
@@ -135,16 +135,18 @@ class _Hall:
 
         view = view_of(Photo(srgb, focal_px, Path("photo.jpg")), None)
         entry = measure(view, "photo.jpg", self.surface, None, promised_ranges(())).entry
-        said = {"status": entry.status, "code": entry.code, "markers": entry.markers_found, "light": entry.contrast}
-        if entry.homography_px_from_mm is None:
-            return said | {"error_mm": None, "error_px": None, "uncertainty_mm": entry.corner_uncertainty_mm}
-        homography, corners = np.array(entry.homography_px_from_mm), rect_corners(self.surface.rect_mm)
+        geometry = entry.geometry
+        said = {"status": entry.status, "code": entry.code, "markers": entry.markers_found}
+        said |= {"light": geometry and geometry.contrast, "error_mm": None, "error_px": None}
+        said |= {"uncertainty_mm": geometry and geometry.corner_uncertainty_mm}
+        if geometry is None or geometry.homography_px_from_mm is None:
+            return said
+        homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(self.surface.rect_mm)
         off_px = apply_homography(homography, corners) - apply_homography(truth, corners)
         off_mm = apply_homography(np.linalg.inv(homography), apply_homography(truth, corners)) - corners
         return said | {
             "error_mm": float(np.linalg.norm(off_mm, axis=1).max()),
             "error_px": np.linalg.norm(off_px, axis=1).tolist(),
-            "uncertainty_mm": entry.corner_uncertainty_mm,
         }
 
 

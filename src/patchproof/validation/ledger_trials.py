@@ -25,7 +25,7 @@ from patchproof.claims import rate
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import local_scale
 from patchproof.report.tables import Table
-from patchproof.scene.conditions import with_value
+from patchproof.scene.conditions import with_values
 from patchproof.strict import Strict
 from patchproof.study.study import Cell, Result, Study
 
@@ -36,15 +36,13 @@ _FADED = 0.2  # of the density that dyes may keep
 
 
 class LedgerSettings(Strict):
-    """Folders of finished runs, trials over all of them, photographs in each, and their size in pixels (by default
-    the scene's own: smaller is quicker).
-    """
+    """Whose designs are photographed, and how often."""
 
-    runs: Annotated[tuple[str, ...], Field(min_length=1)]
-    trials: Annotated[int, Field(ge=1, le=10_000)] = 60
-    photos: Annotated[int, Field(ge=5, le=100)] = 12
-    photo_px: tuple[int, int] | None = None
-    seed: int = 0
+    runs: Annotated[tuple[str, ...], Field(min_length=1)]  # folders of finished runs
+    trials: Annotated[int, Field(ge=1, le=10_000)] = 60  # over all runs
+    photos: Annotated[int, Field(ge=5, le=100)] = 12  # in each trial
+    photo_px: tuple[int, int] | None = None  # their width, height; by default the scene's own, smaller is quicker
+    seed: int = 0  # of everything that is drawn
 
 
 def cells(settings: LedgerSettings, base: Path) -> list[Cell]:
@@ -150,11 +148,12 @@ class _Hall:
         """What `verify` makes of the photographs, each of which lost so much."""
         from patchproof.evidence.ledger import LEAST_PHOTOS, usable
         from patchproof.evidence.run import gather_evidence
+        from patchproof.evidence.task import Options
 
         with TemporaryDirectory() as folder:
             for i, photo in enumerate(photos):
                 (Path(folder) / f"{i:03d}.jpg").write_bytes(photo)
-            evidence = gather_evidence(folder, self.manifest, models=[self.model])
+            evidence = gather_evidence(folder, self.manifest, Options([self.model], self.printer))
         report, ledger = evidence.report, evidence.ledger
         used = np.array([usable(entry.status, entry.code) for entry in report.photos])
         codes = [entry.code or "fine" for entry in report.photos]
@@ -203,7 +202,7 @@ def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
         set_stage(scene),
         manifest,
         model,
-        target_indices(model, manifest),
+        target_indices(model, manifest.promise, manifest.settings),
         pixels,
         size,
         load_printer(scene.settings.printer.profile, scene.base),
@@ -231,12 +230,13 @@ def _trouble(kind: str, rng: np.random.Generator, conditions, hall: _Hall):
         return name, printer, conditions
     if kind == "blur":  # up to what still shows the cells of markers apart
         modules = rng.uniform(0.35, 0.55)
-        return f"{modules:.2f} modules", None, with_value(conditions, "blur_px", modules * hall.module_px(conditions))
+        return f"{modules:.2f} modules", None, with_values(conditions, blur_px=modules * hall.module_px(conditions))
     if kind == "cast":
         gains = np.exp(rng.uniform(-1.8, 0.2, 3))
-        return f"gains {gains.round(2)}", None, replace(conditions, white_balance=conditions.white_balance * gains)
+        cast = with_values(conditions, white_balance=conditions.sensor.white_balance * gains)
+        return f"gains {gains.round(2)}", None, cast
     stops = rng.uniform(2.0, 5.5)
-    return f"{stops:.1f} stops", None, replace(conditions, exposure_ev=conditions.exposure_ev - stops)
+    return f"{stops:.1f} stops", None, with_values(conditions, exposure_ev=conditions.sensor.exposure_ev - stops)
 
 
 def _wrong_printer(rng: np.random.Generator, hall: _Hall):

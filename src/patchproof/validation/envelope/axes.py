@@ -14,7 +14,7 @@ import numpy as np
 
 from patchproof.reprints.reprint import scaled_print
 from patchproof.scene.bend import curled
-from patchproof.scene.conditions import Conditions, with_value
+from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.placement import Placement
 from patchproof.scene.scene import Scene
@@ -115,9 +115,9 @@ def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditi
         if axis == "tilt":
             conditions = _tilted(conditions, value)
         elif axis == "darkness":
-            conditions = with_value(conditions, "exposure_ev", -value)
+            conditions = with_values(conditions, exposure_ev=-value)
         elif axis in _FIELDS:
-            conditions = with_value(conditions, _FIELDS[axis], value)
+            conditions = with_values(conditions, **{_FIELDS[axis]: value})
     return conditions
 
 
@@ -142,11 +142,11 @@ def placed_at(scene: Scene, point: Point) -> Scene:
 
 def _tilted(conditions: Conditions, tilt_deg: float) -> Conditions:
     """The cameras moved to this angle from straight before the side, each towards where it stood."""
-    azimuth, elevation = np.radians(conditions.azimuth_deg), np.radians(conditions.elevation_deg)
+    azimuth, elevation = np.radians(conditions.pose.azimuth_deg), np.radians(conditions.pose.elevation_deg)
     right, up = np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     toward = np.arctan2(up, right)
     tilt = np.radians(tilt_deg)
     right, up = np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward)
     elevation = np.degrees(np.arcsin(up.clip(-1, 1)))
     azimuth = np.degrees(np.arctan2(right, np.cos(tilt)))
-    return with_value(with_value(conditions, "azimuth_deg", azimuth), "elevation_deg", elevation)
+    return with_values(conditions, azimuth_deg=azimuth, elevation_deg=elevation)

@@ -35,36 +35,34 @@ Points = Annotated[int, Field(ge=3, le=33)]
 class Sweep(Strict):
     """One axis from an easy to a hard value; ends left out are those that suit the scene."""
 
-    axis: str
-    easy: Finite | None = None
-    hard: Finite | None = None
-    points: Points | None = None
+    axis: str  # such as tilt, distance, blur; an unknown one is refused with all names
+    easy: Finite | None = None  # value at the easy end
+    hard: Finite | None = None  # value at the hard end
+    points: Points | None = None  # values; by default the study's
 
 
 class Map(Strict):
     """Two axes against each other, each from its easy to its hard end."""
 
-    x: str
-    y: str
-    points: Points = 4
+    x: str  # the axis across
+    y: str  # the axis upwards
+    points: Points = 4  # values of each axis
 
 
 class EnvelopeSettings(Strict):
-    """Whose envelope, and how finely. `n` conditions per point are shown to the network (a quarter of them where JPEG
-    is varied, which takes pictures of full size), `photos` of them photographed in full and measured; `map_n` and
-    `map_photos` the same for points of maps. With these counts another seed moved 32 of the demo's 33 breaks by less
-    than a tenth of their sweeps, as 128 and 8 did at four thirds of the time; 80 and 6 moved two by more.
+    """Whose envelope, and how finely. With these counts another seed moved 32 of the demo's 33 breaks by less than a
+    tenth of their sweeps, as 128 and 8 did at four thirds of the time; 80 and 6 moved two by more.
     """
 
-    run: str
-    seed: Annotated[int, Field(ge=0)] = 0
-    n: Count = 96
-    photos: Count = 6
-    points: Points = 6
-    map_n: Count = 8
-    map_photos: Count = 3
-    sweeps: tuple[Sweep, ...] | None = None
-    maps: tuple[Map, ...] | None = None
+    run: str  # the folder of a finished run of a patch
+    seed: Annotated[int, Field(ge=0)] = 0  # of everything that is drawn
+    n: Count = 96  # conditions per point that the network sees; a quarter where JPEG is varied
+    photos: Count = 6  # of them photographed in full and measured
+    points: Points = 6  # values of each swept axis
+    map_n: Count = 8  # n for points of maps
+    map_photos: Count = 3  # photos for points of maps
+    sweeps: tuple[Sweep, ...] | None = None  # by default every axis that suits the scene
+    maps: tuple[Map, ...] | None = None  # likewise; none: []
     other_printer: str | None = None  # what `mismatch` counts from the run's own printer towards
 
 

@@ -38,7 +38,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import relit, see
 from patchproof.reprints.reprint import DPI_RANGE, OVERSAMPLING
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import Scene
 from patchproof.sheets.manifest import Manifest
@@ -202,7 +202,7 @@ class _Views:
         if self._file[0] != rest:
             self._file = rest, self.at(rest, jpeg=False)[0].permute(1, 2, 0).cpu().numpy()
         srgb = (self._file[1].clip(0, 1) * 255 + 0.5).astype(np.uint8)
-        quality = int(conditions_at(self._world.scene, self._drawn, point).jpeg[0])
+        quality = int(conditions_at(self._world.scene, self._drawn, point).sensor.jpeg[0])
         return torch.tensor(_through_file(srgb, quality)).permute(2, 0, 1)[None] / 255
 
 
@@ -247,7 +247,7 @@ def _window(world: World, stage: Stage, conditions: Conditions) -> _Frame:
     """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
     scene, whole_px = stage.scene, world.scene.settings.camera.photo_px
     everything = _Frame(stage, whole_px)
-    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.vignetting.any():
+    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.sensor.vignetting.any():
         return everything
     edge = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placement.size_mm
@@ -281,10 +281,10 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     view = View(photo, matrix_px, calibrated=False)
     entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
-    if entry.status == "measured" and entry.homography_px_from_mm is not None:
+    if entry.status == "measured" and entry.geometry and entry.geometry.homography_px_from_mm is not None:
         corners = geometry.rect_corners(world.surface.rect_mm)
         true_px = _seen_at(scene, conditions, corners - world.manifest.cut_mm[:2], whole_px) - origin_px
-        back = geometry.apply_homography(np.linalg.inv(np.array(entry.homography_px_from_mm)), true_px)
+        back = geometry.apply_homography(np.linalg.inv(np.array(entry.geometry.homography_px_from_mm)), true_px)
         error_mm = float(np.linalg.norm(back - corners, axis=1).max())
     return Measurement(entry.status, entry.code, error_mm)
 
@@ -314,7 +314,8 @@ def _by_cost(points: Sequence[Point]) -> list[int]:
 
 
 def _same(a: Conditions, b: Conditions) -> bool:
-    return all(np.array_equal(getattr(a, field.name), getattr(b, field.name)) for field in fields(Conditions))
+    others = fields_of(b)
+    return all(np.array_equal(values, others[name]) for name, values in fields_of(a).items())
 
 
 def _through_file(srgb: np.ndarray, quality: int) -> np.ndarray:

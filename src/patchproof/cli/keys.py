@@ -1,0 +1,221 @@
+"""Every key of scene files, page templates and study configs as one Markdown page, read from the settings classes.
+
+Out: per table a row per key: type and range, unit, default, meaning. The meaning is the comment at the end of the
+field's last line or, where there is none, the comment above the field: it stands once, where the code says the key.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import tokenize
+from collections.abc import Iterator, Mapping
+from enum import Enum
+from functools import lru_cache, partial
+from importlib import import_module
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from pydantic import AfterValidator
+from pydantic.fields import FieldInfo
+
+from patchproof.settings import SceneSettings
+from patchproof.sheets.board import BoardTemplate
+from patchproof.sheets.template import Template
+from patchproof.strict import Refused, Strict, nearest, ordered
+
+_HEAD = """# All keys
+
+Printed by `patchproof keys`; the text is that of the settings classes. A key that does not exist is refused with the
+nearest one that does. `[low, high]` is a range to draw from. Paths are relative to the file that names them, and
+`${VAR}` in them is expanded.
+"""
+_UNITS = {"mm": "mm", "deg": "°", "px": "px", "ev": "stops"}
+_BOUNDS = ("ge", "gt", "le", "lt", "min_length")
+_WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
+
+
+def documents() -> dict[str, tuple[str, type[Strict]]]:
+    """By name what a file of settings is for, and its settings."""
+    from patchproof.study.study import STUDIES, load_study
+
+    known: dict[str, tuple[str, type[Strict]]] = {
+        "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
+        "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
+        "board": ("A page template with a board that calibrates cameras.", BoardTemplate),
+    }
+    for name in STUDIES:
+        study = load_study(name)
+        known[name] = f"`patchproof study {name} --config FILE.toml`: {study.about}", study.settings
+    return known
+
+
+def keys_page(name: str | None = None) -> str:
+    """The whole page as Markdown, or what it says of one kind of file."""
+    known = documents()
+    if name is None:
+        where: dict[type[Strict], str] = {}
+        return "\n".join([_HEAD, *(_document(name, *known[name], where) for name in known)])
+    if name not in known:
+        raise Refused("scene, template, board or a study's name", f'"{name}"', nearest(name, known))
+    return _document(name, *known[name], {})
+
+
+def meanings(model: type[Strict]) -> dict[str, str]:
+    """By key the comment that says what it means; a key without one is missing."""
+    return {
+        key: text
+        for owner in reversed(model.__mro__)
+        if issubclass(owner, Strict) and owner is not Strict
+        for key, text in _comments(owner.__module__).get(owner.__qualname__, {}).items()
+    }
+
+
+@lru_cache
+def _comments(module: str) -> dict[str, dict[str, str]]:
+    """By class and field of a module the comment at the field's end, else the one above it."""
+    source = inspect.getsource(import_module(module))
+    lines = iter(source.splitlines(keepends=True))
+    tokens = tokenize.generate_tokens(lambda: next(lines, ""))
+    comments = {token.start[0]: token for token in tokens if token.type == tokenize.COMMENT}
+
+    def comment(field: ast.AnnAssign) -> str | None:
+        if (last := field.end_lineno) in comments:
+            return comments[last].string.lstrip("# ")
+        first = above = field.lineno
+        while above - 1 in comments and comments[above - 1].start[1] == field.col_offset:
+            above -= 1
+        return " ".join(comments[line].string.lstrip("# ") for line in range(above, first)) or None
+
+    return {
+        node.name: {
+            field.target.id: text
+            for field in node.body
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and (text := comment(field))
+        }
+        for node in ast.parse(source).body
+        if isinstance(node, ast.ClassDef)
+    }
+
+
+def _document(name: str, about: str, settings: type[Strict], where: dict[type[Strict], str]) -> str:
+    """One file's tables; those in `where` are told there."""
+    lines = [f"## {name}", "", about, ""]
+    for path, model in tables(settings):
+        if path:
+            lines += [f"### {name}: `{path}`", ""]
+        if model in where:
+            lines += [f"As in {where[model]}.", ""]
+            continue
+        where[model] = f"{name}: `{path}`" if path else name
+        lines += [_cell(model.__doc__ or ""), "", "| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
+        lines += [_row(model, key, field) for key, field in model.model_fields.items()] + [""]
+    return "\n".join(lines)
+
+
+def tables(model: type[Strict], path: str = "") -> Iterator[tuple[str, type[Strict]]]:
+    """The settings and the tables in them, each with its place as TOML writes it."""
+    yield path, model
+    for key, hint in get_type_hints(model).items():
+        for inner, many in _models_in(hint):
+            place = f"{path.strip('[]')}.{key}".strip(".")
+            yield from tables(inner, f"[[{place}]]" if many else f"[{place}]")
+
+
+def _models_in(hint: Any, many: bool = False) -> Iterator[tuple[type[Strict], bool]]:
+    if isinstance(hint, type) and issubclass(hint, Strict):
+        yield hint, many
+    for inner in get_args(hint):
+        yield from _models_in(inner, many or get_origin(hint) is tuple)
+
+
+def _row(model: type[Strict], key: str, field: FieldInfo) -> str:
+    kind = _kind(get_type_hints(model, include_extras=True)[key])
+    unit = _UNITS.get(key.rpartition("_")[2], "")
+    cells = (
+        f"`{key}`",
+        kind,
+        unit,
+        _default(field),
+        meanings(model).get(key, "its own table" if kind.startswith("table") else ""),
+    )
+    return "| " + " | ".join(map(_cell, cells)) + " |"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    return "none" if value is None else f"`{_toml(value)}`"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Strict):
+        value = value.model_dump(exclude_defaults=True)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if value is None:
+        return '"none"'
+    return f"{value:.4g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+
+
+def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
+    """A type as one who writes TOML needs to know it, with its range."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _kind(inner[0], (*checks, *inner[1:]), plural)
+    if origin in (Union, UnionType):
+        return " or ".join(_kind(member, checks, plural) for member in inner if member is not type(None))
+    if origin is Literal or (isinstance(hint, type) and issubclass(hint, Enum)):
+        return ", ".join(f'`"{value}"`' for value in (inner or hint))
+    if origin is dict:
+        return f"table{plural} of {_kind(inner[1], plural='s')}"
+    if origin is tuple and inner[-1] is Ellipsis:
+        least = int(_limits(checks).get("min_length", 0))
+        some = {0: "", 1: ", not empty"}.get(least, f", {least} or more")
+        return f"list of {_kind(inner[0], plural='s')}{some}"
+    if origin is tuple and AfterValidator(ordered) in checks:
+        return f"[low, high]{_range((*get_args(inner[0])[1:], *checks))}"
+    if origin is tuple:
+        kinds = {_kind(member, plural="s") for member in inner}
+        return f"[{len(inner)} {kinds.pop() if len(kinds) == 1 else 'numbers'}]"
+    word = "table" if isinstance(hint, type) and issubclass(hint, Strict) else _WORDS.get(hint, "value")
+    return word + plural + _range(checks)
+
+
+def _range(checks: tuple[Any, ...]) -> str:
+    limits = _limits(checks)
+    # the tighter one of two; of equal ones the one that leaves the end out
+    low = max(
+        ((limits[name], name == "gt", sign) for name, sign in (("ge", "≥"), ("gt", ">")) if name in limits),
+        default=None,
+    )
+    high = min(
+        ((limits[name], name == "le", sign) for name, sign in (("le", "≤"), ("lt", "<")) if name in limits),
+        default=None,
+    )
+    if low and high and low[2] + high[2] == "≥≤":
+        return f", {low[0]:g} to {high[0]:g}"
+    return "".join(f", {end[2]} {end[0]:g}" for end in (low, high) if end)
+
+
+def _limits(checks: tuple[Any, ...]) -> dict[str, float]:
+    """The tightest of the bounds that a type's checks set, by pydantic's names."""
+    limits: dict[str, float] = {}
+    for check in checks:
+        if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # strict.within
+            given = dict(zip(("ge", "le"), check.func.args, strict=True))
+        else:
+            bounds = getattr(check, "metadata", ())
+            given = {name: getattr(bound, name) for bound in bounds for name in _BOUNDS if hasattr(bound, name)}
+        for name, value in given.items():
+            tighter = max if name.startswith("g") else min
+            limits[name] = tighter(limits.get(name, value), value)
+    return limits

@@ -1,0 +1,150 @@
+"""Each photograph of a folder, on its own: measured (over processes), classified, kept in the journal and let go.
+
+In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `KeptPhoto` for
+each, in order, however they finished. A file that cannot be read, cannot be measured or ends its process each time
+becomes a rejected entry; the others go on. Of a control's photographs only what the networks see counts, since a bare
+object carries no marker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.classify import Judges, squares_of
+from patchproof.evidence.journal import Journal, file_sha256
+from patchproof.evidence.ledger import usable
+from patchproof.evidence.measure import MeasuredPhoto, measure
+from patchproof.evidence.pictures import thumbnail
+from patchproof.evidence.reproject import Shot, shot_of
+from patchproof.evidence.results import PhotoEntry, Remark
+from patchproof.evidence.task import Task
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.quality import FrameLight
+from patchproof.photo.read import read_photo
+from patchproof.workers import WorkerDied, Workers, result_of
+
+WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
+_DIED = "measuring it ended its process each time, for want of memory: save it smaller"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A photograph to look at, the control that it shows (None: the patch), and whether pictures of it are wanted."""
+
+    path: Path
+    control: str | None = None
+    with_pictures: bool = False
+
+    @property
+    def name(self) -> str:
+        """Its name in the journal, where controls' photographs may be called as the patch's are."""
+        return self.path.name if self.control is None else f"{self.control}/{self.path.name}"
+
+
+@dataclass(frozen=True)
+class KeptPhoto:
+    """What is kept of one photograph: its entry with predictions, whether it counts, the light on its frame."""
+
+    entry: PhotoEntry
+    counted: bool
+    light: FrameLight | None
+
+    def serialize(self) -> dict[str, Any]:
+        """JSON values."""
+        light = None if self.light is None else {k: np.asarray(v).tolist() for k, v in vars(self.light).items()}
+        return {"entry": self.entry.model_dump(mode="json"), "counted": self.counted, "light": light}
+
+    @classmethod
+    def parse(cls, values: Mapping[str, Any]) -> KeptPhoto:
+        """What `serialize` made JSON of."""
+        light = values["light"]
+        if light is not None:
+            light = FrameLight(**light | {"paper": np.array(light["paper"]), "ink": np.array(light["ink"])})
+        return cls(PhotoEntry.model_validate(values["entry"]), values["counted"], light)
+
+
+def measure_all(
+    task: Task,
+    items: Sequence[Item],
+    judges: Judges | None,
+    workers: Workers,
+    journal: Journal | None,
+    on_pictures: Callable[[str, Mapping[str, np.ndarray]], None],
+    step: Callable[[int, int], None],
+) -> list[KeptPhoto]:
+    """Every photograph in order; those in the journal are not opened again. `step` gets how many are done, and all."""
+    photos: dict[int, KeptPhoto] = {}
+    for number, item in enumerate(items):
+        kept = journal.find(item.name, item.path) if journal is not None else None
+        if kept is not None and (kept["pictures"] or not item.with_pictures):
+            photos[number] = KeptPhoto.parse(kept)
+    todo = [number for number in range(len(items)) if number not in photos]
+    step(len(photos), len(items))
+    for at, future in workers.completed(partial(_measured, task), [items[number] for number in todo]):
+        number, item = todo[at], items[todo[at]]
+        try:
+            measured = result_of(future)
+        except WorkerDied:
+            measured = _rejected(item, Remark(code="unreadable", advice=_DIED))
+        predictions = judges.predictions(measured.squares) if judges and measured.squares is not None else {}
+        sha256 = file_sha256(item.path)
+        entry = measured.entry.changed(sha256=sha256, predictions=predictions)
+        if item.control is None:
+            on_pictures(item.path.name, measured.pictures)
+        kept = KeptPhoto(entry, measured.counted, measured.light).serialize()
+        if journal is not None:
+            journal.add(item.name, sha256, kept | {"pictures": item.with_pictures})
+        photos[number] = KeptPhoto.parse(kept)  # as a later run will find it: what is kept and new must not differ
+        step(len(photos), len(items))
+    return [photos[number] for number in range(len(items))]
+
+
+def _measured(task: Task, item: Item) -> MeasuredPhoto:
+    try:
+        photo = read_photo(item.path)
+        squares = squares_of(photo.srgb, task.sizes_px)
+        if item.control is not None:
+            return MeasuredPhoto(PhotoEntry(file=item.path.name, status="judged"), True, {}, squares=squares)
+        view = view_of(photo, task.camera)
+        measured = measure(view, item.path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
+        if not item.with_pictures:
+            return replace(measured, pictures={}, squares=squares)
+        geometry = measured.entry.geometry
+        small = thumbnail(view.photo.srgb, geometry and geometry.homography_px_from_mm, task.surface)
+        return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
+    except CannotJudge as cannot:
+        return _rejected(item, Remark.of(cannot))
+    except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
+        # no photograph is known that does this; one that does must not cost the others
+        advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
+        return _rejected(item, Remark(code="unreadable", advice=advice))
+
+
+def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:
+    return MeasuredPhoto(PhotoEntry(file=item.path.name, status="rejected", remark=remark), False, {})
+
+
+def shot_again(task: Task, size_px: int, item: tuple[Path, KeptPhoto]) -> Shot | None:
+    """What the ledger needs of a photograph, which is read again for it: only few are, and none then waits.
+
+    None where the ledger cannot work with it: it does not count, or its sheet is not flat or not to be believed.
+    """
+    path, kept = item
+    geometry, light = kept.entry.geometry, kept.light
+    believed = kept.counted and usable(kept.entry.status, kept.entry.code)
+    if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
+        return None
+    try:
+        srgb = view_of(read_photo(path), task.camera).photo.srgb
+        mm, blur_px = geometry.homography_px_from_mm, geometry.blur_px
+        return shot_of(kept.entry.file, srgb, mm, blur_px, light, task.surface, size_px)
+    except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
+        return None  # read before, so this is a file that went away: the ledger does without

@@ -1,0 +1,63 @@
+"""What photographs are judged with and measured against.
+
+In: a manifest and the `Options` of a verification. Out: a `Task`: all that one photograph is measured against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from patchproof.evidence.classify import Judges
+from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
+from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
+from patchproof.sheets.manifest import Manifest
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
+    from patchproof.channel.printer import Printer
+    from patchproof.classifier import Classifier
+
+LEDGER_PHOTOS = 24  # each costs 16 classifications; 24 leave intervals of some ± 5 points
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a verification's figures depend on besides photographs and manifest.
+
+    `printer` is the appearance model that the promise was made with.
+    `camera` replaces the EXIF focal length and takes out the lens. `ruler_mm` are the printed rulers (x, y) as somebody
+    measured them. `controls` is a folder of photographs of controls. `ledger_photos` of the photographs at most, spread
+    evenly, go into the gap ledger (0: no ledger).
+    """
+
+    models: Sequence[Classifier]
+    printer: Printer
+    camera: Camera | None = None
+    scan_dpi: float | None = None
+    ruler_mm: tuple[float, float] | None = None
+    controls: str | Path | None = None
+    ledger_photos: int = LEDGER_PHOTOS
+
+
+@dataclass(frozen=True)
+class Task:
+    """All that one photograph is measured against; small enough to be sent to another process."""
+
+    surface: Surface
+    promised: Promised | None
+    ranges: PromisedRanges
+    sizes_px: tuple[int, ...]  # of the networks' squares
+    scan_dpi: float | None
+    camera: Camera | None
+
+
+def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
+    """What all photographs of a verification are measured against."""
+    surface = surface_of(manifest)
+    promised = promised_of(manifest, surface, options.printer)
+    ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))
+    sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
+    return Task(surface, promised, ranges, sizes, options.scan_dpi, options.camera)

@@ -1,0 +1,114 @@
+"""What a design looks like where it hangs: in its printed piece, or as texels of the object's own textures.
+
+In: a design, a float tensor in [0, 1]: 3×h×w of any grid for a piece, 3×1×M (the texels that may change, texture by
+texture, by rows) for textures. Out: what `photograph` shows, differentiable in the design. The piece is shown whole,
+with its printed frame of markers, because that is what will hang there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.channel.printer import Printer
+from patchproof.render.photograph import ObjectTextures
+from patchproof.render.pixels import PiecePicture
+from patchproof.scene.texture import Canvas
+from patchproof.sheets.piece import MODULES, FrameImage, Piece, frame_image, lay_out_piece
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedPiece:
+    """A piece as this printer prints it."""
+
+    piece: Piece
+    sheet_id: str
+    printer: Printer
+    device: torch.device
+
+    def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
+        """The printed piece round a design 3×h×w, on the design's own grid, in the frame of that kind of sheet."""
+        height, width = design.shape[1:]
+        frame, printed_frame = self._frame(kind, (width, height))
+        x0, y0, *_ = frame.design_box_px
+        printed = self.printer.apply(design[None])[0].permute(1, 2, 0)
+        rows = torch.cat(
+            [printed_frame[y0 : y0 + height, :x0], printed, printed_frame[y0 : y0 + height, x0 + width :]], 1
+        )
+        picture = torch.cat([printed_frame[:y0], rows, printed_frame[y0 + height :]])
+        return PiecePicture(picture, frame.piece_box_px, (x0, y0, x0 + width, y0 + height))
+
+    @lru_cache(maxsize=8)  # noqa: B019 - it lives as long as its stage
+    def _frame(self, kind: str, design_px: tuple[int, int]) -> tuple[FrameImage, Tensor]:
+        """The frame of a kind of sheet, as drawn and as printed (H×W×3)."""
+        piece = self.piece
+        if kind != "design":
+            # the control's own marker ids, as they will be printed
+            piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, self.sheet_id, kind)
+        frame = frame_image(piece, design_px)
+        sent = torch.tensor(np.asarray(frame.srgb), dtype=torch.float32, device=self.device).permute(2, 0, 1)[None]
+        return frame, self.printer.apply(sent)[0].permute(1, 2, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedTextures:
+    """The object's textures with some texels free to change: those of the canvas's masks."""
+
+    canvas: Canvas
+    device: torch.device
+
+    def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
+        """The object's textures with the texels 3×1×M of a design; of any kind."""
+        return ObjectTextures(tuple(self.filled(design)))
+
+    def filled(self, design: Tensor) -> list[Tensor]:
+        """H×W×3 per material."""
+        parts = design[:, 0].T.split(self._counts)
+        both = zip(self._originals, self.masks, parts, strict=True)
+        return [original.masked_scatter(mask[..., None], part) for original, mask, part in both]
+
+    def images(self, design: Tensor) -> list[Tensor]:
+        """3×H×W per material, 0 where nothing may change."""
+        parts = design[:, 0].split(self._counts, 1)
+        return [
+            part.new_zeros(3, *mask.shape).masked_scatter(mask, part)
+            for mask, part in zip(self.masks, parts, strict=True)
+        ]
+
+    def texels(self, textures: Sequence[np.ndarray]) -> np.ndarray:
+        """uint8 1×M×3: the changeable texels of uint8 textures."""
+        masks = self.canvas.mask
+        return np.concatenate([texture[mask] for texture, mask in zip(textures, masks, strict=True)])[None]
+
+    def textures(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Whole uint8 textures with a design's pixels 1×M×3 in them."""
+        result, first = [], 0
+        for original, mask in zip(self._textures_srgb8, self.canvas.mask, strict=True):
+            texture, count = original.copy(), int(mask.sum())
+            texture[mask] = pixels[0, first : first + count]
+            result.append(texture)
+            first += count
+        return tuple(result)
+
+    @cached_property
+    def masks(self) -> tuple[Tensor, ...]:
+        """Where each texture may change, bool H×W."""
+        return tuple(torch.as_tensor(mask, device=self.device) for mask in self.canvas.mask)
+
+    @property
+    def _textures_srgb8(self) -> list[np.ndarray]:
+        # a canvas gives every material a texture
+        return [material.texture_srgb for material in self.canvas.mesh.materials if material.texture_srgb is not None]
+
+    @cached_property
+    def _counts(self) -> list[int]:
+        return [int(mask.sum()) for mask in self.masks]
+
+    @cached_property
+    def _originals(self) -> tuple[Tensor, ...]:
+        return tuple(torch.tensor(t, dtype=torch.float32, device=self.device) / 255 for t in self._textures_srgb8)
