@@ -192,10 +192,8 @@ def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
     design = np.random.default_rng(1).integers(0, 256, (1, subject.start().shape[2], 3), np.uint8)
     shuffled = subject.control("shuffled", design)
     assert np.array_equal(shuffled, subject.control("shuffled", design)) and not np.array_equal(shuffled, design)
-    first = 0
-    for mask, was, now in zip(
-        scene.canvas.mask, subject.surface.textures(design), subject.surface.textures(shuffled), strict=True
-    ):
+    first, textures = 0, (subject.surface.textures(each) for each in (design, shuffled))
+    for mask, was, now in zip(scene.canvas.mask, *textures, strict=True):
         count = int(mask.sum())
         parts = [np.sort(one[0, first : first + count].view("u1,u1,u1").ravel()) for one in (design, shuffled)]
         assert np.array_equal(*parts)

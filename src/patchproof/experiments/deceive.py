@@ -38,10 +38,11 @@ class DeceiveSettings(TrainedSettings):
     """As in all studies of trained designs; each network trains alone and all of them test."""
 
     # By name: tables of the scene file with the keys that change.
+    # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
         min_length=1,
-    )  # by name, keys of scene tables to change
+    )
 
 
 def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:

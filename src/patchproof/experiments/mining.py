@@ -49,7 +49,7 @@ _THINGS = ("clean", "plain", "mined")
 class MiningSettings(GridSettings):
     """Two designs per cell, one of them trained on mined views."""
 
-    map: MapSettings = MapSettings(n=16)  # that chooses the worst cells
+    map: MapSettings = MapSettings(n=16)  # what finds the worst cells
     mine: Count = 240  # conditions that are tried before mined training
     n: Count = 60  # draws in each worst cell that measure
     n_all: Count = 200  # draws over the whole ranges that measure

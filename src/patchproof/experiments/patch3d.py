@@ -66,7 +66,8 @@ class Patch3dSettings(GridSettings):
     renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; from 20 on, half of them are held out
     roll_deg: Range = (-22.5, 22.5)  # of the 2D patch, as in Brown et al.'s published program
     erasing: Share = 0.5  # chance of Random Erasing in 2D training
-    views: dict[str, Range] = Field(default_factory=dict)  # azimuths by name; without any, thirds of the scene's range
+    # Azimuths in degrees by name; without any, thirds of each scene's own range.
+    views: dict[str, Range] = Field(default_factory=dict)
 
 
 def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:

@@ -48,10 +48,9 @@ _SHEET_PX, _TURN_VIEWS, _SIDES = 160, 8, 3
 class RobustSettings(TrainedSettings):
     """Each network trains alone for each class, and all of them test."""
 
-    classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # labels, in place of the scene's target
-    ways: dict[Word, Way] = Field(
-        {"free": {"patch": {"kind": "texture", "start": "grey"}}}, min_length=1
-    )  # by name, keys of scene tables to change
+    classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
+    # By name: tables of the scene file with the keys that change.
+    ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "grey"}}}, min_length=1)
 
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:

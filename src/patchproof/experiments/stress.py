@@ -50,17 +50,17 @@ _MEASURING = 3_000_001  # added to a seed: the evaluate stream's draws that meas
 class OcclusionSettings(Strict):
     """A black square, everywhere in the picture."""
 
-    share: Annotated[Share, Field(gt=0)] = 0.3  # its side over the picture's
-    positions: Annotated[int, Field(ge=2)] = 7  # from edge to edge, across and down
-    n: Count = 32  # draws at each position
+    share: Annotated[Share, Field(gt=0)] = 0.3  # its side, as a share of the picture's
+    positions: Annotated[int, Field(ge=2)] = 7  # places from edge to edge, across and down
+    n: Count = 32  # draws at each place
 
 
 class SearchSettings(Strict):
-    """The search for the worst pose and light; the reach round the best halves from round to round."""
+    """A search from coarse to fine."""
 
     tries: Count = 48  # poses (or lights) in each round
-    rounds: Count = 4  # how often it closes in
-    draws: Count = 4  # of everything else, the same for each try
+    rounds: Count = 4  # the reach round the best halves from one to the next
+    draws: Count = 4  # of everything else, the same for all tries
     n: Count = 64  # draws that measure what was found
 
 

@@ -34,10 +34,10 @@ WORST_SHARE = 0.1
 class MapSettings(Strict):
     """A map's axes, each cut into equal cells of the scene's own range."""
 
-    pose: PoseAxis = "azimuth_deg"  # the axis to the right
-    light: LightAxis = "light_azimuth_deg"  # the axis upward
-    pose_cells: Count = 10  # cells to the right
-    light_cells: Count = 6  # cells upward
+    pose: PoseAxis = "azimuth_deg"  # the axis across
+    light: LightAxis = "light_azimuth_deg"  # the axis upwards
+    pose_cells: Count = 10  # cells of equal width across the scene's own range
+    light_cells: Count = 6  # likewise
     n: Count = 32  # draws in each cell
 
 

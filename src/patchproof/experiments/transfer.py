@@ -50,17 +50,17 @@ _SHEET_PX = 224
 
 
 class TransferSettings(TrainedSettings):
-    """Ensembles are all networks but one, each in turn, and all."""
+    """As in all studies of trained designs."""
 
-    ensembles: bool = True  # whether they train, too
-    lights: Count = 20  # draws per fixed view
+    ensembles: bool = True  # also trained on all networks but one, each in turn, and on all
+    lights: Count = 20  # lights in each of three fixed views
 
 
 def cells(settings: TransferSettings, base: Path) -> list[Cell]:
     """The original and every training set, per scene, way and seed."""
 
     def rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
-        ensembles = {}
+        ensembles: dict[str, Sequence[str]] = {}
         if settings.ensembles and len(networks) > 1:
             if len(networks) > 2:  # else one network is left, which is a row already
                 ensembles = {_WITHOUT + short_name(out): [name for name in networks if name != out] for out in networks}

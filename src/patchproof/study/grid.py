@@ -35,7 +35,7 @@ class GridSettings(Strict):
 
     scenes: Names  # scene files
     networks: tuple[str, ...] = ()  # in place of each scene's own
-    seeds: Seeds = (0,)  # of the scenes' draws
+    seeds: Seeds = (0,)  # of the optimizer and the draws
 
     @model_validator(mode="after")
     def _have_different_names(self):

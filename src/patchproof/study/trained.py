@@ -29,10 +29,11 @@ ORIGINAL = "original"  # the row of the object as it came
 class TrainedSettings(GridSettings):
     """Every scene in every way, before networks that train and test."""
 
-    networks: Names = Field(...)  # to train and to test on
-    if_installed: tuple[str, ...] = ()  # more of them, left out where they cannot be loaded, such as `timm:` ones
-    ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)  # by name, keys of scene tables to change
-    n: Annotated[int, Field(ge=2)] = 400  # conditions per cell, of the evaluate stream
+    networks: Names = Field(...)  # to train on and to test
+    if_installed: tuple[str, ...] = ()  # networks that are left out where they cannot be loaded, such as `timm:` ones
+    # By name: tables of the scene file with the keys that change.
+    ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)
+    n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
 
 
 def networks_of(settings: TrainedSettings, base: Path) -> tuple[str, ...]:

@@ -66,9 +66,9 @@ WORLDS = ("modeled", "path_traced")  # whose photographs: our renderer's, or the
 class AblationSettings(GridSettings):
     """A design for each scene, network and seed with all effects, and one without each."""
 
-    effects: Names = EFFECTS  # left out one at a time; those joined by " + " go together
-    n: Annotated[int, Field(ge=10)] = 400  # conditions for each design
-    photos: Annotated[int, Field(ge=0, le=1000)] = 40  # path-traced photographs for each design
+    effects: Names = EFFECTS  # left out one by one; "a + b" leaves out both at once
+    n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design
+    photos: Annotated[int, Field(ge=0, le=1000)] = 40  # path-traced photographs of each design
 
 
 @dataclass(frozen=True, eq=False)

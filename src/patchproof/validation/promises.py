@@ -44,9 +44,9 @@ _LOW, _HIGH = 1e-3, 1 - 1e-3  # rates whose odds are taken
 class PromisesSettings(GridSettings):
     """A run for each scene, network, printer and seed."""
 
-    printers: Names = ("coated",)  # in place of each scene's own
+    printers: Names = ("coated",)  # that print the designs, and are known while optimizing
     photos: Annotated[int, Field(ge=10, le=1000)] = 40  # of each print
-    path_traced: bool = True  # whether the path tracer takes them
+    path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
 
 
 def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
@@ -129,7 +129,7 @@ def fitted_shift(counts: Sequence[Count]) -> float:
         p = shifted(rates, shift or 1e-12)
         return -float((hits * np.log(p) + (n - hits) * np.log(1 - p)).sum())
 
-    return float(fminbound(unlikely, -3, 3))
+    return float(np.asarray(fminbound(unlikely, -3, 3)))
 
 
 def _bias(counts: Sequence[Count], shift: float = 0.0) -> list[float]:
