@@ -180,9 +180,9 @@ def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
     views = three_views(problem, 4)
     assert sorted(set(views.pose.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
-    assert len(set(views.directional)) == 12 and len(set(views.distance_mm)) == 1
+    assert len(set(views.light.directional)) == 12 and len(set(views.pose.distance_mm)) == 1
     still = from_sides(problem, np.array([0.0, 90.0]))
-    assert not still.directional.any() and not still.noise.any() and (still.ambient == 1).all()
+    assert not still.light.directional.any() and not still.sensor.noise.any() and (still.light.ambient == 1).all()
 
 
 def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
