@@ -1,8 +1,10 @@
-"""Benchmarks: the front, the slope and the intervals are right, what is broken shows, and the files can be read."""
+"""Benchmarks: the front and the times are right, what is broken shows, and the files can be read."""
 
 from __future__ import annotations
 
+import csv
 import json
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,20 +13,21 @@ import torch
 from PIL import Image
 
 from patchproof.bench import chart as charts
-from patchproof.bench import measure, render, run, speed, texture
-from patchproof.bench.chart import Chart, Check, Growth, Point, Series, Shares
+from patchproof.bench import measure, render, run, texture
+from patchproof.bench.chart import Chart, Check, Point, all_checks, pareto, points_table
 from patchproof.bench.world import set_world
+from patchproof.claims import Estimate
 
 LOOKED_AT = (45, 60)  # px wide, degrees
 
 
 def point(setting="a", cost=1.0, error=1.0, default=False):
-    return Point(setting, cost, error, (cost * 0.9, cost * 1.1), (error * 0.9, error * 1.1), default)
+    return Point(setting, *(Estimate(x, 0.9 * x, 1.1 * x, 5) for x in (cost, error)), default)
 
 
-def chart(kind=Chart, points=((1, 3), (2, 1), (3, 2)), **more):
-    series = Series("knob", tuple(point(str(i), *p, default=i == 1) for i, p in enumerate(points)), slope=1.0)
-    return kind("some", "Some knob", "cost, relative", "error, dB", (series,), **more)
+def chart(points=((1, 3), (2, 1), (3, 2)), **more):
+    series = {"knob": [point(str(i), *p, default=i == 1) for i, p in enumerate(points)]}
+    return Chart("some", "Some knob", "cost, relative", "error, dB", series, "About it.", **more)
 
 
 def quiet(stage, done, total):
@@ -39,33 +42,24 @@ def world():
 def test_a_point_that_another_beats_is_not_on_the_front():
     #                 cheap  exact  beaten  as exact but dearer  the same as another
     cost, error = [1, 3, 4, 4, 1], [5, 1, 2, 1, 5]
-    assert charts.pareto(cost, error).tolist() == [True, True, False, False, True]
+    assert pareto(cost, error).tolist() == [True, True, False, False, True]
 
 
 def test_the_front_of_a_quality_is_its_upper_edge():
-    on_front = [p.front for p in charts.with_front(chart()).series[0].points]
-    upper = [p.front for p in charts.with_front(chart(higher_is_better=True)).series[0].points]
-    assert on_front == [True, True, False] and upper == [True, False, False]
+    for made, expected in ((chart(), ["0", "1"]), (chart(higher_is_better=True), ["0"])):
+        (points,) = made.tasks.values()
+        assert [p.setting for p in made.front(points)] == expected
 
 
-@pytest.mark.parametrize("power", [0.5, 1.0, 1.3])
-def test_the_slope_is_that_of_the_larger_half(power):
-    size = np.array([1e3, 1e4, 1e5, 1e6])
-    seconds = 1e-6 * size**power
-    assert measure.slope(size, seconds) == pytest.approx(power)
-    assert measure.slope(size, np.where(size < 1e5, seconds[2], seconds)) == pytest.approx(power)
-
-
-def test_intervals_of_medians_are_order_statistics():
-    # of 100 values the binomial's 2.5 % point is 40: the 40th and 61st, as tables of the sign test have it
-    middle, interval = measure.median_interval(np.arange(1.0, 101))
-    assert middle == 50.5 and interval == (40, 61)
-    assert measure.median_interval(np.array([3.0, 1, 2])) == (2, (1, 3))
+def test_a_point_without_a_finite_error_is_no_choice():
+    made = chart(((1, np.inf), (2, 1), (3, 2)))
+    assert [row[3] is None for row in points_table(made).rows] == [True, False, False]
+    assert [p.setting for p in made.tasks["knob"]] == ["1", "2"]
 
 
 def test_ratios_are_those_of_the_same_round():
     seconds = {"a": np.array([2.0, 20, 200]), "b": np.array([1.0, 10, 100])}
-    assert measure.ratio(seconds, "a", "b") == (2, (2, 2))
+    assert measure.ratio(seconds, "a", "b") == Estimate(2, 2, 2, 3)
 
 
 def test_calls_are_timed_in_turn_after_a_warm_up():
@@ -74,29 +68,43 @@ def test_calls_are_timed_in_turn_after_a_warm_up():
     assert order == ["a", "b"] * 3 and [len(values) for values in seconds.values()] == [2, 2]
 
 
+def test_waiting_is_not_counted_as_work():
+    answer, milliseconds = measure.clocked(lambda: time.sleep(0.05) or 7)
+    assert answer == 7 and 0 <= milliseconds < 25
+
+
 def test_psnr_of_a_tenth_is_twenty():
     assert measure.psnr(torch.full((4, 3), 0.6), torch.full((4, 3), 0.5)) == pytest.approx(20, abs=1e-4)
 
 
 def test_a_check_that_fails_is_said_to_fail():
     checks = (Check("width", 3.0, 2.0), Check("PSNR", 40.0, 38.0, at_least=True), Check("nothing", float("nan"), 1.0))
+    made = chart(checks=checks)
     assert [check.holds for check in checks] == [False, True, False]
-    lines = charts.text(chart(checks=checks))
-    assert [line.split(":")[0].strip() for line in lines[-3:]] == ["FAILS", "holds", "FAILS"]
+    assert [row[-1] for row in charts.checks_table([made]).rows] == [False, True, False, True]
+    assert list(charts.failed_checks([made]).values()) == ["3, at most 2 was claimed", "nan, at most 1 was claimed"]
 
 
-def test_json_table_and_charts_can_be_read_back(tmp_path, monkeypatch):
-    named = [replace(chart(kind), name=name) for kind, name in ((Chart, "a"), (Growth, "b"), (Shares, "c"))]
-    monkeypatch.setattr(run, "_benches", lambda: {"render": lambda quick, on_stage: iter(named)})
-    lines = run.run_bench("render", tmp_path / "out", quick=True)
+def test_json_tables_charts_and_page_can_be_read_back(tmp_path, monkeypatch):
+    named = [chart(), replace(chart(checks=(Check("width", 3.0, 2.0),)), name="other", one_front=True, target=1.5)]
+    monkeypatch.setattr(run, "load_bench", lambda name: lambda quick, on_stage: iter(named))
+    (results,) = run.run_bench("render", tmp_path / "out", quick=True)
     data = json.loads((tmp_path / "out" / "render.json").read_text("utf-8"))
-    assert data["quick"] and data["machine"]["threads"] == torch.get_num_threads()
-    points = data["charts"]["a"]["series"][0]["points"]
-    assert [p["front"] for p in points] == [True, True, False] and points[1]["default"]
-    assert (tmp_path / "out" / "table.txt").read_text("utf-8").splitlines() == lines[:-2]
-    for name in "abc":
+    assert data["settings"] == {"quick": True} and data["machine"]["threads"] == torch.get_num_threads()
+    assert list(data["tables"]) == ["some", "other", "checks"] == [table.name for table in results.tables]
+    assert [row[-1] for row in data["tables"]["some"]["rows"]] == ["front", "default, front", ""]
+    assert data["failed"] == {"other, width": "3, at most 2 was claimed"}
+    (head, first, *_) = csv.reader((tmp_path / "out" / "render_some.csv").read_text().splitlines())
+    assert dict(zip(head, first, strict=True))["error_high"] == "3.3000000000000003"
+    page = (tmp_path / "out" / "render.html").read_text("utf-8")
+    assert "patchproof bench: render" in page and "About it." in page and "3, at most 2" in page
+    for name in ("some", "other"):
         with Image.open(tmp_path / "out" / f"render_{name}.png") as image:
             assert np.asarray(image.convert("L")).std() > 5
+
+
+def test_every_benchmark_has_charts():
+    assert all(callable(run.load_bench(name)) for name in run.BENCHES)
 
 
 def test_an_unknown_benchmark_is_refused_with_the_nearest(tmp_path):
@@ -104,16 +112,21 @@ def test_an_unknown_benchmark_is_refused_with_the_nearest(tmp_path):
         run.run_bench("rendr", tmp_path / "out")
 
 
+def test_a_default_is_checked_where_it_stands():
+    (check,) = all_checks(chart())
+    assert check.claim.startswith("knob: ") and check.figure == 0
+
+
 def test_one_tap_is_further_off_than_the_default(world):
-    look = texture.look(world.problem.scene.piece, world.shown("noise"), *LOOKED_AT)
-    noise = texture.texels(world.shown("noise"))
+    look = texture.look(world.piece, world.control("noise"), *LOOKED_AT)
+    noise = texture.texels(world.control("noise"))
     few, default = (measure.psnr(noise.seen(look, n).detach(), look.truth) for n in (1, texture.DESIGN_TAPS))
     assert default > texture.LEAST_PSNR > few + 5
 
 
 def test_the_reference_is_the_mean_of_what_a_pixel_sees(world):
     """A slow twin for one pixel: 256 samples one by one."""
-    piece, picture = world.problem.scene.piece, world.shown("noise")
+    piece, picture = world.piece, world.control("noise")
     pose = texture._pose(piece, *LOOKED_AT)
     side = texture.PICTURE_PX
     matrix = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
@@ -133,14 +146,7 @@ def test_the_reference_is_the_mean_of_what_a_pixel_sees(world):
 
 def test_samples_at_edges_bring_the_bare_object_nearer_to_the_truth(world, monkeypatch):
     monkeypatch.setattr(render, "EDGES_PX", 96)
-    made = render.edges_chart(world, 1, 1, quiet)
-    points = {p.setting: p for p in made.series[0].points}
-    assert points["1 × 1"].default and points["1 × 1"].cost == 1
-    assert points["3 × 3"].error > points["1 × 1"].error
-
-
-def test_a_sphere_that_is_larger_has_more_fragments_and_a_process_tells_its_peak():
-    small, large = (len(speed.rasterize(*speed.sphere(3, 1, side))) for side in (64, 128))
-    assert large == pytest.approx(4 * small, rel=0.03)
-    peak = speed.peak_gb(1, 64)
-    assert peak is None or 0.05 < peak < 4
+    made = render.edges_chart(world, 2, 1, quiet)
+    points = {p.setting: p for p in made.series["object with its patch"]}
+    assert points["1 × 1"].default and points["1 × 1"].cost.value == 1
+    assert points["3 × 3"].error.value > points["1 × 1"].error.value

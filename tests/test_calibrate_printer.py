@@ -28,7 +28,7 @@ from patchproof.calibrate.ladder import (
     fit_white_black,
     rungs,
 )
-from patchproof.channel.lens import load_camera
+from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer, vary
 from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.color import linear_from_srgb, srgb_from_linear
@@ -303,8 +303,31 @@ def test_print_to_print_variation_is_found():
 # ------------------------------------------------------------------------------------------------ cameras
 
 
+def toned_camera() -> Camera:
+    """A camera with a tone curve as phones have: lighter middle tones and a soft shoulder, steeper in the dark."""
+    codes = np.linspace(0, 1, 65)
+    light = linear_from_srgb(codes)
+    curve = 0.65 * light**1.15 + 0.35 * (codes**2 * (3 - 2 * codes)) ** 1.8
+    return load_camera("phone").changed(name="toned", tone_light=tuple((curve / curve[-1]).tolist()))
+
+
+def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, float]:
+    """Error of the chosen rung against the printer itself, without and with the camera's file."""
+    _, shows, priors = bench_printer.drawn_printer(seed)
+    manifest, colors = chart_manifest(swatches), bench_printer.held_out_colors()
+    shot = photograph_page(printed_page(manifest, shows), seed, camera)
+    truth, errors = bench_printer.shown_by(shows, shot, colors), []
+    for known in (None, camera):
+        light = read_chart(shot.photo, manifest, known).light
+        usable = np.isfinite(light).all(1)
+        sent = np.array([s.srgb for s in manifest.chart])[usable]
+        choice = choose(rungs(priors), sent, srgb_from_linear(light[usable]))
+        errors.append(float(difference(bench_printer.relative(choice.predict, colors), truth).mean()))
+    return errors[0], errors[1]
+
+
 def test_tone_curves_close_and_a_camera_without_one_is_srgb():
-    camera, codes = bench_printer.toned_camera(), np.linspace(0, 1, 200)
+    camera, codes = toned_camera(), np.linspace(0, 1, 200)
     np.testing.assert_allclose(codes_of_light(light_of_codes(codes, camera), camera), codes, atol=1e-9)
     np.testing.assert_allclose(light_of_codes(codes, load_camera("phone")), linear_from_srgb(codes))
     np.testing.assert_allclose(codes_of_light(np.array([2.0, -1.0]), camera), [1, 0])
@@ -322,8 +345,8 @@ def test_a_tone_curve_that_falls_is_refused(tmp_path):
 
 
 def test_a_camera_file_tells_printer_and_camera_apart():
-    camera = bench_printer.toned_camera()
-    without, with_file = bench_printer.printer_errors(0, 48, camera)
+    camera = toned_camera()
+    without, with_file = printer_errors(0, 48, camera)
     assert with_file < 1.5 and without > with_file + 1
 
 
@@ -336,9 +359,10 @@ def test_the_bench_holds_choices_against_the_best_rung():
         return bench_printer.Trial(driver, 48, errors, {"white_black": 0.1, "affine": 0.2, "spline": 0.4}, chosen)
 
     trials = [one("spline", "plain"), one("spline", "plain"), one("affine", "matching")]
-    drawn = bench_printer.ladder_chart(trials, np.array([[4.0, 1.0], [3.0, 1.0]]))
-    points = {point.setting: point for point in drawn.series[0].points}
-    assert points["spline"].cost == pytest.approx(4) and points["spline"].default and points["affine"].error == 2
+    drawn = bench_printer.ladder_chart(trials)
+    points = {point.setting: point for point in drawn.series["rungs"]}
+    assert points["spline"].cost.value == pytest.approx(4) and points["spline"].default
+    assert points["affine"].error.value == 2
     mean, share, worst = drawn.checks
     assert mean.figure == pytest.approx(4 / 3) and mean.holds
     assert share.figure == pytest.approx(2 / 3) and not share.holds

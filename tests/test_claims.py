@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import binom, multinomial
 
-from patchproof.claims import independent_difference, mcnemar_p, paired_difference, prediction_interval, wilson
+from patchproof.claims import (
+    independent_difference,
+    mcnemar_p,
+    mean,
+    median,
+    paired_difference,
+    paired_means,
+    prediction_interval,
+    standard_deviation,
+    wilson,
+)
 
 
 def pairs(both: int, only_a: int, only_b: int, neither: int) -> tuple[list[bool], list[bool]]:
@@ -112,3 +122,33 @@ def test_prediction_interval_is_wider_than_wilson_and_knows_the_ends():
     assert prediction_interval(0, 0, 5) == (0, 5)
     assert prediction_interval(80, 400, 20) == tuple(20 - k for k in reversed(prediction_interval(320, 400, 20)))
     assert all(isinstance(k, int) for k in prediction_interval(320, 400, 20))
+
+
+def test_intervals_of_medians_are_order_statistics():
+    # of 100 values the binomial's 2.5 % point is 40: the 40th and 61st, as tables of the sign test have it
+    middle = median(np.arange(1.0, 101))
+    assert (middle.value, middle.low, middle.high, middle.n) == (50.5, 40, 61, 100)
+    few = median([3.0, 1, 2])
+    assert (few.value, few.low, few.high) == (2, 1, 3)
+
+
+def test_means_have_student_s_interval_and_one_value_has_none():
+    # by hand: deviation 1, /√3, t of 2 degrees 4.303
+    assert mean([1.0, 2.0, 3.0]).high == pytest.approx(2 + 4.303 / 3**0.5, rel=1e-3)
+    assert mean([1.0]) is None
+
+
+def test_paired_intervals_leave_out_what_settings_share():
+    seeds, own = np.array([0.0, 10, 20]), np.array([[1, 2], [1, 2], [1, 2.0]])
+    a, b = paired_means(own + seeds[:, None])
+    assert (a.value, b.value) == (11, 12) and (a.low, a.high) == pytest.approx((11, 11))
+    # by hand: what is left of a is ±0.5, its deviation 0.5, times √2 for two settings, /√3, t of 2 degrees 4.303
+    c, _ = paired_means(np.array([[1, 0], [0, 1], [0.5, 0.5]]))
+    assert (c.high - c.low) / 2 == pytest.approx(4.303 * 0.5 * (2 / 3) ** 0.5, rel=1e-3)
+
+
+def test_a_deviation_of_known_values_has_its_textbook_interval():
+    # χ² with 9 degrees of freedom: 2.700 and 19.023
+    spread = standard_deviation([3.0, -3.0] + [0.0] * 8)
+    assert spread.value == pytest.approx(2**0.5)
+    assert (spread.low, spread.high) == pytest.approx(((18 / 19.023) ** 0.5, (18 / 2.700) ** 0.5), rel=1e-3)

@@ -14,13 +14,15 @@ from patchproof.channel.effect import Effect
 from patchproof.channel.effects import EFFECT, EFFECTS, FIELDS, RECORD_OF, RECORDS, Light, Pose, Sensor
 from patchproof.optimizer.problem import set_problem
 from patchproof.plan.terms import PRINTER, Setup, scene_terms
+from patchproof.render import photograph
 from patchproof.render.photograph import expose
 from patchproof.render.views import see
-from patchproof.scene.conditions import Conditions, draw, fields_of, of_fields, sampled
+from patchproof.scene.conditions import Conditions, draw, fields_of, of_fields, sampled, without
 from patchproof.settings import CameraSettings, LightSettings, PrinterSettings
 from patchproof.validation import ablation
 from test_conditions import EVERYTHING, STREAMS
 from test_optimize import scene_with
+from tolerances import FLOAT32
 
 # Of the fields below in rows 0 to 39 of seed 3, as they were drawn when one function sampled all of them in order.
 DIGESTS = {
@@ -132,12 +134,14 @@ def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(p
     others = {"ambient", "directional", "sh2"} if effect.instead else set()
     assert effect.fields[0] in moved <= {effect.fields[0]} | others
     views = (setup.conditions, setup.conditions, less.conditions)  # the first time, the scene's own textures are made
-    _, count, less_count = (operations(problem, conditions, shown) for conditions in views)
-    assert (less_count < count) == effect.slows
+    (_, count, less_count), (whole, _, plain) = zip(
+        *(photographed(problem, part, shown) for part in views), strict=True
+    )
+    assert (less_count < count) == effect.slows and not torch.equal(whole, plain)
 
 
-def operations(problem, conditions, shown) -> int:
-    """How many tensor operations whole photographs take."""
+def photographed(problem, conditions, shown) -> tuple[int, torch.Tensor]:
+    """How many tensor operations whole photographs take, and the photographs."""
 
     class Counter(TorchDispatchMode):
         count = 0
@@ -147,8 +151,26 @@ def operations(problem, conditions, shown) -> int:
             return func(*args, **(kwargs or {}))
 
     with torch.no_grad(), Counter():
-        expose(see(problem.stage, shown, conditions, problem.scene.settings.camera.photo_px), shown)
-    return Counter.count
+        pictures = expose(see(problem.stage, shown, conditions, problem.scene.settings.camera.photo_px), shown)
+    return Counter.count, pictures
+
+
+@pytest.mark.parametrize("effect", SWITCHED, ids=lambda effect: effect.name)
+def test_the_short_way_to_small_pictures_knows_every_effect(problem, effect, monkeypatch):
+    """Where each pixel is developed alone, only the piece's are developed anew; alone, each effect looks the same."""
+    shown = problem.subject.shown(problem.subject.start())
+    conditions = problem.scene.draw("select", 4)
+    for other in SWITCHED:
+        if other not in (effect, EFFECT["ambient light"]):
+            conditions = without(conditions, other, lambda azimuth_deg, elevation_deg: np.ones(4)) or conditions
+    views = see(problem.stage, shown, conditions, (96, 96))
+    cut = torch.zeros(4 * 96 * 96, dtype=torch.bool)
+    cut[views.on_piece.pixel], cut[views.on_piece.back_pixel] = views.on_piece.share[:, 0] < 1 - FLOAT32, True
+    ways = [expose(views, shown)]
+    monkeypatch.setattr(photograph, "is_pointwise", lambda *arguments: False)
+    ways.append(expose(views, shown))
+    quick, slow = (pictures.permute(0, 2, 3, 1).reshape(-1, 3)[~cut] for pictures in ways)
+    torch.testing.assert_close(quick, slow, atol=1e-5, rtol=0)
 
 
 def test_what_is_not_given_is_off_and_one_row_stands_for_all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -87,10 +88,10 @@ def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeyp
         (photos / path.name).write_bytes(path.read_bytes())
     monkeypatch.setattr(batch, "read_photo", lambda path: opened.append(path.name) or read_photo(path))
 
-    def judged(resume=True, **options):
+    def judged(resume=True, progress=lambda done, total: None, **options):
         opened.clear()
         options = Options([NET], identity_printer(), ledger_photos=0, **options)
-        kept = dict(journal=tmp_path / "photos.jsonl", resume=resume)
+        kept = dict(journal=tmp_path / "photos.jsonl", resume=resume, progress=progress)
         return gather_evidence(photos, make_manifest(promise()), options, **kept).report
 
     first = judged()
@@ -107,6 +108,9 @@ def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeyp
     assert len(opened) == 6
     controls = {"controls": photos}
     assert judged(**controls).controls == judged(**controls).controls and opened == []
+    steps = []
+    judged(**controls, progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(12, 12)]  # what an earlier run did counts as done
 
 
 def test_squares_do_not_wait_for_each_other(folder, monkeypatch):
@@ -174,6 +178,11 @@ def test_a_journal_forgets_other_keys_and_other_bytes(tmp_path):
         journal = Journal(path, key, resume=True)
         assert (journal.find("a.jpg", photo) == {"x": 1.25}) is again
         journal.close()
+    older = {"file": "a.jpg", "sha256": file_sha256(photo), "key": "k", "said": {}}
+    (tmp_path / "older.jsonl").write_text(json.dumps(older))
+    journal = Journal(tmp_path / "older.jsonl", "k", resume=True)
+    assert journal.find("a.jpg", photo) is None  # another version's lines are done anew
+    journal.close()
     photo.write_bytes(b"two")
     journal = Journal(path, "k", resume=True)
     assert journal.find("a.jpg", photo) is None

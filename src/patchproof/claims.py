@@ -82,7 +82,7 @@ def paired_means(values: np.ndarray) -> list[Estimate]:
     return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
-def deviation(values: Sequence[float] | np.ndarray) -> Estimate:
+def standard_deviation(values: Sequence[float] | np.ndarray) -> Estimate:
     """The standard deviation of normal values with its χ² interval."""
     from scipy.stats import chi2
 

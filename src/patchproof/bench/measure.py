@@ -1,7 +1,7 @@
-"""How benchmarks measure: times taken in turn within one run, medians and means with intervals, the machine.
+"""How benchmarks measure: times taken in turn within one run, their ratios, and the machine.
 
-In: calls, or figures. Out: seconds, ratios and intervals. A machine's seconds mean little elsewhere, so that times are
-compared only with times of the same run.
+In: calls. Out: seconds and ratios. A machine's seconds mean little elsewhere, so that times are compared only with
+times of the same run.
 """
 
 from __future__ import annotations
@@ -10,15 +10,18 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from torch import Tensor
 
-from patchproof.bench.chart import Interval
-from patchproof.claims import CONFIDENCE
+from patchproof.claims import Estimate, median
+
+Name = TypeVar("Name", bound=Hashable)
+Answer = TypeVar("Answer")
 
 
 def machine() -> dict[str, Any]:
@@ -42,15 +45,9 @@ def describe(about: Mapping[str, Any]) -> str:
     return f"{about['processor']}, {threads}, torch {about['torch']}, {about['date']}"
 
 
-def slope(size: Sequence[float], seconds: Sequence[float]) -> float:
-    """Exponent k of seconds ~ size^k over the larger half of the sizes: a fixed cost hides in the smaller ones."""
-    half = len(size) // 2
-    return float(np.polyfit(np.log(size[half:]), np.log(seconds[half:]), 1)[0])
-
-
-def timed(calls: Mapping[Any, Callable[[], object]], rounds: int) -> dict[Any, np.ndarray]:
+def timed(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
     """Wall seconds of each call, `rounds` of them, all calls in turn in each round after one round of warm-up."""
-    seconds: dict[Any, list[float]] = {name: [] for name in calls}
+    seconds: dict[Name, list[float]] = {name: [] for name in calls}
     for _ in range(rounds + 1):
         for name, call in calls.items():
             begin = time.perf_counter()
@@ -59,56 +56,18 @@ def timed(calls: Mapping[Any, Callable[[], object]], rounds: int) -> dict[Any, n
     return {name: np.array(values[1:]) for name, values in seconds.items()}
 
 
-def median_interval(values: np.ndarray) -> tuple[float, Interval]:
-    """The median with its distribution-free 95 % interval from order statistics; of few values, their range."""
-    from scipy.stats import binom
-
-    ordered, n = np.sort(values), len(values)
-    skipped = max(int(binom.ppf((1 - CONFIDENCE) / 2, n, 0.5)) - 1, 0)
-    return float(np.median(ordered)), (float(ordered[skipped]), float(ordered[n - 1 - skipped]))
+def clocked(call: Callable[[], Answer]) -> tuple[Answer, float]:
+    """What a call returns, and its milliseconds of the processor: other work on the machine does not count."""
+    begin = time.process_time()
+    return call(), 1000 * (time.process_time() - begin)
 
 
-def ratio(seconds: Mapping[Any, np.ndarray], one: Any, other: Any) -> tuple[float, Interval]:
-    """How many times as long one call took as another: the median over rounds, each with its own ratio."""
-    return median_interval(seconds[one] / seconds[other])
+def ratio(seconds: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
+    """How many times as long `a` took as `b`: the median over rounds, each with its own ratio."""
+    return median(seconds[a] / seconds[b])
 
 
-def mean_interval(values: np.ndarray) -> tuple[float, Interval]:
-    """The mean with its 95 % bootstrap interval (percentiles of 2000 draws from a fixed seed)."""
-    draws = np.random.default_rng(0).integers(len(values), size=(2000, len(values)))
-    tail = 100 * (1 - CONFIDENCE) / 2
-    low, high = np.percentile(np.asarray(values)[draws].mean(1), [tail, 100 - tail])
-    return float(np.mean(values)), (float(low), float(high))
-
-
-def paired_means(values: np.ndarray) -> list[tuple[float, Interval]]:
-    """Means of the columns of S×K (K settings tried on the same S seeds) with 95 % intervals for comparing them.
-
-    What all settings of a seed have in common is taken out: Student's intervals of what is left, as in Morey,
-    Confidence intervals from normalized data: a correction to Cousineau (2005), 2008.
-    """
-    from scipy.stats import t
-
-    seeds, settings = values.shape
-    left = values - values.mean(1, keepdims=True)
-    spread = left.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
-    half = float(t.ppf(0.5 + CONFIDENCE / 2, seeds - 1)) * spread
-    middles = values.mean(0)
-    return [(float(m), (float(m - h), float(m + h))) for m, h in zip(middles, half, strict=True)]
-
-
-def checked_pick(values: np.ndarray, costs: Sequence[float], default: int) -> tuple[int, float]:
-    """(which of K settings that cost no more than the default is best on every second seed, by what share the default's
-    error exceeds its error on the other seeds), of S×K errors, S ≥ 2. Chosen and judged on the same seeds, the luckiest
-    would look best.
-    """
-    affordable = [k for k, cost in enumerate(costs) if cost <= costs[default]]
-    pick = min(affordable, key=lambda k: values[0::2, k].mean())
-    others = values[1::2].mean(0)
-    return pick, float(others[default] / others[pick] - 1)
-
-
-def psnr(picture, truth) -> float:
+def psnr(picture: Tensor, truth: Tensor) -> float:
     """Peak signal-to-noise ratio in dB of pictures in [0, 1]."""
     square = float(((picture.double() - truth.double()) ** 2).mean())
     return -10 * math.log10(max(square, 1e-12))

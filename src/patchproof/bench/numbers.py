@@ -12,22 +12,24 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.bench.chart import Chart, OnStage, Point, Series, Table
-from patchproof.bench.measure import mean_interval, ratio, timed
+from patchproof.bench.chart import Chart, OnStage, Point
+from patchproof.bench.measure import ratio, timed
 from patchproof.bench.world import demo_problem
+from patchproof.claims import student_mean
 from patchproof.classifier.batches import MAX_BATCH, InBatches, few_on_cpu
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.view import center_square
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
+from patchproof.report.tables import Table
 
 VIEWS = 12
 REAL = "models/mobilenet_v2_1.0_224.pt2"
@@ -68,53 +70,45 @@ class Answer:
     gradient: Tensor
 
 
-def numbers_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     """The one chart."""
-    problem, rounds, left_out = demo_problem(), 5 if quick else 15, ()
-    classifiers = [problem.classifiers[0]]
-    path = Path(os.environ.get("PATCHPROOF_DATA", "-")) / REAL
-    if quick or not path.is_file():
-        why = "with --quick" if quick else "PATCHPROOF_DATA names no folder with it"
-        left_out = (f"{REAL} was left out: {why}",)
-    else:
+    problem = demo_problem()
+    classifiers, path = [problem.classifiers[0]], Path(os.environ.get("PATCHPROOF_DATA", "-")) / REAL
+    if path.is_file() and not quick:
         classifiers.append(load_classifier(f"file:{path}", Path()))
-    chart = types_chart(problem, classifiers, rounds, on_stage)
-    yield replace(chart, notes=(*chart.notes, *left_out))
+    yield types_chart(problem, classifiers, 5 if quick else 15, on_stage)
 
 
 def types_chart(problem: Problem, classifiers: list[Classifier], rounds: int, on_stage: OnStage) -> Chart:
     """Types and orders of memory, one series for each network."""
-    photos, series, rows = _photos(problem), [], []
+    photos, series, rows = _photos(problem), {}, []
     for number, classifier in enumerate(classifiers):
-        pictures = center_square(photos, classifier.input_px)
-        network = classifier.network.network  # without the batches that it is loaded in
+        pictures, name = center_square(photos, classifier.input_px), classifier.name.rpartition("/")[2]
+        assert isinstance(classifier.network, InBatches)
+        network = classifier.network.network
+        assert isinstance(network, torch.nn.Module)
         with torch.no_grad():
             label = network(pictures).argmax(1)
         truth = answer(_copy(network).double(), pictures.double(), label)
-        answers, calls = {}, {}
-        for way in WAYS:
-            work = _work(network, way, pictures, label)
-            answers[way], calls[way] = work(), work
-        seconds, points = timed(calls, rounds), []
-        for way in WAYS:
-            off = _off(answers[way].logits, truth.logits, label)
-            (cost, span), (error, interval) = ratio(seconds, way, USUAL), mean_interval(off)
-            points.append(Point(way.name, cost, error, span, interval, way is USUAL))
-            rows.append((f"{classifier.name.rpartition('/')[2]}: {way.name}", *_figures(answers[way], truth)))
-        series.append(Series(classifier.name.rpartition("/")[2], tuple(points)))
+        calls = {way: _work(network, way, pictures, label) for way in WAYS}
+        answers, seconds = {way: call() for way, call in calls.items()}, timed(calls, rounds)
+        series[name] = [
+            Point(way.name, ratio(seconds, way, USUAL), student_mean(_off(answers[way], truth, label)), way is USUAL)
+            for way in WAYS
+        ]
+        rows += [(name, way.name, *_figures(answers[way], truth)) for way in WAYS]
         on_stage("numbers", number + 1, len(classifiers))
+    head = ("network", "way", "mean |logit - float64's|", "largest", "cosine of the gradient")
     return Chart(
-        "types",
-        "Types of numbers and orders of memory",
-        "forward and backward pass to the pictures, relative to the default",
-        f"mean |confidence - float64's| of the top label ({VIEWS} views, 95 %)",
-        tuple(series),
-        (
-            f"{VIEWS} views of the demo's scene; bfloat16 by torch.autocast, gradients in float32 at the pictures",
-            "rows: N×3×H×W in that order; channels last: the colors of a pixel side by side",
-            "few at a time: at most 4 pictures of 224 px, 12 of 128 px; all of 64 px at once",
-        ),
-        tables=(Table(("", "mean |logit - float64's|", "largest", "cosine of the gradient"), tuple(rows)),),
+        name="types",
+        title="Types of numbers and orders of memory",
+        cost="forward and backward pass to the pictures, relative to the default",
+        error=f"mean |confidence - float64's| of the top label ({VIEWS} views)",
+        series=series,
+        about=f"{VIEWS} views of the demo's scene; bfloat16 by torch.autocast, gradients in float32 at the pictures. "
+        "Rows: N×3×H×W in that order; channels last: the colors of a pixel side by side; few at a time: at most 4 "
+        "pictures of 224 px, 12 of 128 px; all of 64 px at once.",
+        tables=(Table("types_logits", "Logits and gradients", head, tuple(rows)),),
     )
 
 
@@ -151,13 +145,12 @@ def _photos(problem: Problem) -> Tensor:
         return expose(problem.see(shown, conditions, problem.figure_px), shown)
 
 
-def _off(logits: Tensor, truth: Tensor, label: Tensor) -> np.ndarray:
-    both = (torch.softmax(one.double(), 1).gather(1, label[:, None])[:, 0] for one in (logits, truth))
-    found, true = both
-    return (found - true).abs().numpy()
+def _off(given: Answer, truth: Answer, label: Tensor) -> np.ndarray:
+    own, true = (torch.softmax(a.logits.double(), 1).gather(1, label[:, None])[:, 0] for a in (given, truth))
+    return (own - true).abs().numpy()
 
 
-def _figures(found: Answer, truth: Answer) -> tuple[str, str, str]:
-    off = (found.logits.double() - truth.logits).abs()
-    cosine = torch.nn.functional.cosine_similarity(found.gradient.double().flatten(1), truth.gradient.flatten(1))
-    return f"{float(off.mean()):.2g}", f"{float(off.max()):.2g}", f"{float(cosine.mean()):.5f}"
+def _figures(given: Answer, truth: Answer) -> tuple[float, float, float]:
+    off = (given.logits.double() - truth.logits).abs()
+    cosine = torch.nn.functional.cosine_similarity(given.gradient.double().flatten(1), truth.gradient.flatten(1))
+    return float(off.mean()), float(off.max()), float(cosine.mean())

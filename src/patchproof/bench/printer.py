@@ -1,8 +1,7 @@
 """Calibrating printers: what each rung of the ladder costs and how near it comes, by the number of swatches.
 
 In: nothing; printers are those of `inkjets` and the shipped profiles (each with the other as its only prior), charts
-are photographed by `chart_photos`. Out: a chart of every rung's time against its error, with the choice among them, and
-a table of what a camera's own tone curve does to the error with and without a camera file.
+are photographed by `chart_photos`. Out: a chart of every rung's time against its error, with the choice among them.
 
 The error is the mean ΔE00 over 1,000 colors that no chart holds, against what the same camera would show of the true
 print under even light at the chart's exposure: paper is white in both. A choice is held against the best of all rungs
@@ -16,15 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.bench.chart import Chart, Check, OnStage, Point, Series, Table
-from patchproof.bench.measure import mean_interval, median_interval
+from patchproof.bench.chart import Chart, Check, OnStage, Point
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.ladder import Map, choose, difference, distinct, rungs
-from patchproof.channel.lens import Camera, load_camera
-from patchproof.channel.tone import codes_of_light, light_of_codes
-from patchproof.claims import wilson
+from patchproof.claims import mean, median, rate, student_mean
 from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.report.tables import Table
 from patchproof.reprints.chart_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
 from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
 
@@ -50,67 +47,44 @@ class Trial:
         return self.errors[self.chosen] - min(self.errors.values())
 
 
-def printer_charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
-    """The ladder's chart, with what a camera file is worth."""
-    count, toned = (6, 3) if quick else (36, 12)  # three minutes of one core; a multiple of the six kinds of printer
-    trials, rows = [], []
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """The ladder's chart for each size of a printer's chart."""
+    count, trials = 6 if quick else 36, []  # three minutes of one core; a multiple of the six kinds of printer
     for i in range(count):
-        trials += [trial(i, swatches) for swatches in SWATCHES]
+        trials += [try_printer(i, swatches) for swatches in SWATCHES]
         on_stage("printers", i + 1, count)
-    camera = toned_camera()
-    for i in range(toned):
-        rows.append(printer_errors(i, 96, camera))
-        on_stage("cameras", i + 1, toned)
     for swatches in SWATCHES:
-        yield ladder_chart([one for one in trials if one.swatches == swatches], np.array(rows))
+        yield ladder_chart([trial for trial in trials if trial.swatches == swatches])
 
 
-def ladder_chart(trials: list[Trial], toned: np.ndarray) -> Chart:
-    """Every rung on charts of one size; `toned` N×2 are errors against the printer itself, without and with a camera
-    file.
-    """
-    names, swatches = [one.chosen for one in trials], trials[0].swatches
+def ladder_chart(trials: list[Trial]) -> Chart:
+    """Every rung on charts of one size."""
+    names, swatches = [trial.chosen for trial in trials], trials[0].swatches
     usual = max(sorted(set(names)), key=names.count)
-    points = tuple(_point(name, trials, usual) for name in trials[0].errors)
-    without, with_file = (mean_interval(toned[:, i]) for i in (0, 1))
-    tone = Table(
-        ("a camera with its own tone curve, 96 swatches", "ΔE00 from the printer itself", "from - to"),
-        tuple(
-            (name, f"{mean:.2f}", f"{low:.2f} - {high:.2f}")
-            for name, (mean, (low, high)) in (("no camera file", without), ("with its camera file", with_file))
-        ),
-    )
-    notes = (
-        f"{len(trials)} printers, each chart photographed once under uneven light with noise and JPEG",
-        f"y is the mean over {COLORS} colors that the chart does not hold, against what the camera shows of the true "
-        "print under even light; intervals are over printers",
-        "ringed: the rung that is chosen most often",
-    )
+    points = []
+    for name in trials[0].errors:
+        cost = median([trial.seconds[name] / trial.seconds["white_black"] for trial in trials])
+        points.append(Point(name, cost, student_mean([trial.errors[name] for trial in trials]), name == usual))
     return Chart(
-        f"{swatches}_swatches",
-        f"Models of a printer from a chart of {swatches} swatches",
-        "time of one fit, ÷ that of white_black",
-        "mean ΔE00 of unseen colors",
-        (Series("rungs", points),),
-        notes,
-        tuple(_checks(swatches, trials)),
-        (_choices(trials), tone) if swatches == max(SWATCHES) else (_choices(trials),),
+        name=f"{swatches}_swatches",
+        title=f"Models of a printer from a chart of {swatches} swatches",
+        cost="time of one fit, ÷ that of white_black",
+        error="mean ΔE00 of unseen colors",
+        series={"rungs": points},
+        about=f"{len(trials)} printers, each chart photographed once under uneven light with noise and JPEG. Error: "
+        f"the mean over {COLORS} colors that the chart does not hold, against what the camera shows of the true print "
+        "under even light; intervals are over printers. Default: the rung that is chosen most often.",
+        checks=tuple(_checks(swatches, trials)),
+        tables=(_choices(trials),),
     )
-
-
-def _point(name: str, trials: list[Trial], usual: str) -> Point:
-    times = np.array([one.seconds[name] / one.seconds["white_black"] for one in trials])
-    cost, cost_interval = median_interval(times)
-    error, interval = mean_interval(np.array([one.errors[name] for one in trials]))
-    return Point(name, cost, error, cost_interval, interval, default=name == usual)
 
 
 def _checks(swatches: int, trials: list[Trial]) -> list[Check]:
-    behind = np.array([one.behind for one in trials])
+    behind = np.array([trial.behind for trial in trials])
     if swatches not in TARGETS:
-        fitted = np.mean([one.chosen not in ("identity", "white_black", "prior") for one in trials])
+        fitted = np.mean([trial.chosen not in ("identity", "white_black", "prior") for trial in trials])
         return [Check(f"{swatches} swatches: share of choices with anything fitted", float(fitted), 0.0)]
-    chosen = float(np.mean([one.errors[one.chosen] for one in trials]))
+    chosen = float(np.mean([trial.errors[trial.chosen] for trial in trials]))
     return [
         Check(f"{swatches} swatches: mean ΔE00 of the chosen rung", chosen, TARGETS[swatches]),
         Check(
@@ -123,48 +97,33 @@ def _checks(swatches: int, trials: list[Trial]) -> list[Check]:
 def _choices(trials: list[Trial]) -> Table:
     """By driver: the chosen rung's error, how often it is near the best, what was chosen."""
     rows = []
-    for driver in (*dict.fromkeys(one.driver for one in trials), "all"):
-        some = [one for one in trials if driver in (one.driver, "all")]
-        errors = np.array([one.errors[one.chosen] for one in some])
-        near = sum(one.behind <= NEAR for one in some)
-        low, high = wilson(near, len(some))
-        names = [one.chosen for one in some]
+    for driver in (*dict.fromkeys(trial.driver for trial in trials), "all"):
+        some = [trial for trial in trials if driver in (trial.driver, "all")]
+        errors, names = [trial.errors[trial.chosen] for trial in some], [trial.chosen for trial in some]
+        near = rate([trial.behind <= NEAR for trial in some])
         picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
-        figures = f"{errors.mean():.2f}", f"{errors.max():.2f}", f"{near}/{len(some)} [{low:.2f}, {high:.2f}]"
-        rows.append((driver, *figures, picked))
-    return Table(("printer", "mean", "worst", f"within {NEAR} of best", "chosen"), tuple(rows))
+        rows.append((driver, mean(errors), max(errors), near, picked))
+    head = ("printer", "ΔE00 of the chosen", "worst", f"within {NEAR} of the best", "chosen")
+    return Table(
+        f"{trials[0].swatches}_swatches_chosen", f"Chosen with {trials[0].swatches} swatches", head, tuple(rows)
+    )
 
 
-def trial(seed: int, swatches: int, camera: Camera | None = None, known: Camera | None = None) -> Trial:
-    """One printer's chart photographed by `camera` and read as if by `known`, every rung on it."""
+def try_printer(seed: int, swatches: int) -> Trial:
+    """One printer's chart photographed and read, every rung on it."""
     driver, shows, priors = drawn_printer(seed)
     manifest = chart_manifest(swatches)
-    shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    light = read_chart(shot.photo, manifest, known).light
+    shot = photograph_page(printed_page(manifest, shows), seed)
+    light = read_chart(shot.photo, manifest).light
     usable = np.isfinite(light).all(1)
     sent, seen = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
     ladder = rungs(priors)
     choice = choose(ladder, sent, seen)
-    truth, errors = shown_by(shows, shot, camera, known, held_out_colors()), {}
+    truth, errors = shown_by(shows, shot, held_out_colors()), {}
     for rung in (rung for rung in ladder if rung.name not in choice.left_out):
         seen_by = relative(rung.fit(*distinct(sent, seen)), held_out_colors())
         errors[rung.name] = float(difference(seen_by, truth).mean())
     return Trial(driver, swatches, errors, {f.name: f.seconds for f in choice.figures}, choice.name)
-
-
-def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, float]:
-    """Error of the chosen rung against the printer itself, without and with the camera's file."""
-    _, shows, priors = drawn_printer(seed)
-    manifest, colors = chart_manifest(swatches), held_out_colors()
-    shot = photograph_page(printed_page(manifest, shows), seed, camera)
-    truth, found = shown_by(shows, shot, None, None, colors), []
-    for known in (None, camera):
-        light = read_chart(shot.photo, manifest, known).light
-        usable = np.isfinite(light).all(1)
-        sent = np.array([s.srgb for s in manifest.chart])[usable]
-        choice = choose(rungs(priors), sent, srgb_from_linear(light[usable]))
-        found.append(float(difference(relative(choice.predict, colors), truth).mean()))
-    return found[0], found[1]
 
 
 def relative(predict: Map, colors: np.ndarray) -> np.ndarray:
@@ -184,22 +143,13 @@ def drawn_printer(seed: int) -> tuple[str, Shows, dict]:
     return "the other profile", lambda colors: linear_from_srgb(own(colors)), priors
 
 
-def shown_by(shows: Shows, shot: Shot, camera: Camera | None, known: Camera | None, colors: np.ndarray) -> np.ndarray:
-    """sRGB N×3 of colors on the true print under even light, through the camera and read with what is known of it."""
+def shown_by(shows: Shows, shot: Shot, colors: np.ndarray) -> np.ndarray:
+    """sRGB N×3 that a camera shows of colors on the true print under even light, which clips at its exposure."""
     white = np.ones((1, 3))
-    light = shows(np.vstack([colors, white])) / shows(white) * shot.paper
-    read = light_of_codes(codes_of_light(light, camera), known)
-    return srgb_from_linear(read[:-1] / read[-1])
+    light = np.clip(shows(np.vstack([colors, white])) / shows(white) * shot.paper, 0, 1)
+    return srgb_from_linear(light[:-1] / light[-1])
 
 
 def held_out_colors() -> np.ndarray:
     """Colors N×3 spread evenly over the cube."""
     return np.random.default_rng(99).random((COLORS, 3))
-
-
-def toned_camera() -> Camera:
-    """A camera with a tone curve as phones have: lighter middle tones and a soft shoulder, steeper in the dark."""
-    codes = np.linspace(0, 1, 65)
-    light = linear_from_srgb(codes)
-    curve = 0.65 * light**1.15 + 0.35 * (codes**2 * (3 - 2 * codes)) ** 1.8
-    return load_camera("phone").model_copy(update={"name": "toned", "tone_light": tuple((curve / curve[-1]).tolist())})

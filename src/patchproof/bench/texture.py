@@ -14,13 +14,15 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from patchproof import geometry
-from patchproof.bench.chart import Chart, Check, OnStage, Point, Series, Table
+from patchproof.bench.chart import Chart, Check, OnStage, Point
 from patchproof.bench.measure import psnr, ratio, timed
 from patchproof.bench.world import World
+from patchproof.claims import median
 from patchproof.render.fragments import Cameras
 from patchproof.render.pixels import DESIGN_TAPS, PiecePicture
 from patchproof.render.raster import rasterize
 from patchproof.render.texture import Layout, footprint, layout, look_up, texel_table
+from patchproof.report.tables import Table
 from patchproof.sheets.piece import Piece
 
 TAPS = tuple(sorted({1, 2, 4, 6, 8, 12, DESIGN_TAPS}))
@@ -62,58 +64,43 @@ def texels(picture: PiecePicture) -> Texels:
 
 def texture_chart(world: World, widths_px: Sequence[int], rounds: int, on_stage: OnStage) -> Chart:
     """Taps along a footprint's shorter side against the error to 16×16 samples per pixel."""
-    kinds = {"optimized design": world.shown(tiled=3), "noise control": world.shown("noise")}
+    kinds = {"optimized design": world.shown(tiled=3), "noise control": world.control("noise")}
     views = [(width, tilt) for width in widths_px for tilt in TILTS_DEG]
-    quality, seconds = {}, {}
+    series, checks, rows = {}, [], []
     for kind, picture in kinds.items():
         looks, content = [], texels(picture)
         for view in views:
-            looks.append(look(world.problem.scene.piece, picture, *view))
-            on_stage("texture", len(quality) // len(TAPS) * len(views) + len(looks), len(kinds) * len(views))
-        for taps in TAPS:
-            with torch.no_grad():
-                quality[kind, taps] = np.array([psnr(content.seen(one, taps), one.truth) for one in looks])
+            looks.append(look(world.piece, picture, *view))
+            on_stage("texture", len(series) * len(views) + len(looks), len(kinds) * len(views))
+        with torch.no_grad():
+            quality = {taps: [psnr(content.seen(view, taps), view.truth) for view in looks] for taps in TAPS}
 
         def work(taps: int, looks=looks, content=content) -> None:
-            for one in looks:
-                torch.autograd.grad(content.seen(one, taps).sum(), content.table)
+            for view in looks:
+                torch.autograd.grad(content.seen(view, taps).sum(), content.table)
 
-        seconds[kind] = timed({taps: lambda taps=taps, work=work: work(taps) for taps in TAPS}, rounds)
-    rows = tuple((f"{kind}, {taps}", *(f"{q:.1f}" for q in values)) for (kind, taps), values in quality.items())
-    milliseconds = 1e3 * np.median(seconds["optimized design"][DESIGN_TAPS]) / len(views)
+        seconds = timed({taps: lambda taps=taps, work=work: work(taps) for taps in TAPS}, rounds)
+        series[kind] = [
+            Point(f"{taps}", ratio(seconds, taps, DESIGN_TAPS), median(quality[taps]), taps == DESIGN_TAPS)
+            for taps in TAPS
+        ]
+        claim = f"worst PSNR of the {kind} at the default, dB"
+        checks.append(Check(claim, min(quality[DESIGN_TAPS]), LEAST_PSNR, at_least=True))
+        rows += [(kind, taps, *quality[taps]) for taps in TAPS]
+    head = ("picture", "taps", *(f"{width} px {tilt}°" for width, tilt in views))
     return Chart(
-        "texture",
-        "Texture: taps along the shorter side of a pixel's footprint",
-        "footprint + look-up + backward, relative to the default",
-        f"PSNR of the design's pixels, dB (median and range of {len(views)} views)",
-        tuple(
-            Series(kind, tuple(_over_views(taps, seconds[kind], quality[kind, taps]) for taps in TAPS))
-            for kind in kinds
-        ),
-        (
-            "truth: 16 × 16 samples per pixel of printed blocks, averaged as code values; pixels wholly on the design",
-            "design: the optimized one three by three, as fine as one for a classifier with three times the pixels",
-            f"the default takes {milliseconds:.2f} ms per view",
-        ),
-        tuple(
-            Check(
-                f"worst PSNR of the {kind} at the default, dB",
-                float(quality[kind, DESIGN_TAPS].min()),
-                LEAST_PSNR,
-                at_least=True,
-            )
-            for kind in kinds
-        ),
-        (Table(("PSNR in dB, by taps", *(f"{width} px {tilt}°" for width, tilt in views)), rows),),
+        name="texture",
+        title="Texture: taps along the shorter side of a pixel's footprint",
+        cost="footprint + look-up + backward, relative to the default",
+        error=f"PSNR of the design's pixels, dB (median of {len(views)} views)",
+        series=series,
+        about="Truth: 16 × 16 samples per pixel of printed blocks, averaged as code values; pixels wholly on the "
+        "design. Design: the optimized one three by three, as fine as one for a classifier of three times the pixels.",
+        checks=tuple(checks),
+        tables=(Table("texture_views", "PSNR in dB by width and tilt", head, tuple(rows)),),
         higher_is_better=True,
         target=LEAST_PSNR,
     )
-
-
-def _over_views(taps: int, seconds: dict, quality: np.ndarray) -> Point:
-    cost, interval = ratio(seconds, taps, DESIGN_TAPS)
-    spread = (float(quality.min()), float(quality.max()))
-    return Point(f"{taps}", cost, float(np.median(quality)), interval, spread, taps == DESIGN_TAPS)
 
 
 def look(piece: Piece, picture: PiecePicture, width_px: float, tilt_deg: float) -> Look:
@@ -129,8 +116,8 @@ def look(piece: Piece, picture: PiecePicture, width_px: float, tilt_deg: float) 
     fragments = fragments.where(inside)
     corner_uv = torch.tensor(_uv(picture, piece, plane[:, :2]), dtype=torch.float32)[faces][fragments.face]
     weights = (fragments.barycentric, fragments.barycentric_dx, fragments.barycentric_dy)
-    uv = tuple((weight[..., None] * corner_uv).sum(1) for weight in weights)
-    return Look(uv, truth[inside])
+    uv, uv_dx, uv_dy = ((weight[..., None] * corner_uv).sum(1) for weight in weights)
+    return Look((uv, uv_dx, uv_dy), truth[inside])
 
 
 def _pose(piece: Piece, width_px: float, tilt_deg: float) -> np.ndarray:

@@ -60,7 +60,7 @@ def say(*lines: str) -> None:
 
 
 def say_study(finished) -> None:
-    """A study's tables, and on standard error what failed."""
+    """A study's or benchmark's tables, and on standard error what failed."""
     from patchproof.report.tables import text_lines
 
     for table in finished.tables:

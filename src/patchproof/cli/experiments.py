@@ -109,12 +109,14 @@ def bench(
         str, typer.Argument(help="A benchmark: render, train, numbers, printer, detect, evidence, or all.")
     ] = "all",
     quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for charts, table and JSON.")] = Path("patchproof-bench"),
+    out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchproof-bench"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Speed against accuracy of each knob on this machine: charts, a table and JSON."""
+    """Speed against accuracy of each knob on this machine: charts, tables and a page."""
     from patchproof.bench.run import run_bench
 
     with progress() as bar:
-        lines = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)
-    say(*lines)
+        written = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)
+    for results in written:
+        say_study(results)
+        say(f"page: {out / results.name}.html")

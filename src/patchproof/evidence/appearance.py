@@ -1,8 +1,8 @@
-"""How the print looks in a photograph against how it was promised to look: ΔE00, after a stated colour fit.
+"""How the print looks in a photograph against how it was promised to look: ΔE00, after a stated color fit.
 
 In: a photograph, its homography, the promised linear light. Out: figures for the entry, the clipped share, and
 pictures. Both sides are averaged over the same coarse cells, and the promise is blurred as the photo is, so that
-resolution is not mistaken for colour: a cell is at least two photo pixels, twice the blur and four times the corner
+resolution is not mistaken for color: a cell is at least two photo pixels, twice the blur and four times the corner
 uncertainty wide. The outermost ring of cells is left out: blur mixes the white frame into it. Clipped cells and cells
 with gloss, light that is added to all three channels in one place, are left out and counted.
 """
@@ -26,7 +26,7 @@ from patchproof.photo.rectify import rectify
 
 LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # light by code value
 _CELLS = (6, 48)  # least and most along the design's shorter side
-MOST_CLIPPED = 0.5  # share of the design at full white, where colour is unknown
+MOST_CLIPPED = 0.5  # share of the design at full white, where color is unknown
 _MOST_CLIPPED_PAPER = 0.2
 _PICTURE_PX = 192
 # JPEG halves the resolution of color: read up to their borders, swatches came out up to 17 code values off; with this
@@ -44,7 +44,7 @@ def appearance(
     light: FrameLight,
     geometry: Geometry,
 ) -> tuple[Color, dict[str, np.ndarray]]:
-    """Colour difference of the whole design, None where more than half of it is clipped, and pictures (uint8 sRGB;
+    """Color difference of the whole design, None where more than half of it is clipped, and pictures (uint8 sRGB;
     `delta_e00` float cells).
     """
     part, px_from_mm = piece_only(srgb, px_from_mm, surface)
@@ -53,7 +53,7 @@ def appearance(
     fit = color_fit(swatches, promised, light)
     flat = partial(rectify, px_from_mm=px_from_mm, rect_mm=surface.rect_mm, px_per_mm=_cells_per_mm(surface, geometry))
     seen = fit.apply(flat(linear).astype(float))
-    clipped = flat((part >= CLIPPED_CODE).any(-1, keepdims=True).astype(np.float32)).reshape(seen.shape[:2]) > 0.05
+    clipped = flat((part.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)).reshape(seen.shape[:2]) > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     expected = _coarse(promised.design, seen.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
     delta = ciede2000(lab_from_linear(expected), lab_from_linear(seen))
@@ -85,7 +85,7 @@ def appearance(
 
 
 def color_fit(swatches: np.ndarray, promised: Promised, light: FrameLight) -> ColorFit:
-    """The best colour map that the N×3 swatches in view support (NaN: unread)."""
+    """The best color map that the N×3 swatches in view support (NaN: unread)."""
     usable = np.isfinite(swatches).all(1)
     fit = affine12(swatches[usable], promised.swatches[usable].reshape(-1, 3))
     return fit or white_black(light.paper, light.ink, promised.ink)

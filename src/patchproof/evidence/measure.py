@@ -1,9 +1,9 @@
-"""One photograph against the printed surface: where it was taken from, how sharp, how far its colours are off.
+"""One photograph against the printed surface: where it was taken from, how sharp, how far its colors are off.
 
 In: a `Photo`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
 the report. Every figure that can be had is filled in even where a later step fails. A photograph is `rejected` only
 for reasons that do not depend on the view (plus: outside of the promised ranges); where the sheet is identified but
-geometry or colour cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
+geometry or color cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
 and leaving them out would flatter.
 """
 
@@ -32,7 +32,7 @@ from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, v
 from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighbouring cells melt together
-SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean colour
+SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
 MOST_TILT_DEG = 78.0  # foreshortened to a fifth
 MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
 MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
@@ -68,7 +68,7 @@ def measure(
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
 ) -> MeasuredPhoto:
-    """Everything that one readable photograph says; `promised` None leaves colour unmeasured."""
+    """Everything that one readable photograph says; `promised` None leaves color unmeasured."""
     photo = view.photo
     try:
         found, surface = identify(photo.srgb, surface)
@@ -216,7 +216,7 @@ def _pose(view: View, fit: PageFit, flat: bool, surface: Surface) -> Pose | None
 
 
 def _trouble(geometry: Geometry, fit: PageFit, found: Found, surface: Surface) -> CannotJudge | None:
-    """Why geometry or colour cannot be trusted, the nearest cause first; None where they can."""
+    """Why geometry or color cannot be trusted, the nearest cause first; None where they can."""
     tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
     most_blur = MOST_BLUR * float(np.median([b.module_px for b in found.markers.values()]))

@@ -29,6 +29,6 @@ def thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) 
 
 
 def _outline(picture: np.ndarray, px_from_mm: np.ndarray, corners_mm: np.ndarray, color, width: int) -> None:
-    # OpenCV counts from pixel centres and takes sixteenths of pixels here
+    # OpenCV counts from pixel centers and takes sixteenths of pixels here
     points = np.clip((apply_homography(px_from_mm, corners_mm) - 0.5) * 16, -1e6, 1e6)
     cv2.polylines(picture, [points.round().astype(np.int32)], True, color, width, cv2.LINE_AA, 4)

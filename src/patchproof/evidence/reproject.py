@@ -41,7 +41,7 @@ _SUPERSAMPLE = 2
 
 @dataclass(frozen=True)
 class Shot:
-    """One photograph: `square` uint8 W×W×3, millimetres to its pixels, blur in its pixels, noise in linear light.
+    """One photograph: `square` uint8 W×W×3, millimeters to its pixels, blur in its pixels, noise in linear light.
 
     `swatches` N×3 are linear light as photographed, NaN where they cannot be read; `scale` is W over the photograph's
     shorter side.

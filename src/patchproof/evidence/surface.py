@@ -1,7 +1,7 @@
 """What a manifest says about the printed surface, as the judge needs it: where things lie, how they should look.
 
-In: a manifest and a printer model. Out: `Surface` (millimetres) and `Promised` (media-relative linear light: paper is
-1). Only the page that carries the design counts. A piece in tiles is one surface when assembled, in the millimetres of
+In: a manifest and a printer model. Out: `Surface` (millimeters) and `Promised` (media-relative linear light: paper is
+1). Only the page that carries the design counts. A piece in tiles is one surface when assembled, in the millimeters of
 the design's page; each of its pages is another, by which scans and photographs of it are known.
 """
 
@@ -79,7 +79,7 @@ def surface_of(manifest: Manifest) -> Surface:
 
 
 def _assembled(manifest: Manifest) -> Surface:
-    """The piece glued together, in the millimetres of the design's page (the first tile's without a design)."""
+    """The piece glued together, in the millimeters of the design's page (the first tile's without a design)."""
     page = manifest.design.page if manifest.design else manifest.tiles[0].page
     square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
     to_page = {number: (square[page] @ np.linalg.inv(matrix))[:2] for number, matrix in square.items()}

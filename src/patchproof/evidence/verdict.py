@@ -41,7 +41,7 @@ def judge(
     if judged == 0:
         return Verdict("cannot_tell", None, "No photograph could be judged.")
     low, high = prediction_interval(round(promise_rate * promise_n), promise_n, judged)
-    seen = f"{recognized} of {judged} photographs were recognized; the promise allows for {low} to {high}"
+    counts = f"{recognized} of {judged} photographs were recognized; the promise allows for {low} to {high}"
     lost = without_markers / (judged + without_markers)
     if lost > MOST_WITHOUT_MARKERS:
         reason = f"{without_markers} readable photographs show no marker ({lost:.0%}, at most 10 % are allowed)."
@@ -50,10 +50,10 @@ def judge(
         return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
     worst = low if goal.sign > 0 else high
     if goal.sign * (recognized - worst) < 0:
-        return Verdict("broken", (low, high), f"{seen}.")
+        return Verdict("broken", (low, high), f"{counts}.")
     if goal.sign * (worst / judged - promise_rate) >= -SLACK - 1e-9:
-        return Verdict("kept", (low, high), f"{seen}.")
-    return Verdict("cannot_tell", (low, high), f"{seen}, which is too wide to tell: take more photographs.")
+        return Verdict("kept", (low, high), f"{counts}.")
+    return Verdict("cannot_tell", (low, high), f"{counts}, which is too wide to tell: take more photographs.")
 
 
 @dataclass(frozen=True)

@@ -72,11 +72,8 @@ def run_demo(
 ) -> list[str]:
     """Run every step into the folder `out`; returns the summary's lines."""
     with new_folder(out, OWN, overwrite) as folder:
-        scene = folder / "scene.toml"
-        scene.write_text(SCENE, encoding="utf-8")
-        _clutter(folder / "clutter")
         run = optimize_scene(
-            scene,
+            demo_scene(folder),
             folder / "run",
             on_step=lambda step, total: on_stage("optimize", step.state.number, total),
             on_promise=lambda done, total: on_stage("promise", done, total),
@@ -106,11 +103,14 @@ def run_demo(
     ]
 
 
-def _clutter(folder: Path) -> None:
-    """Made-up backgrounds, the same on every machine."""
+def demo_scene(folder: Path) -> Path:
+    """Write scene.toml and its clutter, the same on every machine, into a folder; the scene's path."""
     import numpy as np
     from PIL import Image
 
-    folder.mkdir()
+    scene, clutter = folder / "scene.toml", folder / "clutter"
+    scene.write_text(SCENE, encoding="utf-8")
+    clutter.mkdir()
     for i in range(BACKGROUNDS):
-        Image.fromarray(background(np.random.default_rng([SEED, i]), BACKGROUND_PX)).save(folder / f"{i:02d}.png")
+        Image.fromarray(background(np.random.default_rng([SEED, i]), BACKGROUND_PX)).save(clutter / f"{i:02d}.png")
+    return scene

@@ -32,7 +32,7 @@ def _flat(photo: Mapping[str, Any]) -> dict[str, Any]:
             numbers = [None] * 9 if value is None else [number for line in value for number in line]
             row |= {f"{name}_{i // 3}{i % 3}": number for i, number in enumerate(numbers)}
         elif name == "predictions":
-            row |= {f"{model} {key}": _plain(v) for model, said in value.items() for key, v in said.items()}
+            row |= {f"{model} {key}": _plain(v) for model, prediction in value.items() for key, v in prediction.items()}
         else:
             row[name] = _plain(value)
     return row

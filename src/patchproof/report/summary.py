@@ -28,10 +28,10 @@ def promise_lines(promise: Any) -> list[str]:
 def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
     """Each network's rate and controls."""
     lines = []
-    for name, found in result["models"].items():
-        low, high = found["interval"]
-        lines.append(f"{name}: recognized in {found['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]")
-        lines += _control_lines(found["controls"])
+    for name, rates in result["models"].items():
+        low, high = rates["interval"]
+        lines.append(f"{name}: recognized in {rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]")
+        lines += _control_lines(rates["controls"])
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Tables and figures of studies: what a study hands over to be written, and how a figure reads.
+"""Tables and figures of studies and benchmarks: what is handed over to be written, and how a figure reads.
 
 In: rows of plain values and `Estimate`s, drawings for matplotlib. Out: CSV text with numbers in full, cells of a page
 as people read them, PNG bytes. The same input gives the same bytes.
@@ -17,7 +17,6 @@ from patchproof.claims import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 Value = str | int | float | bool | None | Estimate
 
@@ -55,7 +54,7 @@ def csv_text(table: Table) -> str:
     )
     for row in table.rows:
         writer.writerow(
-            one for value, is_wide in zip(row, wide, strict=True) for one in (_four(value) if is_wide else (value,))
+            part for value, is_wide in zip(row, wide, strict=True) for part in (_four(value) if is_wide else (value,))
         )
     return buffer.getvalue()
 
