@@ -109,9 +109,6 @@ def _again(problem: Problem, there: Conditions, anywhere: Conditions) -> dict[st
     }
 
 
-# -------------------------------------------------------------------------------------------- maps of pose × light
-
-
 def _mapped(problem: Problem, asked: MapSettings, seed: int) -> dict[str, Any]:
     axes = axes_of(problem.scene.settings, asked)
     hits, confidence = map_of(problem, axes, problem.scene.draw("select", asked.n, seed))
@@ -124,9 +121,6 @@ def _mapped(problem: Problem, asked: MapSettings, seed: int) -> dict[str, Any]:
         "worst": [list(place) for place in worst],
         "again": _again(problem, in_cells(fresh, axes, worst), fresh),
     }
-
-
-# -------------------------------------------------------------------------------------------- a black square
 
 
 def occluded(problem: Problem, settings: OcclusionSettings, seed: int) -> tuple[dict[str, Any], Tensor]:
@@ -174,9 +168,6 @@ def _blackened(pictures: Tensor, box: Box | None) -> Tensor:
     return pictures
 
 
-# -------------------------------------------------------------------------------------------- search
-
-
 def worst_case(
     problem: Problem, names: Sequence[str], settings: SearchSettings, seed: int
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -207,9 +198,6 @@ def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
     lamps, fields = drawn.light.point.max() > 0, fields_of(drawn)
     figures = {name: fields[name] for name in names if lamps or not name.startswith("point")}
     return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
-
-
-# -------------------------------------------------------------------------------------------- tables and figures
 
 
 def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, ...]:

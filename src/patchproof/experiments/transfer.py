@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.claims import Estimate, rate
+from patchproof.claims import rate
 from patchproof.experiments.turntable import sides, three_views
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
@@ -29,7 +29,7 @@ from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.figures import number_grid, picture_sheet
 from patchproof.study.grid import Count, grouped, of_values, problem_of, short_name
 from patchproof.study.pictures import contact_sheet, object_file, photographs
-from patchproof.study.record import Record, hits_of, recorded
+from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import (
     ORIGINAL,
@@ -85,7 +85,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     answers[f"{cell.name}.sheet.png"] = contact_sheet([views])
     if isinstance(problem.scene, MeshScene):
         fixed = three_views(problem, settings.lights)
-        answers["views"] = recorded(responses(problem, things, fixed))["hits"]
+        answers["views"] = recorded(responses(problem, things, fixed))
         answers["azimuths"] = fixed.pose.azimuth_deg[:: settings.lights].tolist()
     return answers
 
@@ -160,20 +160,15 @@ def _views(settings: TransferSettings, groups: Rows) -> list[Table]:
     rows = []
     for key, by_row in groups.items():
         for row, of_row in by_row.items():
-            for network in of_row[0].cell.values["trained"]:
-                for number, azimuth in enumerate(of_row[0].answers.get("azimuths", ())):
-                    both = (by_row.get(ORIGINAL, ()), of_row)
-                    rates = (_in_view(settings, some, network, number) for some in both)
+            for network in of_row[0].cell.values["trained"] if "views" in of_row[0].answers else ():
+                records = (Record(some, "design", "views") for some in (by_row.get(ORIGINAL, ()), of_row))
+                before, after = (np.reshape(record.hits(network), (-1, 3, settings.lights)) for record in records)
+                for i, azimuth in enumerate(of_row[0].answers["azimuths"]):
+                    rates = (rate(hits[:, i].ravel().tolist()) for hits in (before, after))
                     rows.append((*key, row, short_name(network), azimuth, *rates))
     head = ("scene", "way", "trained on", "tested on", "azimuth (deg)", "original", "design")
     about = f"Three fixed views, {settings.lights} drawn lights, backgrounds and cameras each, on training networks."
     return [Table("views", "Three views in changed light", head, tuple(rows), about)] if rows else []
-
-
-def _in_view(settings: TransferSettings, results: Sequence[Result], network: str, number: int) -> Estimate | None:
-    part = slice(number * settings.lights, (number + 1) * settings.lights)
-    texts = [one.answers["views"]["design"][one.cell.values["networks"].index(network)][part] for one in results]
-    return rate(hits_of("".join(texts)))
 
 
 def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawing]:

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import torch
 from PIL import Image
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from patchproof.claims import difference, rate
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.harden.attacks import ATTACKS, right
-from patchproof.harden.harden import Method, harden, moved, squares
+from patchproof.harden.harden import Epsilon, Method, epsilon_words, harden, moved, squares
 from patchproof.harden.labeled import in_blocks, labeled_files, read_large_enough
 from patchproof.output import write_whole
 from patchproof.photo.cannot import CannotJudge
@@ -45,23 +45,6 @@ Attack = Literal["fgsm", "pgd"]
 Condition = tuple[str, float]  # an attack and its ε
 CLEAN: Condition = ("clean", 0.0)
 _RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
-
-
-def _epsilon(value: Any) -> float | None:
-    """0.03, "0.03", "8/255" or "none"."""
-    if value is None or value == "none":
-        return None
-    numerator, _, denominator = str(value).partition("/")
-    try:
-        epsilon = float(numerator) / float(denominator or 1)
-    except (ValueError, ZeroDivisionError):
-        raise ValueError('must be a number, such as 0.03 or "8/255", or "none"') from None
-    if not 1 / 255 - 1e-9 <= epsilon <= 1:
-        raise ValueError("must be from 1/255 to 1: 8-bit images cannot hold less")
-    return epsilon
-
-
-Epsilon = Annotated[float | None, BeforeValidator(_epsilon)]
 
 
 class HardenSettings(Strict):
@@ -98,24 +81,20 @@ def cells(settings: HardenSettings, base: Path) -> list[Cell]:
     """Originals by network, and every variant, in blocks of photographs; networks and labels are checked here."""
     folder = Path(expand(settings.images, base))
     rows = labeled_files(folder, Path(expand(settings.labels, base)))
-    indices: dict[str, dict[str, int]] = {}
-    for name in _names(settings):
-        labels = _classifier(name, base).labels
-        indices[name] = {word: find_labels(labels, int(word) if word.isdigit() else word)[0] for _, _, word in rows}
+    names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
+    for name in names:
+        _truth(name, base, [label for _, _, label in rows])
     variants, work = _variants(settings), []
     for number, block in enumerate(in_blocks(folder, rows), 1):
         photos = [{"file": file, "png": png, "label": label} for file, png, label in block]
-
-        def values(judges: Sequence[str], photos: Sequence[Mapping[str, str]] = photos) -> dict[str, Any]:
-            truth = {name: [indices[name][photo["label"]] for photo in photos] for name in judges}
-            return {"photos": photos, "judges": list(judges), "indices": truth}
-
-        work += [Cell(f"original{at}_{number:04d}", values([name])) for at, name in enumerate(indices, 1)]
+        for at, name in enumerate(names, 1):
+            work.append(Cell(f"original{at}_{number:04d}", {"photos": photos, "judges": [name]}))
         for at, variant in enumerate(variants, 1):
-            words = f"{at:02d}_{variant['method']}_{_epsilon_words(variant['epsilon']).replace('/', '-')}"
-            folder_of = {"variant": variant, "folder": "" if len(variants) == 1 else f"images/{words}/"}
-            judges = dict.fromkeys((*variant["models"], *settings.judges))
-            work.append(Cell(f"hardened{at}_{number:04d}", values(list(judges)) | folder_of))
+            words = f"{at:02d}_{variant['method']}_{epsilon_words(variant['epsilon']).replace('/', '-')}"
+            judges = list(dict.fromkeys((*variant["models"], *settings.judges)))
+            into = "" if len(variants) == 1 else f"images/{words}/"
+            values = {"photos": photos, "judges": judges, "variant": variant, "folder": into}
+            work.append(Cell(f"hardened{at}_{number:04d}", values))
     return work
 
 
@@ -123,25 +102,23 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """One block: hardened if it has a variant, then judged."""
     values, folder = cell.values, Path(expand(settings.images, base))
     photos, originals, unread = [], [], []
-    for at, photo in enumerate(values["photos"]):
+    for photo in values["photos"]:
         try:
             originals.append(read_large_enough(folder / photo["file"]))
-            photos.append(photo | {"at": at, "right": {}})
+            photos.append(photo | {"right": {}})
         except CannotJudge as cannot:
             unread.append({"file": photo["file"], "reason": cannot.advice})
-    truth = {name: [indices[photo["at"]] for photo in photos] for name, indices in values["indices"].items()}
-    pictures, files = originals, {}
+    labels, pictures, files = [photo["label"] for photo in photos], originals, {}
     if photos and "variant" in values:
-        variant = values["variant"]
-        networks = [_classifier(name, base) for name in variant["models"]]
-        labels = [truth[name] for name in variant["models"]]
-        how = variant["method"], variant["epsilon"], settings.steps, settings.step_size
-        pictures = harden(originals, labels, networks, *how)
+        names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
+        networks, truth = [_classifier(name, base) for name in names], [_truth(name, base, labels) for name in names]
+        pictures = harden(originals, truth, networks, *how, settings.steps, settings.step_size)
         for photo, original, picture in zip(photos, originals, pictures, strict=True):
             files[values["folder"] + photo["png"]] = _png(picture)
             photo["rms"], photo["ssim"] = moved(original, picture)
     for name in values["judges"] if photos else ():
-        outcomes = _judged(settings, _classifier(name, base), pictures, torch.tensor(truth[name]))
+        truth = torch.tensor(_truth(name, base, labels))
+        outcomes = _judged(settings, _classifier(name, base), pictures, truth)
         for i, photo in enumerate(photos):
             photo["right"][name] = [bool(outcome[i]) for outcome in outcomes]
     return {"photos": photos, "unread": unread} | files
@@ -227,7 +204,7 @@ def too_strong(condition: Condition, survivors: Mapping[Condition, int]) -> bool
 
 def figures(settings: HardenSettings, results: Sequence[Result]) -> list[Drawing]:
     """Accuracy over the attack's ε, original and hardened, a panel per network and attack."""
-    names = _names(settings)
+    names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
 
     def draw(figure: Figure) -> None:
         grid = figure.subplots(len(names), len(settings.attacks), squeeze=False, sharex=True, sharey=True)
@@ -261,11 +238,6 @@ def _draw_panel(axes: Axes, settings: HardenSettings, results: Sequence[Result],
 STUDY = Study("harden", HardenSettings, cells, run, tables, figures, files=".", own_files=("images",))
 
 
-def _names(settings: HardenSettings) -> tuple[str, ...]:
-    """All networks."""
-    return tuple(dict.fromkeys((*settings.models, *settings.judges)))
-
-
 def _variants(settings: HardenSettings) -> list[dict[str, Any]]:
     groups = [settings.models] if settings.together else [(name,) for name in settings.models]
     return [
@@ -283,19 +255,19 @@ def _conditions(settings: HardenSettings) -> dict[str, Condition]:
 
 
 def _words(variant: Mapping[str, Any]) -> tuple[str, str, str]:
-    return ", ".join(map(short_name, variant["models"])), variant["method"], _epsilon_words(variant["epsilon"])
-
-
-def _epsilon_words(epsilon: float | None) -> str:
-    if epsilon is None:
-        return "none"
-    codes = epsilon * 255
-    return f"{codes:.0f}/255" if abs(codes - round(codes)) < 1e-6 else f"{epsilon:g}"
+    return ", ".join(map(short_name, variant["models"])), variant["method"], epsilon_words(variant["epsilon"])
 
 
 @lru_cache(maxsize=4)  # a process works through one study: its networks stay loaded
 def _classifier(name: str, base: Path) -> Classifier:
     return load_classifier(name, base)
+
+
+def _truth(name: str, base: Path, labels: Sequence[str]) -> list[int]:
+    """A network's indices of labels; refused where it does not have one."""
+    known = _classifier(name, base).labels
+    found = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
+    return [found[label] for label in labels]
 
 
 def _photos(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
