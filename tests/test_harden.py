@@ -19,7 +19,7 @@ from patchproof.harden.folder import HardenSettings, harden_images, too_strong
 from patchproof.harden.harden import harden, moved, squares
 from patchproof.photo.read import read_photo
 from patchproof.strict import Refused, validated
-from patchproof.study.study import run_study
+from patchproof.study.study import Work, run_study
 
 FAKE = "module:fake_networks.red_against_blue"
 RED = Classifier("red", None, 32, RedAgainstBlue.labels, RedAgainstBlue())
@@ -124,16 +124,16 @@ def test_resuming_and_originals_in_the_way(folder, tmp_path):
     harden_images(settings, out)
     table, picture = (out / "harden_accuracy.csv").read_bytes(), (out / "b.png").read_bytes()
     (out / "b.png").unlink()
-    harden_images(settings, out, resume=True)
+    harden_images(settings, out, Work(resume=True))
     assert (out / "b.png").read_bytes() == picture and (out / "harden_accuracy.csv").read_bytes() == table
-    harden_images(settings, out, overwrite=True)
+    harden_images(settings, out, Work(overwrite=True))
     with pytest.raises(Refused, match="another folder"):
-        harden_images(settings, folder, overwrite=True)
+        harden_images(settings, folder, Work(overwrite=True))
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "mine.png").touch()
     with pytest.raises(Refused, match=r"mine\.png"):
-        harden_images(settings, mine, overwrite=True)
+        harden_images(settings, mine, Work(overwrite=True))
 
 
 def test_the_study_varies_networks_and_epsilons(folder, tmp_path):

@@ -87,16 +87,19 @@ def test_design_corners_are_where_the_truth_says(journey, report):
 def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
     """The conditions of these very photographs, rendered as for a promise: at most one in eight is judged otherwise."""
     from patchproof.optimizer.problem import set_problem
-    from patchproof.optimizer.promise import try_out
+    from patchproof.optimizer.promise import shown_with_controls
+    from patchproof.optimizer.responses import responses
     from patchproof.optimizer.run import load_run
 
     run = load_run(journey / "run")
-    outcomes = try_out(set_problem(run.scene), run.design, run.scene.draw("reprint", PHOTOS))
+    problem = set_problem(run.scene)
+    shown = shown_with_controls(problem, run.design, ())
+    answers = responses(problem, shown, run.scene.draw("reprint", PHOTOS))["design"]
     seen = [photo["predictions"]["builtin"] for photo in report["photos"]]
-    differ = outcomes.recognized["design"][0] != np.array([one["recognized"] for one in seen])
+    differ = answers.recognized[0] != np.array([one["recognized"] for one in seen])
     confidence = np.array([one["target_confidence"] for one in seen])
     assert differ.mean() <= 1 / 8
-    assert abs(outcomes.confidence["design"][0].mean() - confidence.mean()) < 0.05
+    assert abs(answers.confidence[0].mean() - confidence.mean()) < 0.05
 
 
 def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):

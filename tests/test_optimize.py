@@ -18,7 +18,8 @@ from patchproof.optimizer.goals import target_loss, total_variation
 from patchproof.optimizer.loop import _step, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROLS, judged, promise_from, try_out
+from patchproof.optimizer.promise import CONTROLS, make_promise
+from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import with_values
@@ -162,7 +163,7 @@ def test_networks_that_answer_nan_or_infinity_are_refused_and_large_answers_are_
         with pytest.raises(Refused, match="finite logits, got NaN or infinity from the network"):
             _step(spoiled(problem, spoil), begin, seen)
         with pytest.raises(Refused, match="finite logits"):
-            judged(spoiled(problem, spoil), {"design": problem.subject.shown(begin.design)}, drawn)
+            responses(spoiled(problem, spoil), {"design": problem.subject.shown(begin.design)}, drawn)
     with pytest.raises(Refused, match="finite gradients, got nan in step 1"):
         _step(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, seen)
 
@@ -222,8 +223,7 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
     problem = set_problem(scene_with(tmp_path, target__label="blue"))
     blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
-    outcomes = try_out(problem, blue, problem.scene.draw("promise", 40))
-    promise = promise_from(problem, outcomes)
+    promise = make_promise(problem, blue, problem.scene.draw("promise", 40))
     assert promise.n == 40 and len(promise.conditions) == 40
     assert promise.rate == sum(c.recognized for c in promise.conditions) / 40
     assert promise.interval == wilson(round(promise.rate * 40), 40)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,8 +30,8 @@ from patchproof.render.views import see
 from patchproof.reprints.hung_sheet import scaled_print
 from patchproof.scene.conditions import with_values
 from patchproof.strict import Refused
-from patchproof.study.study import run_study
-from patchproof.validation.gamut import UNPRINTED, WAYS, Outcomes, gamut_cell, gamut_rows, other_printers, way_problem
+from patchproof.study.study import Cell, Result, run_study
+from patchproof.validation.gamut import UNPRINTED, WAYS, other_printers, reprinted, rows_of, way_problem
 from test_plan import scene_with
 from test_views import WHITE, area, box_scene, outline, piece_of, posed
 
@@ -220,40 +221,49 @@ def test_ways_differ_in_what_they_say(tmp_path):
 
 
 def test_a_cell_of_the_study_shows_every_design_in_the_same_views(tmp_path):
-    scene = scene_with(tmp_path, optimize__steps=2)
+    problem = set_problem(scene_with(tmp_path, optimize__steps=2))
     ways = (WAYS[0], replace(WAYS[0], name="again"), WAYS[-1])
-    found = gamut_cell(scene, 0, [load_printer("coated"), load_printer("uncoated")], ways, views=6)
-    assert found.outcomes.shape == (3, 2, 2, 6)
-    np.testing.assert_array_equal(found.outcomes[0], found.outcomes[1])
-    assert found.out_of_gamut[2] < 0.01
-    rows = gamut_rows([found])
+    answers = reprinted(problem, [load_printer("coated"), load_printer("uncoated")], ways, 6)
+    assert len(answers["hits"]) == 3 * 2 and list(answers["missed"]) == [way.name for way in ways]
+    first, again = (answers["confidence"][f"{way.name}, printed by uncoated"] for way in ways[:2])
+    assert first == again and len(first[0]) == 6
+    assert answers["missed"][ways[2].name] < 0.01
+    cell = Cell("c", {"name": "scene", "networks": ["net"], "seed": 0})
+    rows = rows_of([Result(cell, answers, tmp_path)])
     assert [row.difference.value for row in rows[:2]] == [0, 0] and rows[0].rate.n == 6
 
 
 def test_rows_pool_seeds_by_hand():
     """Two seeds of two views: the other way gains one recognition and 0.1 of confidence in every view."""
-    hit = np.array([[[1.0, 0], [0, 0]], [[1, 1], [0, 0]]])  # seeds × ways × views
-    confidence = np.array([[[0.5, 0.3], [0.6, 0.4]], [[0.4, 0.2], [0.5, 0.3]]])
-    found = []
-    for one_hit, one_confidence in zip(hit, confidence, strict=True):
-        outcomes = np.stack([one_hit, one_confidence], 1)[:, None]  # ways × printers × 2 × views
-        found.append(Outcomes((UNPRINTED.name, "other"), ("p",), outcomes, np.array([0.5, 0.0])))
-    base, other = gamut_rows(found)
+    hits = ("10", "00"), ("11", "00")  # seeds × ways
+    sure = ([0.5, 0.3], [0.6, 0.4]), ([0.4, 0.2], [0.5, 0.3])
+    things = (f"{UNPRINTED.name}, printed by p", "other, printed by p")
+    results = []
+    for seed in (0, 1):
+        answers = {
+            "hits": {thing: [text] for thing, text in zip(things, hits[seed], strict=True)},
+            "confidence": {thing: [row] for thing, row in zip(things, sure[seed], strict=True)},
+            "missed": {UNPRINTED.name: 0.5, "other": 0.0},
+            "printers": ["p"],
+        }
+        results.append(Result(Cell(f"c{seed}", {"name": "s", "networks": ["n"], "seed": seed}), answers, Path()))
+    base, other = rows_of(results)
     assert (base.rate.n, base.rate.value, other.rate.value, other.difference.value) == (4, 0.75, 0.0, -0.75)
-    assert other.gain.value == pytest.approx(0.1) and other.gain_by_seed == pytest.approx((0.1, 0.1))
-    assert (other.gain.low, other.gain.high) == pytest.approx((0.1, 0.1)) and base.out_of_gamut == 0.5
+    assert other.gain.value == pytest.approx(0.1) and other.gain_by_seed == "+0.100 +0.100"
+    assert (other.gain.low, other.gain.high) == pytest.approx((0.1, 0.1)) and base.missed == 0.5
     mean = base.confidence
-    assert mean.value == pytest.approx(0.35) and mean.high - mean.low == pytest.approx(1.96 * 0.1290994, rel=1e-5)
+    # Student's t of three degrees of freedom, 3.1824, times the deviation over the root of four
+    assert mean.value == pytest.approx(0.35) and mean.high - mean.low == pytest.approx(3.1824 * 0.1290994, rel=1e-4)
 
 
 def test_the_study_runs_cell_by_cell_and_says_what_is_missing(tmp_path):
     (tmp_path / "a.toml").write_text(SCENE.replace("steps = 3", "steps = 1").replace("views = 4", "views = 1"), "utf-8")
-    (tmp_path / "study.toml").write_text('scenes = ["a.toml", "none.toml"]\nseeds = [0]\nviews = 2\n', "utf-8")
+    (tmp_path / "study.toml").write_text('scenes = ["a.toml"]\nseeds = [0]\nn = 2\n', "utf-8")
     finished = run_study("gamut", tmp_path / "study.toml", tmp_path / "out")
-    assert list(finished.failed) == ["none-seed-0"] and "no file at" in finished.failed["none-seed-0"]
     (table,) = finished.tables
     assert len(table.rows) == len(WAYS) * 3 and table.rows[0][:2] == ("coated", UNPRINTED.name)
     assert (tmp_path / "out/gamut_a.csv").is_file() and (tmp_path / "out/gamut_a.png").is_file()
-    (tmp_path / "study.toml").write_text('scenes = ["a.toml", "b/a.toml"]\n', "utf-8")
-    with pytest.raises(Refused, match="names of their own"):
-        run_study("gamut", tmp_path / "study.toml", tmp_path / "other")
+    for other, says in (("none.toml", "no file at"), ("b/a.toml", "different names")):
+        (tmp_path / "study.toml").write_text(f'scenes = ["a.toml", "{other}"]\n', "utf-8")
+        with pytest.raises(Refused, match=says):
+            run_study("gamut", tmp_path / "study.toml", tmp_path / "other")

@@ -10,12 +10,11 @@ import torch
 from scipy.stats import spearmanr
 
 from patchproof.channel.effects import FIELDS
-from patchproof.experiments import mining, stress
+from patchproof.experiments import mining
 from patchproof.experiments.hard_views import (
     CANDIDATES,
     LIGHT,
     POSE,
-    clean_losses,
     expected_losses,
     hardest,
     training_conditions,
@@ -24,21 +23,23 @@ from patchproof.experiments.stress import OcclusionSettings, SearchSettings, occ
 from patchproof.experiments.stress_map import (
     Axis,
     MapSettings,
-    ScenesSettings,
-    axes,
+    axes_of,
+    clean,
     in_cell,
     map_of,
-    scene_cells,
+    mesh_cells,
     worst_cells,
 )
 from patchproof.goal import Goal
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.loop import State, steps
+from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.scene.conditions import fields_of
+from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings
 from patchproof.strict import Refused, validated
+from patchproof.study.grid import GridSettings
 from patchproof.study.study import run_study
 
 SCENE = {
@@ -75,6 +76,10 @@ def few_views(monkeypatch):
     monkeypatch.setattr(loop, "SELECT_AFTER", 4)
 
 
+def losses_of(problem, conditions):
+    return clean(problem, conditions, problem.training_px).loss.mean(0)
+
+
 def rows_of(conditions, names):
     return np.concatenate([fields_of(conditions)[name].astype(float).reshape(len(conditions), -1) for name in names], 1)
 
@@ -97,7 +102,7 @@ def test_mined_views_take_pose_and_light_of_expectedly_bad_draws_and_nothing_els
     np.testing.assert_array_equal(rows_of(mined, others), rows_of(drawn[:12], others))
     np.testing.assert_array_equal(rows_of(mined, names)[::2], rows_of(drawn[:12], names)[::2])
     fresh, tried = drawn[76:], drawn[12:76]  # the worst of each eight draws that no try has used
-    expected = expected_losses(tried, clean_losses(problem, tried), fresh).reshape(6, CANDIDATES)
+    expected = expected_losses(tried, losses_of(problem, tried), fresh).reshape(6, CANDIDATES)
     groups = zip(rows_of(mined, names)[1::2], rows_of(fresh, names).reshape(6, CANDIDATES, -1), expected, strict=True)
     for row, group, losses in groups:
         assert (row == group).all(1).nonzero()[0].tolist() == [losses.argmax()]
@@ -122,9 +127,8 @@ def test_views_from_behind_a_patch_are_not_mined(tmp_path):
     mined, drawn = training_conditions(around, 16), around.scene.draw("train", 12)
     changed = mined.pose.azimuth_deg != drawn.pose.azimuth_deg
     assert changed.any() and (np.abs(around.scene.piece_azimuth_deg(mined))[changed] < 90).all()
-    np.testing.assert_array_equal(
-        training_conditions(around, 1).pose.azimuth_deg, drawn.pose.azimuth_deg
-    )  # too few to fit
+    too_few = training_conditions(around, 1)  # to fit anything to
+    np.testing.assert_array_equal(too_few.pose.azimuth_deg, drawn.pose.azimuth_deg)
 
 
 def test_the_worst_of_every_eight_by_hand():
@@ -144,13 +148,13 @@ def test_a_step_of_mined_training_depends_on_state_and_number_alone(tmp_path):
 
 def test_equal_cost_by_hand(monkeypatch):
     monkeypatch.setattr(loop, "SELECT_AFTER", 80)
-    monkeypatch.setattr(mining, "SELECT_VIEWS", 64)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 64)
     plain = OptimizeSettings(steps=40, views=8)
     # 40 · 8 views, and 4 selections of 64 views forward only
     assert mining.passes(plain) == pytest.approx(320 + 256 / 3)
     # 192 tries cost 64 passes, which are 8 steps of 8 views
     assert mining.equal_steps(plain, 192) == 32 and mining.equal_steps(plain, 193) == 31
-    assert mining.passes(plain.model_copy(update={"steps": 32}), 192) == mining.passes(plain)
+    assert mining.passes(plain.changed(steps=32), 192) == mining.passes(plain)
     # one step's worth of tries from the last training that can pay for them
     two = OptimizeSettings(steps=2, views=4)
     assert mining.equal_steps(two, 12) == 1
@@ -163,7 +167,7 @@ def test_equal_cost_by_hand(monkeypatch):
 
 def test_a_cell_moves_pose_and_light_as_far_as_they_lay_in_their_ranges(tmp_path):
     problem = problem_with(tmp_path)
-    both = axes(problem.scene.settings, MapSettings(light="ambient", pose_cells=3, light_cells=2))
+    both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=3, light_cells=2))
     assert both[0].edges == pytest.approx((-60, -20, 20, 60)) and both[1].edges == pytest.approx((0, 0.3, 0.6))
     drawn = problem.scene.draw("select", 32)
     there = in_cell(drawn, both, (2, 0))
@@ -176,7 +180,7 @@ def test_a_cell_moves_pose_and_light_as_far_as_they_lay_in_their_ranges(tmp_path
 def test_an_axis_without_a_range_is_refused(tmp_path):
     settings = problem_with(tmp_path, view={"roll_deg": [3, 3]}).scene.settings
     with pytest.raises(Refused, match=r"a range of roll_deg .* got \[3, 3\]"):
-        axes(settings, MapSettings(pose="roll_deg"))
+        axes_of(settings, MapSettings(pose="roll_deg"))
 
 
 def test_the_worst_tenth_by_hand():
@@ -196,7 +200,7 @@ def test_a_map_shows_where_light_fails(tmp_path):
     dark = {"background": {"color": [0, 0, 0]}, "view": {"distance_mm": [330, 340], "look_at_jitter": 0}}
     light = {"ambient": [0.0, 1.2], "directional": [0, 0]}
     problem = problem_with(tmp_path, target=BRIGHT, light=light, camera={"exposure_ev": [0, 0]}, **dark)
-    both = axes(problem.scene.settings, MapSettings(light="ambient", pose_cells=2, light_cells=3))
+    both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=2, light_cells=3))
     hits, confidence = map_of(problem, both, problem.scene.draw("select", 8))
     assert hits.shape == confidence.shape == (2, 3, 8)
     assert not hits[:, 0].any() and (confidence.mean((0, 2))[1:] > confidence.mean((0, 2))[:-1]).all()
@@ -209,6 +213,7 @@ def test_a_map_shows_where_light_fails(tmp_path):
 def test_the_black_square_that_hides_what_the_network_looks_at_is_the_worst(tmp_path):
     problem = problem_with(tmp_path, target=BRIGHT, light={"ambient": [1, 1]}, camera={"exposure_ev": [0, 0]})
     found, picture = occluded(problem, OcclusionSettings(share=0.5, positions=3, n=8), 0)
+    picture = as_pixels(picture)
     assert found["worst"] == [0, 0] and found["worst_again"] == "0" * 8
     # of the other corners none reaches the upper left quarter
     assert found["hits"][2] == found["hits"][6] == found["hits"][8] and "1" in found["hits"][8]
@@ -226,9 +231,7 @@ def test_the_search_ends_in_the_dark_for_a_network_that_wants_brightness(tmp_pat
     assert ranges.ambient[0] <= condition["ambient"] <= 0.2 and ranges.directional[0] <= condition["directional"]
     drawn = problem.scene.draw("select", 2 + 8, 0)
     first = [
-        clean_losses(
-            problem, stress._with(drawn[:2], {name: fields_of(drawn)[name][i : i + 1] for name in LIGHT})
-        ).mean()
+        losses_of(problem, with_values(drawn[:2], **{n: fields_of(drawn)[n][i : i + 1] for n in LIGHT})).mean()
         for i in range(2, 10)
     ]
     assert found["losses"][0] == pytest.approx(max(first)) and found["losses"][-1] > max(first)
@@ -278,7 +281,6 @@ def test_the_stress_study_leaves_tables_maps_and_a_page_twice_alike(tmp_path):
 
 
 def test_the_mining_study_compares_at_equal_cost_on_the_same_conditions(tmp_path, monkeypatch):
-    monkeypatch.setattr(mining, "SELECT_VIEWS", 4)
     toml(tmp_path / "scene.toml", patch=PRINTED)
     (tmp_path / "mining.toml").write_text(MINING)
     finished = run_study("mining", tmp_path / "mining.toml", tmp_path / "out")
@@ -294,7 +296,7 @@ def test_settings_that_will_not_do_are_refused(tmp_path):
     lines = flat.read_text().replace('mesh = "primitive:carton"', 'photos = "p"\nsheet = "s.json"')
     flat.write_text(lines.replace("length_mm = 300\n", "").replace('"texture"', '"patch"'))
     with pytest.raises(Refused, match="scenes with a mesh"):
-        scene_cells(ScenesSettings(scenes=("flat.toml",)), tmp_path)
+        mesh_cells(GridSettings(scenes=("flat.toml",)), tmp_path)
     with pytest.raises(Refused, match="different names"):
-        validated(ScenesSettings, {"scenes": ["a/s.toml", "b/s.toml"]}, "test")
+        validated(GridSettings, {"scenes": ["a/s.toml", "b/s.toml"]}, "test")
     assert len(Axis("x", (0.0, 1.0, 2.0))) == 2

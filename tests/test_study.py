@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -13,16 +14,17 @@ from pathlib import Path
 
 import pytest
 
+import patchproof
 import toy_studies as toy
 from patchproof.strict import Refused
 from patchproof.study import study
-from patchproof.study.study import carry_out, load_study, run_study
+from patchproof.study.study import Work, carry_out, load_study, run_study
 
 BASE = Path(__file__).parent
 
 
 def carried_out(out, *numbers, **options):
-    return carry_out(toy.STUDY, toy.ToySettings(numbers=numbers), BASE, out, **options)
+    return carry_out(toy.STUDY, toy.ToySettings(numbers=numbers), BASE, out, Work(**options))
 
 
 def contents(folder):
@@ -70,10 +72,10 @@ def test_resuming_does_what_failed_changed_or_is_missing_and_nothing_else(tmp_pa
         done.append(cell.name)
         return {"square": -1}
 
-    carry_out(replace(toy.STUDY, run=run), toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, resume=True)
+    carry_out(replace(toy.STUDY, run=run), toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
     assert done == ["n3", "n13"]
     changed = replace(toy.STUDY, run=run, cells=lambda s, b: [study.Cell("n2", {"number": 20})])
-    carry_out(changed, toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, resume=True)
+    carry_out(changed, toy.ToySettings(numbers=(2, 3, 13)), BASE, tmp_path, Work(resume=True))
     assert done == ["n3", "n13", "n2"]
 
 
@@ -118,10 +120,31 @@ def test_studies_are_found_by_name_and_configs_read_strictly(tmp_path, monkeypat
     assert len(run_study("toy", config, tmp_path / "out").results) == 1
 
 
+def test_every_study_is_listed_under_its_own_name_and_says_what_it_is_about():
+    root = Path(patchproof.__file__).parent
+    modules = {
+        ".".join(["patchproof", *path.relative_to(root).with_suffix("").parts])
+        for path in root.rglob("*.py")
+        if re.search(r"^STUDY\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert modules == set(study.STUDIES.values()), "list it in STUDIES"
+    for name, module in study.STUDIES.items():
+        assert load_study(name).name == name
+        assert re.fullmatch(r"[A-Z].{20,118}\.", study.first_line(module)), module
+
+
+def test_listing_the_studies_imports_none_of_them():
+    code = (
+        "import sys; from patchproof.study.study import STUDIES, first_line\n"
+        "print(*map(first_line, STUDIES.values())); sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     settings = toy.ToySettings(numbers=tuple(range(20, 32)), pause_s=0.2)
-    carry_out(toy.STUDY, settings, BASE, whole, jobs=2)
+    carry_out(toy.STUDY, settings, BASE, whole, Work(jobs=2))
     code = (
         f"import sys; sys.path.insert(0, {str(BASE)!r})\n"
         "import toy_studies as toy\nfrom pathlib import Path\nfrom patchproof.study.study import carry_out\n"
@@ -135,7 +158,7 @@ def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert len(list(killed.glob("cells/*.json"))) < 12
-    carry_out(toy.STUDY, settings, BASE, killed, resume=True)
+    carry_out(toy.STUDY, settings, BASE, killed, Work(resume=True))
     assert contents(killed) == contents(whole)
 
 
@@ -146,6 +169,6 @@ def test_a_cluster_that_loses_a_worker_changes_no_byte(tmp_path):
     carry_out(toy.STUDY, settings, BASE, tmp_path / "here")
     (tmp_path / "n3").touch()
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        carry_out(toy.STUDY, settings, BASE, tmp_path / "there", cluster=cluster.scheduler_address)
+        carry_out(toy.STUDY, settings, BASE, tmp_path / "there", Work(cluster=cluster.scheduler_address))
     assert not (tmp_path / "n3").exists()
     assert contents(tmp_path / "there") == contents(tmp_path / "here")

@@ -1,6 +1,7 @@
 """Training without an effect: the views that it sees, what is refused, and what an effect has earned, by hand."""
 
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -64,11 +65,11 @@ def test_what_an_effect_earned_by_hand():
     results = []
     for seed, counts in enumerate(((8, 6), (9, 5))):
         for effect, count in zip((ALL, "noise"), counts, strict=True):
-            hits = [1] * count + [0] * (10 - count)
-            found = {"hits": hits, "confidence": [count / 20] * 10, "traced_hits": [], "traced_confidence": []}
-            found["cost"] = {"noise": 0.1 + 0.2 * seed} if effect == ALL else {}
-            values = {"name": "s", "network": "n", "seed": seed, "effect": effect}
-            results.append(Result(Cell(f"{seed}{effect}", values), found, None))
+            hits = "1" * count + "0" * (10 - count)
+            answers = {"modeled": {"hits": {"design": [hits]}, "confidence": {"design": [[count / 20] * 10]}}}
+            answers["cost"] = {"noise": 0.1 + 0.2 * seed} if effect == ALL else {}
+            values = {"name": "s", "networks": ["n"], "network": "n", "seed": seed, "effect": effect}
+            results.append(Result(Cell(f"{seed}{effect}", values), answers, Path()))
     earned, designs = ablation.tables(settings, results)
     ((effect, groups, rate, confidence, *traced, cost),) = earned.rows
     assert (effect, groups, traced) == ("noise", 2, [None, None]) and cost.value == pytest.approx(0.2)

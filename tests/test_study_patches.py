@@ -11,16 +11,17 @@ import pytest
 import torch
 from PIL import Image
 
-from patchproof.claims import LEAST_CLUSTERS, clustered_mean
+from patchproof.claims import LEAST_CLUSTERS, clustered, clustered_mean
 from patchproof.experiments import patch2d, patch3d
-from patchproof.experiments.image_classes import ImageClass, classes_of, write_renders
+from patchproof.experiments.image_classes import ImageClass, class_scene, classes_of, scene_settings, write_renders
 from patchproof.geometry import local_scale
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, read_toml, validated
+from patchproof.study.grid import scene_values
+from patchproof.study.record import bits
 from patchproof.study.study import Cell, Result, run_study
-from patchproof.study.trials import clustered
 
 
 @pytest.fixture
@@ -52,13 +53,13 @@ def test_few_clusters_have_no_interval():
 
 def test_patches_3d_and_2d_on_the_same_terms(scene_file, short_loop, tmp_path):
     config = tmp_path / "study.toml"
-    config.write_text('scenes = ["scene.toml"]\nseeds = [0]\nconditions = 12\nrenders = 8\n')
+    config.write_text('scenes = ["scene.toml"]\nseeds = [0]\nn = 12\nrenders = 8\n')
     finished = run_study("patch3d", config, tmp_path / "out")
     assert not finished.failed
-    found = finished.results[0].found
+    found = finished.results[0].answers
     assert found["passes"] == {"3d": 3 * 4 + 8, "2d": 3 * 4 + 8}
-    assert all(len(found["recognized"][kind]) == len(found["confidence"][kind]) == 12 for kind in patch3d.KINDS)
-    sizes = [pixels_of(tmp_path / "out/files" / f"scene-builtin-0-{kind}.png").shape for kind in ("2d", "3d")]
+    assert all(len(found["hits"][kind][0]) == len(found["confidence"][kind][0]) == 12 for kind in patch3d.KINDS)
+    sizes = [pixels_of(tmp_path / "out/files" / f"scene.builtin.0-{kind}.png").shape for kind in ("2d", "3d")]
     assert sizes[0] == sizes[1] and sizes[0][0] >= 180  # 90 mm at 2 pixels per mm
     rows = list(csv.reader((tmp_path / "out/patch3d_views.csv").read_text().splitlines()))
     assert [row[1] for row in rows] == ["view", "left", "middle", "right"]
@@ -66,7 +67,7 @@ def test_patches_3d_and_2d_on_the_same_terms(scene_file, short_loop, tmp_path):
 
 
 def test_the_flat_twin_is_as_large_in_its_pictures_as_the_patch_in_its_views(scene_file, tmp_path):
-    settings = patch3d.Patch3dSettings(scenes=("scene.toml",), renders=2, conditions=1)
+    settings = patch3d.Patch3dSettings(scenes=("scene.toml",), renders=2, n=1)
     problem = set_problem(load_scene(scene_file))
     twin = patch3d.flat_twin(problem, settings, tmp_path)
     sizes = []
@@ -106,15 +107,17 @@ def test_renders_show_the_bare_object_and_never_an_evaluated_view(scene_file, tm
 
 def result3d(scene, model, seed, **kinds):
     """A result whose kinds were recognized in so many of four conditions."""
-    found = {kind: [i < kinds.get(kind, 0) for i in range(4)] for kind in patch3d.KINDS}
-    values = {
-        "recognized": found,
-        "recognized_in_images": found,
+    hits = {kind: [bits(i < kinds.get(kind, 0) for i in range(4))] for kind in patch3d.KINDS}
+    record = {"hits": hits, "confidence": {kind: [[0.5] * 4] for kind in patch3d.KINDS}}
+    answers = {
+        **record,
+        "in_images": record,
         "azimuth_deg": [-30.0, -5.0, 5.0, 30.0],
         "azimuth_range_deg": (-45.0, 45.0),
         "passes": {"3d": 1, "2d": 1},
     }
-    return Result(Cell(f"{scene}-{model}-{seed}", {"scene": scene, "model": model, "seed": seed}), values, Path())
+    values = {"name": scene, "networks": [model], "network": model, "seed": seed}
+    return Result(Cell(f"{scene}-{model}-{seed}", values), answers, Path())
 
 
 def test_clusters_are_objects_before_networks_and_hard_ones_are_told_apart():
@@ -150,7 +153,7 @@ def test_only_printed_patches_on_meshes_are_compared(scene_file, scene, match):
     settings = patch3d.Patch3dSettings(scenes=("scene.toml",))
     if match is None:
         assert [one.name for one in patch3d.cells(settings, scene_file.parent)] == [
-            f"scene-builtin-{seed}" for seed in (0, 1, 2)
+            f"scene.builtin.{seed}" for seed in (0, 1, 2)
         ]
         return
     with pytest.raises(Refused, match=match):
@@ -167,7 +170,7 @@ def two_classes(tmp_path, scene_file, more=""):
     config = tmp_path / "study.toml"
     config.write_text(
         'images = "images"\nlabels = "images/labels.csv"\nrenders = ["scene.toml"]\nrenders_each = 20\n'
-        'models = ["builtin"]\nconditions = 8\nshown_px = 20\n' + more + "\n[optimize]\nsteps = 1\nviews = 2\n"
+        'networks = ["builtin"]\nn = 8\nshown_px = 20\n' + more + "\n[optimize]\nsteps = 1\nviews = 2\n"
     )
     return config
 
@@ -179,19 +182,24 @@ def test_gain_and_harm_of_a_2d_patch(scene_file, short_loop, tmp_path):
     pooled, gain, harm = finished.tables
     assert gain.rows[0][:4] == ("carton (renders)", "builtin", 20, True) and gain.rows[0][4].n == 8
     assert [row[2] for row in harm.rows] == ["mug", "traffic cone"]  # every other class, and the target is none of them
-    called = finished.results[0].found["classes"][2]
-    assert called["same"] and called["recognized"] == called["called_target"]
+    called = finished.results[0].answers["classes"][2]
+    assert called["same"] and all(own == target for own, target in called["hits"].values())
     assert isinstance(pooled.rows[0][1], float)  # one cluster: no interval
 
 
 def test_classes_are_those_of_the_table_that_have_images_and_of_the_scenes(scene_file, tmp_path):
     config = two_classes(tmp_path, scene_file)
     settings = validated(patch2d.Patch2dSettings, read_toml(config), "study.toml")
-    classes = classes_of(settings.images, settings.labels, settings.renders, tmp_path)
+    renders = [scene_values(file, tmp_path) for file in settings.renders]
+    classes = classes_of(settings.images, settings.labels, renders, tmp_path)
     assert [one.label for one in classes] == ["mug", 2, "carton"]
     assert [cell.values["target"] for cell in patch2d.cells(settings, tmp_path)] == ["mug", 2, "carton"]
     with pytest.raises(Refused, match='"cartoon": did you mean "carton"'):
-        patch2d.cells(settings.model_copy(update={"targets": ("cartoon",)}), tmp_path)
+        patch2d.cells(settings.changed(targets=("cartoon",)), tmp_path)
+    before = patch2d.cells(settings, tmp_path)
+    scene_file.write_text(scene_file.read_text().replace("[500, 900]", "[500, 800]"))
+    after = patch2d.cells(settings, tmp_path)
+    assert before[0].name == after[0].name and before[0].values != after[0].values  # a changed scene is done again
 
 
 def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file, tmp_path):
@@ -199,8 +207,8 @@ def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file,
     settings = validated(patch2d.Patch2dSettings, read_toml(config), "study.toml")
     (tmp_path / "work").mkdir()
     classifier = patch2d.load_classifier("builtin", tmp_path)
-    one = ImageClass("mug", (), None)
-    scene = patch2d.class_scene(settings, tmp_path, one, classifier, 0, tmp_path / "work")
+    one = ImageClass("mug")
+    scene = class_scene(settings, tmp_path, one, classifier, 0, tmp_path / "work")
     side = classifier.input_px
     widths = [
         local_scale(matrix, np.array([30.0, 30.0]))[0] * 60
@@ -208,16 +216,16 @@ def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file,
     ]
     assert min(widths) >= 16 - 1e-6 and max(widths) <= 25 + 1e-6  # 20 times 0.8 to 1.25
     assert np.median(widths) == pytest.approx(20, rel=0.05)
-    problem = patch2d.problem_of(settings, tmp_path, scene, classifier, one)
-    shown = patch2d.shown_with_controls(problem, problem.subject.pixels(torch.full((3, 60, 60), 0.25)))
+    problem = patch2d.flat_problem(settings, tmp_path, scene, classifier, one)
+    shown = patch2d.shown_by_kind(problem, problem.subject.pixels(torch.full((3, 60, 60), 0.25)))
     assert shown["patch"].srgb.shape == shown["grey"].srgb.shape == (120, 120, 3)  # printed pixels, and no frame
     largest = replace(classifier, input_px=30)
     with pytest.raises(Refused, match="pixels before a network of 30"):
-        patch2d.scene_settings(settings, one, largest, "images", "images/labels.csv")
+        scene_settings(settings, one, largest, "images", "images/labels.csv")
 
 
 def test_images_or_renders_are_asked_for(tmp_path):
     for text, match in (("", "takes images and labels, or renders"), ('images = "a"\n', "images and labels together")):
-        (tmp_path / "study.toml").write_text(text + 'models = ["builtin"]\n')
+        (tmp_path / "study.toml").write_text(text + 'networks = ["builtin"]\n')
         with pytest.raises(Refused, match=match):
             run_study("patch2d", tmp_path / "study.toml", tmp_path / "out")

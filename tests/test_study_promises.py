@@ -1,6 +1,7 @@
 """Promises against photographs: the shares and the correction by hand, and one cell from scene to verdict."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,19 +13,25 @@ from patchproof.validation import promises
 from test_optimize import SCENE
 
 
-def found(rate, recognized, judged=40, n=400):
+def count(rate, recognized, judged=40, n=400):
     return {"rate": rate, "n": n, "judged": judged, "recognized": recognized, "verdict": "kept"}
 
 
 def result(scene, one):
-    values = {"name": scene, "network": "builtin", "printer": "coated", "seed": 0}
-    return Result(Cell(f"{scene}{one['recognized']}", values), one, None)
+    values = {
+        "name": scene,
+        "networks": ["builtin"],
+        "network": "builtin",
+        "scene": {"printer": {"profile": "coated"}},
+        "seed": 0,
+    }
+    return Result(Cell(f"{scene}{one['recognized']}", values), one, Path())
 
 
 def test_an_interval_holds_up_to_its_ends_and_not_beyond():
     low, high = prediction_interval(320, 400, 40)
-    assert [promises.held(found(0.8, count)) for count in (low - 1, low, high, high + 1)] == [False, True, True, False]
-    assert promises.interval_of(found(0.8, 0)) == (low, high)
+    assert [promises.held(count(0.8, hits)) for hits in (low - 1, low, high, high + 1)] == [False, True, True, False]
+    assert promises.interval_of(count(0.8, 0)) == (low, high)
 
 
 def test_the_shift_of_the_log_odds_is_found_again_and_no_shift_changes_nothing():
@@ -32,14 +39,14 @@ def test_the_shift_of_the_log_odds_is_found_again_and_no_shift_changes_nothing()
     assert promises.shifted(rates, 0.0).tolist() == rates.tolist()
     true = promises.shifted(rates, -0.7)
     assert promises.shifted(true, 0.7)[1:4] == pytest.approx(rates[1:4])
-    seen = [found(rate, 1000 * p, 1000) for rate, p in zip(rates[1:4], true[1:4], strict=True)]
+    seen = [count(rate, 1000 * p, 1000) for rate, p in zip(rates[1:4], true[1:4], strict=True)]
     assert promises.fitted_shift(seen) == pytest.approx(-0.7, abs=1e-3)
 
 
 def test_a_correction_is_judged_on_other_scenes_than_it_was_fitted_on():
     settings = promises.PromisesSettings(scenes=("a", "b"), networks=("builtin",))
-    low = [result("a", found(0.8, count)) for count in (20, 21, 22)]  # promised too much
-    fair = [result("b", found(0.8, count)) for count in (31, 32, 33)]
+    low = [result("a", count(0.8, hits)) for hits in (20, 21, 22)]  # promised too much
+    fair = [result("b", count(0.8, hits)) for hits in (31, 32, 33)]
     held, correction, each = promises.tables(settings, low + fair)
     assert [(row[0], row[1].value, row[1].n) for row in held.rows] == [("a", 0, 3), ("b", 1, 3), ("all", 0.5, 6)]
     assert held.rows[0][3].value == pytest.approx(21 / 40 - 0.8)
@@ -65,5 +72,9 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     finished = run_study("promises", tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
     (one,) = finished.results
-    assert one.found["n"] == 16 and one.found["judged"] <= 10 and 0 <= one.found["recognized"] <= one.found["judged"]
-    assert (tmp_path / "out" / "promises_calibration.png").is_file() or not one.found["judged"]
+    assert (
+        one.answers["n"] == 16
+        and one.answers["judged"] <= 10
+        and 0 <= one.answers["recognized"] <= one.answers["judged"]
+    )
+    assert (tmp_path / "out" / "promises_calibration.png").is_file() or not one.answers["judged"]

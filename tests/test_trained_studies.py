@@ -18,8 +18,10 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import optimize_scene
 from patchproof.scene.scene import load_scene
 from patchproof.strict import Refused, validated
-from patchproof.study.study import Cell, Result, run_study, short_name
-from patchproof.study.trained import Told, TrainedSettings, cell_of, networks_of, scenes_of, verdict
+from patchproof.study.grid import short_name
+from patchproof.study.record import Record
+from patchproof.study.study import Cell, Result, run_study
+from patchproof.study.trained import TrainedSettings, networks_of, trained_cells, verdict
 from test_textures_optimized import scene_file
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
@@ -178,9 +180,9 @@ def test_fixed_views_keep_their_pose_and_change_their_light(tmp_path):
     problem = set_problem(load_scene(tmp_path / "texture.toml"))
     views = three_views(problem, 4)
     assert sorted(set(views.pose.azimuth_deg.round(6))) == pytest.approx([-80 / 3, 0, 80 / 3])  # sixths of [-40, 40]
-    assert len(set(views.directional)) == 12 and len(set(views.distance_mm)) == 1
+    assert len(set(views.light.directional)) == 12 and len(set(views.pose.distance_mm)) == 1
     still = from_sides(problem, np.array([0.0, 90.0]))
-    assert not still.directional.any() and not still.noise.any() and (still.ambient == 1).all()
+    assert not still.light.directional.any() and not still.sensor.noise.any() and (still.light.ambient == 1).all()
 
 
 def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
@@ -190,8 +192,8 @@ def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
     design = np.random.default_rng(1).integers(0, 256, (1, subject.start().shape[2], 3), np.uint8)
     shuffled = subject.control("shuffled", design)
     assert np.array_equal(shuffled, subject.control("shuffled", design)) and not np.array_equal(shuffled, design)
-    first = 0
-    for mask, was, now in zip(scene.canvas.mask, subject.textures(design), subject.textures(shuffled), strict=True):
+    first, textures = 0, (subject.surface.textures(each) for each in (design, shuffled))
+    for mask, was, now in zip(scene.canvas.mask, *textures, strict=True):
         count = int(mask.sum())
         parts = [np.sort(one[0, first : first + count].view("u1,u1,u1").ravel()) for one in (design, shuffled)]
         assert np.array_equal(*parts)
@@ -204,15 +206,14 @@ def test_shuffling_keeps_every_texel_and_moves_whole_cells(tmp_path):
 def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_path):
     config = written(tmp_path, config=f'networks = ["{RED}"]\n')
     settings = TrainedSettings(scenes=("texture.toml",), networks=(RED,))
-    ((_, _, before),) = scenes_of(settings, config.parent)
+    (before,) = trained_cells(settings, config.parent)
     scene = tmp_path / "texture.toml"
     scene.write_text(scene.read_text().replace("distance_mm = [600", "distance_mm = [500"))
-    ((_, _, after),) = scenes_of(settings, config.parent)
-    cells = [cell_of(values, "row", (RED,), (RED,), 0) for values in (before, after)]
-    assert cells[0].name == cells[1].name and cells[0].values != cells[1].values
-    wrong = settings.model_copy(update={"ways": {"odd": {"optimize": {"stpes": 3}}}})
+    (after,) = trained_cells(settings, config.parent)
+    assert before.name == after.name and before.values != after.values
+    wrong = settings.changed(ways={"odd": {"optimize": {"stpes": 3}}})
     with pytest.raises(Refused, match=r'way odd, got "optimize\.stpes": did you mean "steps"'):
-        scenes_of(wrong, config.parent)
+        trained_cells(wrong, config.parent)
 
 
 def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path):
@@ -220,23 +221,25 @@ def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path)
         scenes=("a.toml",), networks=("builtin",), if_installed=("module:fake_networks.missing", RED)
     )
     assert networks_of(settings, tmp_path) == ("builtin", RED)
-    both = settings.model_copy(update={"networks": ("file:a/net.pt2", "file:b/net.pt2")})
     with pytest.raises(Refused, match="different names"):
-        networks_of(both, tmp_path)
+        networks_of(settings.changed(if_installed=("builtin",)), tmp_path)
+    with pytest.raises(Refused, match="different names"):
+        settings.changed(networks=("file:a/net.pt2", "file:b/net.pt2"))
     with pytest.raises(Refused, match=r"ways\.a b"):
         validated(TrainedSettings, {"scenes": ["a"], "networks": ["b"], "ways": {"a b": {}}}, "config")
 
 
 def test_pairs_are_those_of_seeds_that_both_have():
     def result(seed, hits):
-        values = {"seed": seed, "tested": ["net"]}
+        values = {"name": "scene", "seed": seed, "networks": ["net"]}
         return Result(Cell("c", values), {"hits": {"x": [hits]}, "confidence": {"x": [[0.5] * len(hits)]}}, Path())
 
-    one = Told([result(0, "1100"), result(1, "1111")], "x")
-    other = Told([result(1, "0001"), result(2, "0000")], "x")
+    one = Record([result(0, "1100"), result(1, "1111")], "x")
+    other = Record([result(1, "0001"), result(2, "0000")], "x")
     gain, _ = one.gain(other, "net")
     assert gain.n == 4 and gain.value == 0.75 and one.level("net")[0].n == 8
-    assert one.gain(Told([], "x"), "net") == (None, None) and verdict(None) == "not measured"
+    assert one.gain(other) == one.gain(other, "net")  # the only network need not be named
+    assert one.gain(Record([], "x"), "net") == (None, None) and verdict(None) == "not measured"
 
 
 def test_means_have_students_interval():

@@ -38,18 +38,18 @@ def run(settings, base, cell):
 
 
 def tables(settings, results):
-    rows = tuple((one.cell.name, one.found["square"], rate([one.found["square"] > 3] * 4)) for one in results)
+    rows = tuple((one.cell.name, one.answers["square"], rate([one.answers["square"] > 3] * 4)) for one in results)
     return (Table("squares", "Squares", ("cell", "square", "large"), rows, "of whole numbers"),)
 
 
 def figures(settings, results):
     def draw(figure):
-        figure.add_subplot().plot([one.found["square"] for one in results])
+        figure.add_subplot().plot([one.answers["square"] for one in results])
 
     return (Drawing("squares", "Squares", draw, (3.0, 2.0)),)
 
 
-STUDY = Study("toy", "Squares of numbers.", ToySettings, cells, run, tables, figures)
+STUDY = Study("toy", ToySettings, cells, run, tables, figures)
 
 
 def double(number):

@@ -165,6 +165,16 @@ def resampled_means(values: np.ndarray, draws: int) -> np.ndarray:
     return values[np.random.default_rng(0).integers(0, len(values), (draws, len(values)))].mean(1)
 
 
+def clustered(values: Sequence[float]) -> Estimate | float | None:
+    """The mean of one figure per cluster as a table says it, n the number of clusters: without an interval where they
+    are too few for one, None of nothing.
+    """
+    if len(values) < LEAST_CLUSTERS:
+        return statistics.fmean(values) if values else None
+    value, (low, high) = clustered_mean(values)
+    return Estimate(value, low, high, len(values))
+
+
 def mcnemar_p(a: list[bool], b: list[bool]) -> float:
     """Exact two-sided McNemar p-value that the pairs `a`, `b` have the same rate (1 when no pair differs)."""
     from scipy.stats import binomtest

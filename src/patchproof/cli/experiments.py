@@ -40,6 +40,7 @@ def harden(
     """Change labeled images so that classifiers recognize them better, and attack them."""
     from patchproof.harden.folder import HardenSettings, harden_images
     from patchproof.strict import validated
+    from patchproof.study.study import Work
 
     given = {
         "images": str(images),
@@ -55,30 +56,23 @@ def harden(
         "attack_epsilons": names_of(attack_eps),
     }
     with progress() as bar:
-        finished = harden_images(
-            validated(HardenSettings, given, "the options"),
-            out,
-            resume=resume,
-            overwrite=overwrite,
-            jobs=jobs,
-            cluster=cluster,
-            on_cell=lambda done, total: bar("harden", done, total),
-        )
+        work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("harden", done, total))
+        finished = harden_images(validated(HardenSettings, given, "the options"), out, work)
     say_study(finished)
     say(f"images: {out}, tables: {out / 'harden.html'}")
     raise typer.Exit(0 if finished.results else 1)
 
 
 class ListsStudies(TyperCommand):
-    """A command whose help ends with all studies; they are imported when it is asked for."""
+    """A command whose help ends with all studies."""
 
     def format_help(self, ctx, formatter) -> None:
         """The usual help, then a line per study."""
-        from patchproof.study.study import STUDIES, load_study
+        from patchproof.study.study import STUDIES, first_line
 
         super().format_help(ctx, formatter)
         say("Studies (all keys of a config: patchproof keys NAME):")
-        say(*(f"  {name:<10} {load_study(name).about}" for name in STUDIES))
+        say(*(f"  {name:<10} {first_line(module)}" for name, module in STUDIES.items()))
 
 
 def study(
@@ -91,19 +85,11 @@ def study(
     cluster: Cluster = None,
 ) -> None:
     """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
-    from patchproof.study.study import run_study
+    from patchproof.study.study import Work, run_study
 
     with progress() as bar:
-        finished = run_study(
-            name,
-            config,
-            out,
-            resume=resume,
-            overwrite=overwrite,
-            jobs=jobs,
-            cluster=cluster,
-            on_cell=lambda done, total: bar("cells", done, total),
-        )
+        work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("cells", done, total))
+        finished = run_study(name, config, out, work)
     say_study(finished)
     say(f"page: {out / name}.html")
     raise typer.Exit(0 if finished.results else 1)

@@ -1,4 +1,4 @@
-"""Study "deceive": textures that hide the object from networks, beside controls that were not trained to.
+"""Textures that hide an object from networks, beside gray, noise and shuffled controls.
 
 In: scenes that the networks read well, networks, seeds, and ways (by default a free texture and one within 8/255 of the
 original). Out: rates of the design, the original object and gray, noise and shuffled controls on the same conditions;
@@ -17,36 +17,27 @@ from typing import Any
 
 from pydantic import Field
 
-from patchproof.experiments.turntable import contact_sheet, pictures, sides
+from patchproof.experiments.turntable import sides
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.promise import judged, shown_with_controls
-from patchproof.output import image_pixels
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
-from patchproof.study.study import Cell, Result, Study, short_name
-from patchproof.study.trained import (
-    Told,
-    TrainedSettings,
-    Way,
-    Word,
-    cell_of,
-    grouped,
-    left_out_note,
-    networks_of,
-    object_file,
-    problem_of,
-    said,
-    scenes_of,
-    tested_in,
-    trained_on,
-)
+from patchproof.study.figures import picture_sheet
+from patchproof.study.grid import grouped, of_values, problem_of, short_name
+from patchproof.study.pictures import contact_sheet, object_file, photographs
+from patchproof.study.record import Record, recorded
+from patchproof.study.study import Cell, Result, Study
+from patchproof.study.trained import TrainedSettings, Way, Word, left_out_note, tested_in, trained_cells, trained_on
 
 CONTROLS = ("bare", "grey", "noise", "shuffled")
+_KINDS = ("design", *CONTROLS)
 _SHEET_PX, _SHEET_VIEWS = 160, 4
 
 
 class DeceiveSettings(TrainedSettings):
     """As in all studies of trained designs; each network trains alone and all of them test."""
 
+    # By name: tables of the scene file with the keys that change.
     # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
@@ -56,49 +47,38 @@ class DeceiveSettings(TrainedSettings):
 
 def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
     """One per scene, way, network and seed; the goal is `deceive` whatever the scene file says."""
-    networks, found = networks_of(settings, base), []
-    for _, _, values in scenes_of(settings, base):
-        scene = values["scene"] | {"target": {**values["scene"]["target"], "goal": "deceive"}}
-        for network in networks:
-            found.extend(
-                cell_of(values | {"scene": scene}, short_name(network), (network,), networks, seed)
-                for seed in settings.seeds
-            )
-    return found
+    return trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
 
 
 def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train against one network, show design and controls to all."""
-    problem = problem_of(base, cell)
+    problem = problem_of(base, cell.values)
     design = best_design(trained_on(problem, cell))
     things = shown_with_controls(problem, design, CONTROLS)
-    found = said(judged(problem, things, problem.scene.draw("evaluate", settings.n)))
-    sheet = f"{cell.name}.sheet.png"
-    rows = [pictures(problem, one, sides(problem, _SHEET_VIEWS), _SHEET_PX) for one in things.values()]
+    suffix, content = object_file(problem, design)
+    views = sides(problem, _SHEET_VIEWS)
+    sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
     return {
-        **found,
-        "sheet": sheet,
-        sheet: contact_sheet(rows),
-        f"{cell.name}.{'glb' if problem.scene.piece is None else 'png'}": object_file(problem, design),
+        **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),
+        f"{cell.name}.sheet.png": sheet,
+        f"{cell.name}.{suffix}": content,
     }
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
     """Rates of everything shown, and the design minus each control."""
     rates, differences = [], []
-    for (scene, way), by_row in grouped(results).items():
-        for row, cells_of_row in by_row.items():
-            told = {kind: Told(cells_of_row, kind) for kind in ("design", *CONTROLS)}
-            for network in tested_in(cells_of_row):
-                start = (scene, way, row, short_name(network))
-                levels = [one.level(network) for one in told.values()]
-                rates.append((*start, *(level[0] for level in levels), levels[0][1]))
-                gains = [told["design"].gain(told[kind], network)[0] for kind in CONTROLS]
-                differences.append((*start, *gains))
+    for design, of_design in grouped(results, of_values("name", "way", "row")).items():
+        records = {kind: Record(of_design, kind) for kind in _KINDS}
+        for network in tested_in(of_design):
+            start = (*design, short_name(network))
+            levels = [record.level(network) for record in records.values()]
+            rates.append((*start, *(level[0] for level in levels), levels[0][1]))
+            differences.append((*start, *(records["design"].gain(records[kind], network)[0] for kind in CONTROLS)))
     head, n = ("scene", "way", "trained on", "tested on"), f"{settings.n} unseen conditions per seed"
     note = left_out_note(settings, results)
     return [
-        Table("rates", "Rates", (*head, "design", *CONTROLS, "confidence"), tuple(rates), f"Over {n}.{note}"),
+        Table("rates", "Rates", (*head, *_KINDS, "confidence"), tuple(rates), f"Over {n}.{note}"),
         Table(
             "differences",
             "The design minus each control",
@@ -112,33 +92,16 @@ def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
 def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawing]:
     """One contact sheet per scene, way and network: the design, then the controls."""
     return [
-        Drawing(
+        picture_sheet(
             f"sheet_{scene}_{way}_{row}",
             f"{scene}, {way}, trained on {row}",
-            lambda figure, one=cells_of_row[0]: _sheet(figure, one),
-            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * (1 + len(CONTROLS))),
+            [("", of_design[0].file(f"{of_design[0].cell.name}.sheet.png"))],
+            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * len(_KINDS)),
             "In even light; the first seed.",
+            rows=_KINDS,
         )
-        for (scene, way), by_row in grouped(results).items()
-        for row, cells_of_row in by_row.items()
+        for (scene, way, row), of_design in grouped(results, of_values("name", "way", "row")).items()
     ]
 
 
-def _sheet(figure, one: Result) -> None:
-
-    axes = figure.add_subplot()
-    axes.imshow(image_pixels((one.out / one.found[one.found["sheet"]]).read_bytes()))
-    kinds = ("design", *CONTROLS)
-    axes.set_yticks([_SHEET_PX * (i + 0.5) for i in range(len(kinds))], kinds)
-    axes.set_xticks([])
-
-
-STUDY = Study(
-    "deceive",
-    "Textures that hide an object from networks, beside gray, noise and shuffled controls.",
-    DeceiveSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("deceive", DeceiveSettings, cells, run, tables, figures)

@@ -20,12 +20,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from patchproof.channel.effects import EFFECT
-from patchproof.optimizer.goals import target_loss
+from patchproof.experiments.stress_map import clean
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import expose
 from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
 
 # What of a draw is the pose and the light; the rest is background, print and camera.
@@ -34,7 +32,6 @@ _LIGHT = ("ambient light", "directional light", "exposure", "lamp", "uneven ambi
 LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
 CANDIDATES = 8
 _RIDGE = 1.0  # beside features of unit variance: as much as one try
-_CHUNK = 16
 
 
 def training_conditions(problem: Problem, tries: int) -> Conditions:
@@ -47,7 +44,7 @@ def training_conditions(problem: Problem, tries: int) -> Conditions:
     tried, others = tried[_shows_what_is_trained(problem, tried)], others[_shows_what_is_trained(problem, others)]
     if len(tried) < 2 or len(others) < CANDIDATES:
         return drawn[:count]
-    expected = expected_losses(tried, clean_losses(problem, tried), others)
+    expected = expected_losses(tried, clean(problem, tried, problem.training_px).loss.mean(0), others)
     return with_pose_and_light(drawn[:count], others[hardest(expected)])
 
 
@@ -56,20 +53,6 @@ def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str] = 
     rows = np.tile(np.arange(len(rest)), len(tried))
     fields = fields_of(tried)
     return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
-
-
-def clean_losses(problem: Problem, conditions: Conditions) -> np.ndarray:
-    """N losses of the clean object (bare, or with its own texture), as training sees it: the mean over classifiers."""
-    goal, losses = problem.scene.settings.target.goal, []
-    with torch.no_grad():
-        for first in range(0, len(conditions), _CHUNK):
-            pictures = expose(problem.see(None, conditions[first : first + _CHUNK], problem.training_px), None)
-            each = [
-                target_loss(classifier.logits(pictures), indices, goal)
-                for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
-            ]
-            losses.append(torch.stack(each).mean(0).cpu().numpy())
-    return np.concatenate(losses)
 
 
 def expected_losses(tried: Conditions, losses: np.ndarray, others: Conditions) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Study "mining": does training that mines the clean object's worst cases lift it there, at equal cost?
+"""Designs trained with and without mining of the clean object's worst cases, at equal cost in classifier passes.
 
 In: scenes whose `optimize` settings say how a design is trained without mining, networks, seeds. Per cell a map of
 pose × light finds the tenth of its cells where the clean object fails most, on draws of the select stream with a seed
@@ -17,32 +17,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from patchproof.claims import difference, rate
 from patchproof.experiments.hard_views import training_conditions
-from patchproof.experiments.heat import heat_map
+from patchproof.experiments.heat import heat_map, map_ticks
 from patchproof.experiments.stress_map import (
-    Count,
     MapSettings,
-    ScenesSettings,
-    axes,
-    axes_said,
-    bits,
-    hits_of,
+    axes_of,
+    axes_values,
     in_cells,
-    judge,
     map_of,
-    problem_of,
-    scene_cells,
+    mesh_cells,
     worst_cells,
 )
-from patchproof.optimizer.loop import SELECT_VIEWS, best_design, selections
+from patchproof.optimizer import loop
+from patchproof.optimizer.loop import best_design, selections
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import Shown
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
+from patchproof.study.grid import Count, GridSettings, grouped, of_values, problem_of, who, with_tables
+from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 
 FORWARD, BOTH = 1, 3  # thirds of a pass: going back takes two products of matrices where going forward takes one
@@ -50,41 +46,40 @@ _CHOOSING, _MEASURING = 1_000_003, 2_000_003  # added to seeds, so that a seed's
 _THINGS = ("clean", "plain", "mined")
 
 
-class MiningSettings(ScenesSettings):
-    """How much is tried, and how much measures."""
+class MiningSettings(GridSettings):
+    """Two designs per cell, one of them trained on mined views."""
 
     map: MapSettings = MapSettings(n=16)  # what finds the worst cells
     mine: Count = 240  # conditions that are tried before mined training
-    n: Count = 60  # draws per worst cell that measure
+    n: Count = 60  # draws in each worst cell that measure
     n_all: Count = 200  # draws over the whole ranges that measure
 
 
 def cells(settings: MiningSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed."""
-    return scene_cells(settings, base)
+    return mesh_cells(settings, base)
 
 
 def run(settings: MiningSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Map, train twice, measure."""
-    plain, seed = problem_of(cell, base), cell.values["seed"]
-    steps_of_mined = equal_steps(plain.scene.settings.optimize, settings.mine)
-    mined = problem_of(cell, base, steps=steps_of_mined)
-    both = axes(plain.scene.settings, settings.map)
-    hits, confidence = map_of(plain, both, plain.scene.draw("select", settings.map.n, seed + _CHOOSING))
+    plain, seed = problem_of(base, cell.values), cell.values["seed"]
+    usual = plain.scene.settings.optimize
+    fewer = usual.changed(steps=equal_steps(usual, settings.mine))
+    mined = problem_of(base, with_tables(dict(cell.values), {"optimize": {"steps": fewer.steps}}))
+    axes = axes_of(plain.scene.settings, settings.map)
+    hits, confidence = map_of(plain, axes, plain.scene.draw("select", settings.map.n, seed + _CHOOSING))
     worst = worst_cells(hits, confidence, plain.scene.settings.target.goal)
     things = {"clean": None, "plain": _trained(plain), "mined": _trained(mined, settings.mine)}
     drawn = plain.scene.draw("evaluate", settings.n * len(worst) + settings.n_all, seed + _MEASURING)
+    in_worst, over_all = drawn[: settings.n * len(worst)], drawn[settings.n * len(worst) :]
     return {
-        "axes": axes_said(both),
+        "axes": axes_values(axes),
         "rates": hits.mean(2).tolist(),
-        "worst": [list(one) for one in worst],
-        "steps": {"plain": plain.scene.settings.optimize.steps, "mined": steps_of_mined},
-        "passes": {
-            "plain": passes(plain.scene.settings.optimize),
-            "mined": passes(mined.scene.settings.optimize, settings.mine),
-        },
-        "in_worst": _hits(plain, things, in_cells(drawn[: settings.n * len(worst)], both, worst)),
-        "over_all": _hits(plain, things, drawn[settings.n * len(worst) :]),
+        "worst": [list(place) for place in worst],
+        "steps": [usual.steps, fewer.steps],
+        "passes": [passes(usual), passes(fewer, settings.mine)],
+        "in_worst": recorded(responses(plain, things, in_cells(in_worst, axes, worst))),
+        "over_all": recorded(responses(plain, things, over_all)),
     }
 
 
@@ -96,13 +91,13 @@ def passes(settings: OptimizeSettings, tries: int = 0) -> float:
 def equal_steps(plain: OptimizeSettings, mine: int) -> int:
     """The most steps with which mined training costs no more than training without."""
     for count in range(plain.steps, 0, -1):
-        if _thirds(plain.model_copy(update={"steps": count}), mine) <= _thirds(plain, 0):
+        if _thirds(plain.changed(steps=count), mine) <= _thirds(plain, 0):
             return count
     raise Refused(f"a training that costs more than {mine} tries", f"{plain.steps} steps", "raise steps or lower mine")
 
 
 def _thirds(settings: OptimizeSettings, tries: int) -> int:
-    forward = selections(settings) * SELECT_VIEWS + tries
+    forward = selections(settings) * loop.SELECT_VIEWS + tries
     return BOTH * settings.steps * settings.views + FORWARD * forward
 
 
@@ -112,68 +107,56 @@ def _trained(problem: Problem, tries: int = 0) -> Shown:
     return problem.subject.shown(from_pixels(best_design(problem, conditions), problem.device))
 
 
-def _hits(problem: Problem, things: dict[str, Shown], conditions: Conditions) -> dict[str, str]:
-    return {name: bits(said.recognized) for name, said in judge(problem, things, conditions).items()}
-
-
 def tables(settings: MiningSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """The lift in the worst cells and over all, per scene, network and seed; and pooled over seeds."""
     head = ("scene", "network", "seed", "steps", "steps mined", "passes", "passes mined")
-    head = (*head, "clean", "not mined", "mined", "mined - not mined")
-    share = "the worst tenth of the cells of pose × light, chosen on other draws"
-    rows = {where: tuple(_row(one, where) for one in results) for where in ("in_worst", "over_all")}
+    rates = ("clean", "not mined", "mined", "mined - not mined")
+    pooled = grouped(results, of_values("name", "network"))
     return (
-        Table("worst", "In the clean object's worst cells", head, rows["in_worst"], f"Rates in {share}."),
-        Table("all", "Over the whole ranges", head, rows["over_all"], "What mining costs or brings elsewhere."),
+        Table(
+            "worst",
+            "In the clean object's worst cells",
+            (*head, *rates),
+            tuple(_row(result, "in_worst") for result in results),
+            "Rates in the worst tenth of the cells of pose × light, chosen on other draws.",
+        ),
+        Table(
+            "all",
+            "Over the whole ranges",
+            (*head, *rates),
+            tuple(_row(result, "over_all") for result in results),
+            "What mining costs or brings elsewhere.",
+        ),
         Table(
             "pooled",
             "Worst cells, seeds together",
-            ("scene", "network", "seeds", *head[-4:]),
-            tuple(_pooled(results)),
+            ("scene", "network", "seeds", *rates),
+            tuple((*key, len(group), *_compared(group, "in_worst")) for key, group in pooled.items()),
             "All seeds' conditions in one; differences are paired by condition.",
         ),
     )
 
 
-def _row(one: Result, where: str) -> tuple:
-    values, found = one.cell.values, one.found
-    costs = (*found["steps"].values(), *found["passes"].values())
-    return (values["scene"], values["network"], values["seed"], *costs, *_compared([one], where))
-
-
-def _pooled(results: Sequence[Result]):
-    for scene, network in dict.fromkeys((one.cell.values["scene"], one.cell.values["network"]) for one in results):
-        those = [one for one in results if (one.cell.values["scene"], one.cell.values["network"]) == (scene, network)]
-        yield (scene, network, len(those), *_compared(those, "in_worst"))
+def _row(result: Result, where: str) -> tuple:
+    return (*who(result), *result.answers["steps"], *result.answers["passes"], *_compared([result], where))
 
 
 def _compared(results: Sequence[Result], where: str) -> tuple:
     """(clean, not mined, mined, mined - not mined)."""
-    clean, plain, mined = ([hit for one in results for hit in hits_of(one.found[where][thing])] for thing in _THINGS)
-    return rate(clean), rate(plain), rate(mined), difference(mined, plain)
+    clean, plain, mined = (Record(results, thing, where) for thing in _THINGS)
+    return *(record.level()[0] for record in (clean, plain, mined)), mined.gain(plain)[0]
 
 
 def figures(settings: MiningSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
     """The clean object's map with the worst cells framed, per cell of the study."""
-    return tuple(
-        heat_map(
-            f"map_{one.cell.name}",
-            f"{one.cell.values['scene']}, {one.cell.values['network']}, seed {one.cell.values['seed']}: clean object",
-            one.found["axes"],
-            one.found["rates"],
-            settings.map.n,
-            one.found["worst"],
-        )
-        for one in results
-    )
+    caption = f"rate, n = {settings.map.n} draws per cell; framed: the worst tenth"
+    drawings = []
+    for result in results:
+        title = "{}, {}, seed {}: clean object".format(*who(result))
+        answers, name = result.answers, f"map_{result.cell.name}"
+        ticks = map_ticks(answers["axes"])
+        drawings.append(heat_map(name, (title, caption), answers["rates"], answers["worst"], ticks))
+    return tuple(drawings)
 
 
-STUDY = Study(
-    "mining",
-    "Designs trained with and without mining of the clean object's worst cases, at equal cost in classifier passes.",
-    MiningSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("mining", MiningSettings, cells, run, tables, figures)

@@ -1,4 +1,4 @@
-"""The classic 2D patch with the assistive goal: what it gains on its class, and what it does to every other class.
+"""The classic 2D patch with the assistive goal: its gain on its class, its harm on every other.
 
 In: labeled images, scenes whose clean object is rendered where no photographs of a class exist, or both; networks,
 seeds. A cell is a target, a network and a seed: a patch of `made_px` texels a side is optimized on images of the target
@@ -17,194 +17,143 @@ from __future__ import annotations
 
 import itertools
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
 
 from patchproof.channel.printer import load_printer
-from patchproof.claims import Estimate, difference, rate
+from patchproof.claims import clustered, difference, rate
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.experiments.image_classes import ImageClass, classes_of, render_class
+from patchproof.experiments.image_classes import ImageClass, PastedSettings, class_scene, classes_of
+from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, expose
+from patchproof.optimizer.responses import responses
+from patchproof.render.photograph import Shown
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.image_scene import SPLIT_FROM, ImageScene, largest_share, load_image_scene
-from patchproof.settings import (
-    BackgroundSettings,
-    CameraSettings,
-    ObjectSettings,
-    OptimizeSettings,
-    PatchSettings,
-    PrinterSettings,
-    SceneSettings,
-    TargetSettings,
-    ViewSettings,
-)
-from patchproof.sheets.piece import Piece
-from patchproof.strict import Positive, PositiveRange, Range, Refused, Share, Strict, expand, nearest
+from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
+from patchproof.scene.scene import Scene
+from patchproof.strict import Refused, expand, nearest
+from patchproof.study.figures import number_grid, picture_sheet
+from patchproof.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
+from patchproof.study.pictures import contact_sheet, enlarged, photographs
+from patchproof.study.record import hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
-from patchproof.study.trials import clustered, enlarged, grouped, logits_of, png_of, short
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 KINDS = ("bare", "grey", "noise", "patch")
+OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target
 _TILE_PX = 192
 
 
-class Patch2dSettings(Strict):
-    """Targets × models × seeds."""
+class Patch2dSettings(PastedSettings):
+    """Targets × networks × seeds."""
 
-    images: str | None = None  # a folder of images
-    labels: str | None = None  # CSV: file name, label
-    renders: tuple[str, ...] = ()  # scenes with meshes: each is one more class, its target's
-    renders_each: Annotated[int, Field(ge=2)] = 64  # images of each of them
-    targets: tuple[str | int, ...] = ()  # without any, every class
-    models: Annotated[tuple[str, ...], Field(min_length=1)]  # each trains and tests its own patches
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
-    conditions: Annotated[int, Field(ge=1)] = 200  # per class and cell
-    made_px: Annotated[int, Field(ge=8, le=512)] = 60  # side of the patch as it is optimized
-    shown_px: Positive = 30.0  # its side in the network's input
-    scale: PositiveRange = (0.8, 1.25)  # random, times shown_px
-    roll_deg: Range = (-22.5, 22.5)  # as in Brown et al.'s published program
-    erasing: Share = 0.5  # chance of Random Erasing in training
-    printer: PrinterSettings = PrinterSettings()
-    camera: CameraSettings = CameraSettings()
-    optimize: OptimizeSettings = OptimizeSettings()
-
-    @model_validator(mode="after")
-    def _has_images(self):
-        if (self.images is None) != (self.labels is None):
-            raise ValueError("takes images and labels together")
-        if self.images is None and not self.renders:
-            raise ValueError("takes images and labels, or renders, or both")
-        return self
+    targets: tuple[str | int, ...] = ()  # classes that patches are made for; without any, every class
+    networks: Names  # each trains alone
+    seeds: Seeds = (0,)  # of draws
+    n: Count = 200  # conditions per class and cell
 
 
 def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
-    """Targets × models × seeds; all targets with the first seed come first."""
-    known = [one.label for one in classes_of(settings.images, settings.labels, settings.renders, base)]
+    """Targets × networks × seeds; all targets with the first seed come first."""
+    renders = [scene_values(file, base) for file in settings.renders]
+    known = [each.label for each in classes_of(settings.images, settings.labels, renders, base)]
     targets = settings.targets or tuple(dict.fromkeys(known))
     for target in targets:
         if target not in known:
             raise Refused("a target that there are images of", f'"{target}"', nearest(str(target), map(str, known)))
-    return [
-        Cell(f"target{i}-{short(model)}-{seed}", {"target": target, "model": model, "seed": seed})
-        for seed, (i, target), model in itertools.product(settings.seeds, enumerate(targets), settings.models)
-    ]
+    cells = []
+    for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks):
+        name = short_name(network)
+        values = {"name": f"target{i}", "target": target, "networks": [network], "network": name, "renders": renders}
+        cells.append(cell_of(values, seed, name))
+    return cells
 
 
 def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """One patch, and every class with and without it."""
-    classifier = load_classifier(expand(cell.values["model"], base), base)
-    seed, classes = cell.values["seed"], classes_of(settings.images, settings.labels, settings.renders, base)
-    target = next(one for one in classes if one.label == cell.values["target"])
+    values, seed = cell.values, cell.values["seed"]
+    classifier = load_classifier(expand(values["networks"][0], base), base)
+    classes = classes_of(settings.images, settings.labels, values["renders"], base)
+    target = [each.label for each in classes].index(values["target"])
     with tempfile.TemporaryDirectory() as folder:
-        scenes = [class_scene(settings, base, one, classifier, seed, Path(folder)) for one in classes]
-    problem = problem_of(settings, base, scenes[classes.index(target)], classifier, target)
+        scenes = [class_scene(settings, base, each, classifier, seed, Path(folder)) for each in classes]
+    problem = flat_problem(settings, base, scenes[target], classifier, classes[target])
     design = best_design(problem)
-    shown = shown_with_controls(problem, design)
-    found = [_class_found(problem, one, scene, shown, settings) for one, scene in zip(classes, scenes, strict=True)]
+    shown = shown_by_kind(problem, design)
+    pairs = zip(classes, scenes, strict=True)
     return {
-        "classes": found,
-        "target": classes.index(target),
-        f"{cell.name}.png": png_of(_picture(problem, scenes, design, shown["patch"])),
+        "classes": [_answers(problem, each, scene, shown, settings.n) for each, scene in pairs],
+        "target": target,
+        f"{cell.name}.png": _picture(problem, scenes, design, shown["patch"]),
     }
 
 
-def class_scene(
-    settings: Patch2dSettings, base: Path, one: ImageClass, classifier: Classifier, seed: int, folder: Path
-) -> ImageScene:
-    """A scene of one class's images, in which the patch has no frame; renders are written to `folder`."""
-    images, table = settings.images, settings.labels
-    if one.scene is not None:
-        images, table = render_class(one, base, seed, settings.renders_each, folder)
-    scene = load_image_scene(scene_settings(settings, one, classifier, images, table), base, seed)
-    side = float(settings.made_px)
-    return replace(scene, piece=Piece((side, side), (0.0, 0.0, side, side), (), (), 1.0), sheet_id=f"patch2d:{seed}")
-
-
-def scene_settings(
-    settings: Patch2dSettings, one: ImageClass, classifier: Classifier, images: str, table: str
-) -> SceneSettings:
-    """A millimetre of the patch is one of its texels; its size in pictures follows from the network's own."""
-    side = settings.made_px
-    share = tuple(settings.shown_px * factor / classifier.input_px for factor in settings.scale)
-    largest = largest_share((side, side), settings.roll_deg)
-    if share[1] > largest:
-        raise Refused(
-            f"a patch of at most {largest * classifier.input_px:.0f} pixels before a network of {classifier.input_px}",
-            f"shown_px = {settings.shown_px:g} times {settings.scale[1]:g}",
-            "show it smaller",
-        )
-    return SceneSettings(
-        object=ObjectSettings(images=images, labels=table),
-        patch=PatchSettings(width_mm=side, height_mm=side),
-        target=TargetSettings(label=one.label, accept=one.accept, models=(classifier.name,)),
-        view=ViewSettings(patch_share=share, roll_deg=settings.roll_deg),
-        background=BackgroundSettings(erasing=settings.erasing),
-        printer=settings.printer,
-        camera=settings.camera,
-        optimize=settings.optimize,
-    )
-
-
-def problem_of(
-    settings: Patch2dSettings, base: Path, scene: ImageScene, classifier: Classifier, one: ImageClass
+def flat_problem(
+    settings: Patch2dSettings, base: Path, scene: ImageScene, classifier: Classifier, images_of: ImageClass
 ) -> Problem:
     """A patch on images of its class."""
     stage, printer = set_stage(scene), load_printer(settings.printer.profile, base)
     subject = Patch(scene, printer, (settings.made_px, settings.made_px), stage.device)
-    return Problem(scene, stage, printer, (classifier,), (_indices(classifier, one),), subject)
+    loss = partial(target_loss, goal=scene.settings.target.goal)
+    return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, loss)
 
 
-def shown_with_controls(problem: Problem, design: np.ndarray) -> dict[str, Shown]:
-    """What is pasted, by `KINDS`."""
-    subject = problem.subject
-    pixels = {"patch": design} | {kind: subject.control(kind, design) for kind in ("grey", "noise")}
+def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Shown]:
+    """What is pasted, by `KINDS`; controls have no markers of their own."""
+    shown: dict[str, Shown] = {"bare": None}
     with torch.no_grad():
-        shown = {kind: subject.shown(from_pixels(one)) for kind, one in pixels.items()}
-    return {kind: (shown | {"bare": None})[kind] for kind in KINDS}
+        for kind in KINDS[1:]:
+            pixels = design if kind == "patch" else problem.subject.control(kind, design)
+            shown[kind] = problem.subject.shown(from_pixels(pixels))
+    return shown
 
 
-def _class_found(
-    problem: Problem, one: ImageClass, scene: ImageScene, shown: dict[str, Shown], settings: Patch2dSettings
+def _on(problem: Problem, scene: Scene) -> Problem:
+    """The patch on other images."""
+    return replace(problem, scene=scene, stage=set_stage(scene))
+
+
+def _answers(
+    problem: Problem, images_of: ImageClass, scene: ImageScene, shown: Mapping[str, Shown], n: int
 ) -> dict[str, Any]:
     """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
-    classifier, own, target = problem.classifiers[0], _indices(problem.classifiers[0], one), problem.indices[0]
-    logits = logits_of(
-        replace(problem, scene=scene, stage=set_stage(scene)), shown, scene.draw("evaluate", settings.conditions)
-    )
+    (classifier,), (target,) = problem.classifiers, problem.indices
+    own = _indices(classifier, images_of)
+    both = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
     return {
-        "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if one.scene else ""),
+        "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
         "images": len(scene.images),
         "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
-        "recognized": {kind: classifier.recognized(values, own).tolist() for kind, values in logits.items()},
-        "called_target": {kind: classifier.recognized(values, target).tolist() for kind, values in logits.items()},
+        "hits": recorded(responses(both, shown, scene.draw("evaluate", n)))["hits"],
     }
 
 
-def _indices(classifier: Classifier, one: ImageClass) -> tuple[int, ...]:
-    return find_labels(classifier.labels, one.label, one.accept)
+def _indices(classifier: Classifier, images_of: ImageClass) -> tuple[int, ...]:
+    return find_labels(classifier.labels, images_of.label, images_of.accept)
 
 
-def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Shown) -> np.ndarray:
+def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Shown) -> bytes:
     """Side by side: the patch, an image of its class with it, and up to three of other classes."""
-    tiles = [enlarged(design, _TILE_PX)]
-    others = [scene for scene in scenes if scene is not problem.scene][:3]
-    with torch.no_grad():
-        for scene in (problem.scene, *others):
-            one = replace(problem, scene=scene, stage=set_stage(scene))
-            tiles.append(as_pixels(expose(one.see(shown, scene.draw("evaluate", 1), _TILE_PX), shown)[0]))
-    return np.concatenate(tiles, 1)
+    worlds = (problem, *(_on(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
+    tiles = [photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0] for world in worlds]
+    return contact_sheet([[enlarged(design, _TILE_PX), *tiles]])
+
+
+Class = Mapping[str, Any]  # what a cell found of one class
 
 
 def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
@@ -214,20 +163,12 @@ def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
 
 def _gains(results: Sequence[Result]) -> Table:
     rows = []
-    for (_, model), ones in _by_target(results):
-        mine = [one.found["classes"][one.found["target"]] for one in ones]
-        hits = {kind: _joined(mine, "recognized", kind) for kind in KINDS}
-        rows.append(
-            (
-                mine[0]["name"],
-                short(model),
-                mine[0]["images"],
-                mine[0]["images"] >= SPLIT_FROM,
-                *(rate(hits[kind]) for kind in KINDS),
-                difference(hits["patch"], hits["bare"]),
-                difference(hits["patch"], hits["grey"]),
-            )
-        )
+    for (_, network), group in _by_target(results).items():
+        own = [_target(result) for result in group]
+        hits = {kind: _hits(own, kind, OWN) for kind in KINDS}
+        start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= SPLIT_FROM)
+        gains = (difference(hits["patch"], hits[control]) for control in ("bare", "grey"))
+        rows.append((*start, *(rate(hits[kind]) for kind in KINDS), *gains))
     about = (
         "Recognition of images of the patch's own class, seeds together. Where images are not held out, these are the"
         " images that the patch was made with, at new places. Classes marked as renders show renders of an object over"
@@ -239,26 +180,17 @@ def _gains(results: Sequence[Result]) -> Table:
 
 def _harm(results: Sequence[Result]) -> Table:
     rows = []
-    for (_, model), ones in _by_target(results):
-        target = ones[0].found["classes"][ones[0].found["target"]]["name"]
-        for i, other in enumerate(ones[0].found["classes"]):
+    for (_, network), group in _by_target(results).items():
+        for i, other in enumerate(group[0].answers["classes"]):
             if other["same"]:
                 continue
-            mine = [one.found["classes"][i] for one in ones]
-            own = {kind: _joined(mine, "recognized", kind) for kind in KINDS}
-            called = {kind: _joined(mine, "called_target", kind) for kind in KINDS}
-            rows.append(
-                (
-                    target,
-                    short(model),
-                    other["name"],
-                    *(rate(own[kind]) for kind in ("bare", "grey", "patch")),
-                    difference(own["patch"], own["bare"]),
-                    difference(own["patch"], own["grey"]),
-                    rate(called["patch"]),
-                    difference(called["patch"], called["bare"]),
-                )
-            )
+            of_class = [result.answers["classes"][i] for result in group]
+            own = {kind: _hits(of_class, kind, OWN) for kind in KINDS}
+            called, usual = (_hits(of_class, kind, TARGET) for kind in ("patch", "bare"))
+            rates = (rate(own[kind]) for kind in ("bare", "grey", "patch"))
+            harm = (difference(own["patch"], own[control]) for control in ("bare", "grey"))
+            start = (_target(group[0])["name"], network, other["name"])
+            rows.append((*start, *rates, *harm, rate(called), difference(called, usual)))
     about = (
         "Images of another class with the same patch. Recognized means its own labels; a negative difference is harm."
         " Called the target: the patch has made an adversarial example of it."
@@ -269,18 +201,17 @@ def _harm(results: Sequence[Result]) -> Table:
 
 
 def _pooled(results: Sequence[Result]) -> Table:
-    own, others = [], []
-    for _, ones in _by_target(results):
-        own.append([one.found["classes"][one.found["target"]] for one in ones])
-        others.append([other for one in ones for other in one.found["classes"] if not other["same"]])
+    groups = _by_target(results).values()
+    own = [[_target(result) for result in group] for group in groups]
+    others = [[each for result in group for each in result.answers["classes"] if not each["same"]] for group in groups]
     rows = []
-    for name, groups, field in (
-        ("target recognized", own, "recognized"),
-        ("other classes recognized", others, "recognized"),
-        ("other classes called the target", others, "called_target"),
+    for name, clusters, which in (
+        ("target recognized", own, OWN),
+        ("other classes recognized", others, OWN),
+        ("other classes called the target", others, TARGET),
     ):
-        groups = [group for group in groups if group]
-        rows.append((name, *(_clustered(groups, field, control) for control in ("bare", "grey", "noise"))))
+        controls = ([_effect(some, which, control) for some in clusters if some] for control in KINDS[:3])
+        rows.append((name, *map(clustered, controls)))
     about = (
         "Mean differences of rates over targets and networks; the interval is a bootstrap over these clusters, each"
         " with all its seeds, images and other classes; n counts clusters, and fewer than 5 get none."
@@ -291,88 +222,64 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
     """Heat maps of what each patch does to each class, and what was made."""
-    count, models = len(results[0].found["classes"]), list(dict.fromkeys(one.cell.values["model"] for one in results))
-    targets = len({one.cell.values["target"] for one in results})
-    firsts = [ones[0] for ones in grouped(results, lambda one: one.cell.values["target"]).values()]
-    size = (1.6 + 0.75 * count, 1.4 + (0.5 * targets + 0.6) * len(models))
-    about = "Rate with the patch minus rate without it, in points, by the image's own labels. Targets are framed."
+    count, networks = (
+        len(results[0].answers["classes"]),
+        list(dict.fromkeys(result.cell.values["network"] for result in results)),
+    )
+    firsts = [group[0] for group in grouped(results, of_values("target")).values()]
+    files = [(_target(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
         Drawing(
-            "effect", "What each patch does to each class", lambda f: _draw_effect(f, results, models), size, about
+            "effect",
+            "What each patch does to each class",
+            lambda figure: _draw_effect(figure, results, networks),
+            (1.6 + 0.75 * count, 1.4 + (0.5 * len(firsts) + 0.6) * len(networks)),
+            "Rate with the patch minus rate without it, in points, by the image's own labels. Targets are framed.",
         ),
-        Drawing(
+        picture_sheet(
             "patches",
             "Patches, and images with them",
-            lambda figure: _draw_patches(figure, firsts),
+            files,
             (7.0, 1.6 * len(firsts) + 0.3),
             "The patch, its own class, and other classes; first network and seed of each target.",
         ),
     ]
 
 
-def _draw_effect(figure, results: Sequence[Result], models: Sequence[str]) -> None:
-    panels = figure.subplots(len(models), 1, squeeze=False)[:, 0]
-    for axes, model in zip(panels, models, strict=True):
-        groups = [ones for (_, its), ones in _by_target(results) if its == model]
-        names = [one["name"] for one in results[0].found["classes"]]
-        values = np.array([[_effect(ones, i) for i in range(len(names))] for ones in groups]) * 100
-        axes.imshow(values, cmap="RdBu", vmin=-100, vmax=100, aspect="auto")
-        for row, ones in enumerate(groups):
-            for column in range(len(names)):
-                value = values[row, column]
-                color = "white" if abs(value) > 60 else "black"
-                mark = "bold" if ones[0].found["classes"][column]["same"] else "normal"
-                axes.text(column, row, f"{value:+.0f}", ha="center", va="center", color=color, weight=mark)
-                if mark == "bold":
-                    axes.add_patch(_frame(row, column))
-        axes.set_xticks(range(len(names)), [name.replace(" (", "\n(") for name in names], fontsize=7)
-        axes.set_yticks(range(len(groups)), [names[ones[0].found["target"]] for ones in groups], fontsize=7)
+def _draw_effect(figure: Figure, results: Sequence[Result], networks: Sequence[str]) -> None:
+    panels = figure.subplots(len(networks), 1, squeeze=False)[:, 0]
+    classes = results[0].answers["classes"]
+    for axes, network in zip(panels, networks, strict=True):
+        groups = [group for (_, of_group), group in _by_target(results).items() if of_group == network]
+        values, framed = np.zeros((len(groups), len(classes))), []
+        for row, group in enumerate(groups):
+            for column in range(len(classes)):
+                of_class = [result.answers["classes"][column] for result in group]
+                values[row, column] = 100 * _effect(of_class, OWN, "bare")
+                framed += [(row, column)] if of_class[0]["same"] else []
+        texts = [[f"{value:+.0f}" for value in row] for row in values]
+        number_grid(axes, values, texts, framed, "RdBu", (-100, 100))
+        axes.set_xticks(range(len(classes)), [each["name"].replace(" (", "\n(") for each in classes], fontsize=7)
+        axes.set_yticks(range(len(groups)), [_target(group[0])["name"] for group in groups], fontsize=7)
         axes.set_ylabel("patch for")
-        axes.set_title(f"{short(model)}: images of", fontsize=9)
+        axes.set_title(f"{network}: images of", fontsize=9)
 
 
-def _frame(row: int, column: int):
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((column - 0.48, row - 0.46), 0.96, 0.92, fill=False, linewidth=1.2)
-
-
-def _draw_patches(figure, firsts: Sequence[Result]) -> None:
-    from matplotlib.image import imread
-
-    for i, one in enumerate(firsts):
-        axes = figure.add_subplot(len(firsts), 1, i + 1)
-        axes.imshow(imread(one.out / one.found[f"{one.cell.name}.png"]))
-        axes.set_title(one.found["classes"][one.found["target"]]["name"], loc="left")
-        axes.axis("off")
+def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:
+    """Seeds together: results by (target, network)."""
+    return grouped(results, of_values("target", "network"))
 
 
-def _by_target(results: Sequence[Result]) -> list[tuple[tuple[str | int, str], list[Result]]]:
-    """Seeds together: ((target, network), results)."""
-    return list(grouped(results, lambda one: (one.cell.values["target"], one.cell.values["model"])).items())
+def _target(result: Result) -> Class:
+    return result.answers["classes"][result.answers["target"]]
 
 
-def _effect(ones: Sequence[Result], index: int) -> float:
-    mine = [one.found["classes"][index] for one in ones]
-    return float(np.mean(_joined(mine, "recognized", "patch")) - np.mean(_joined(mine, "recognized", "bare")))
+def _hits(classes: Sequence[Class], kind: str, which: int) -> list[bool]:
+    return [hit for each in classes for hit in hits_of(each["hits"][kind][which])]
 
 
-def _joined(found: Sequence[dict], field: str, kind: str) -> list[bool]:
-    return [hit for one in found for hit in one[field][kind]]
+def _effect(classes: Sequence[Class], which: int, control: str) -> float:
+    return float(np.mean(_hits(classes, "patch", which)) - np.mean(_hits(classes, control, which)))
 
 
-def _clustered(groups: Sequence[Sequence[dict]], field: str, control: str) -> Estimate | float | None:
-    return clustered(
-        [np.mean(_joined(group, field, "patch")) - np.mean(_joined(group, field, control)) for group in groups]
-    )
-
-
-STUDY = Study(
-    "patch2d",
-    "The classic 2D patch with the assistive goal: its gain on its class, its harm on every other.",
-    Patch2dSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("patch2d", Patch2dSettings, cells, run, tables, figures)

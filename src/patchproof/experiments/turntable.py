@@ -1,6 +1,6 @@
 """The object all round and from three sides: pictures to look at, mean colors, and what a network looks at.
 
-In: a problem and what shows. Out: contact sheets as PNG bytes, a mean color, attributions. Turntable views have even
+In: a problem and what shows. Out: views and pictures of a turn, a mean color, attributions. Turntable views have even
 light and a still camera; they are for eyes and are never counted as a rate. Attributions are integrated gradients
 (Sundararajan et al., ICML 2017, equation 1) from the original's picture to the design's: they add up to the change of
 the log of the target's confidence, so that they say what of the change did it.
@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from patchproof.channel.effects import EFFECT, Light, Pose, Sensor
-from patchproof.color import codes_of, srgb_from_linear
+from patchproof.color import srgb_from_linear
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, expose, shade
-from patchproof.report.images import png
+from patchproof.render.photograph import Shown, shade
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.mesh_scene import MeshScene
+from patchproof.study.pictures import photographs
 
 _PATH_STEPS = 24  # of the integral; builtin's attributions then add up to within a few percent
 
@@ -57,19 +57,7 @@ def three_views(problem: Problem, lights: int) -> Conditions:
 
 def turn(problem: Problem, shown: Shown, views: int, side_px: int) -> Tensor:
     """N×3×S×S pictures of a full turn."""
-    return pictures(problem, shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
-
-
-def pictures(problem: Problem, shown: Shown, conditions: Conditions, side_px: int) -> Tensor:
-    """N×3×S×S photographs of one thing."""
-    with torch.no_grad():
-        return expose(problem.see(shown, conditions, side_px), shown)
-
-
-def contact_sheet(rows: list[Tensor]) -> bytes:
-    """Pictures N×3×S×S, one row each, as one PNG."""
-    lines = [torch.cat(list(row), 2) for row in rows]
-    return png(codes_of(torch.cat(lines, 1)).permute(1, 2, 0).cpu().numpy())
+    return photographs(problem, shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
 
 
 def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
@@ -77,7 +65,8 @@ def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tupl
     seen = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
     with torch.no_grad():
         light = shade(seen, shown).permute(0, 2, 3, 1).reshape(-1, 3)[seen.on_object.pixel]
-    return tuple(codes_of(srgb_from_linear(light.double().mean(0))).tolist())
+    red, green, blue = (srgb_from_linear(light.double().mean(0)) * 255).round().clamp(0, 255).int().tolist()
+    return red, green, blue
 
 
 def attributions(problem: Problem, before: Tensor, after: Tensor) -> Tensor:

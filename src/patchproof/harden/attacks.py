@@ -98,11 +98,12 @@ def even_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) ->
     """
     with torch.enable_grad():
         leaves = [one.detach().double().requires_grad_(True) for one in logits]
-        total = sum(loss(one, truth).sum() for one, truth in zip(leaves, labels, strict=True))
+        total = torch.stack([loss(one, truth).sum() for one, truth in zip(leaves, labels, strict=True)]).sum()
         slopes = torch.autograd.grad(total, leaves)
         largest = torch.stack([slope.abs().amax(1) for slope in slopes]).amax(0)
         largest = torch.where(largest > 0, largest, 1)
-        return sum((one * (slope / largest[:, None])).sum() for one, slope in zip(logits, slopes, strict=True))
+        pairs = zip(logits, slopes, strict=True)
+        return torch.stack([(one * (slope / largest[:, None])).sum() for one, slope in pairs]).sum()
 
 
 def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: Loss) -> Tensor:

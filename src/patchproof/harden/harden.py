@@ -19,10 +19,11 @@ al., Adversarial Examples in the Physical World, 2017 (iterated FGSM).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from pydantic import BeforeValidator
 from torch import Tensor
 
 from patchproof.classifier.network import Classifier
@@ -33,6 +34,31 @@ Method = Literal["pgd", "fgsm", "adam"]
 # Without ε. Of 11 photographs hardened in 50 steps against a MobileNetV1 0.25, PGD of 0.01 left, with steps of 0.03 and
 # of 0.1 that do not fall, 3 and 0; with falling ones 3 and 11. At ε = 0.1, FGSM left 6 without and 11 with the fall.
 UNBOUNDED_STEP = 0.1
+
+
+def _epsilon(value: Any) -> float | None:
+    """0.03, "0.03", "8/255" or "none"."""
+    if value is None or value == "none":
+        return None
+    numerator, _, denominator = str(value).partition("/")
+    try:
+        epsilon = float(numerator) / float(denominator or 1)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError('must be a number, such as 0.03 or "8/255", or "none"') from None
+    if not 1 / 255 - 1e-9 <= epsilon <= 1:
+        raise ValueError("must be from 1/255 to 1: 8-bit images cannot hold less")
+    return epsilon
+
+
+Epsilon = Annotated[float | None, BeforeValidator(_epsilon)]
+
+
+def epsilon_words(epsilon: float | None) -> str:
+    """ε as it is written: in code values of 255 where it is a whole number of them."""
+    if epsilon is None:
+        return "none"
+    codes = epsilon * 255
+    return f"{codes:.0f}/255" if abs(codes - round(codes)) < 1e-6 else f"{epsilon:g}"
 
 
 def harden(

@@ -1,23 +1,21 @@
 """Evaluate a run again: fresh conditions, its controls, and networks it was not optimized with.
 
 In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control. Conditions
-come from the evaluate stream, which neither training nor the promise has seen. They are seen in parts of `CHUNK`, by
-this process or by others, each of which opens the run for itself.
+come from the evaluate stream, which neither training nor the promise has seen. They are seen a few at a time, by this
+process or by others, each of which opens the run for itself.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from patchproof.claims import wilson
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CHUNK, PROMISE_VIEWS, Outcomes, control_claims, try_out
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, shown_with_controls
+from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined, responses
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import write_whole
 from patchproof.scene.conditions import Conditions
@@ -39,22 +37,14 @@ def evaluate_run(
     folder = Path(run_folder).resolve()
     with open_workers(jobs, cluster) as workers:
         run, problem = _opened(folder, models, device)
-        conditions = run.scene.draw("evaluate", n, seed)
-        parts = [conditions[first : first + CHUNK] for first in range(0, n, CHUNK)]
-        try_part = partial(_try_part, folder, models, device)
-        tried = workers.map(try_part, parts, lambda done, _: on_view(min(done * CHUNK, n), n))
+        parts = in_parts(run.scene.draw("evaluate", n, seed))
+        show = partial(_show, folder, models, device)
+        answers = joined(workers.map(show, parts, lambda done, _: on_view(min(done * AT_A_TIME, n), n)))
     _opened.cache_clear()
-    outcomes = Outcomes(*(_joined(part) for part in zip(*tried, strict=True)), conditions)
     result = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
-    for i, classifier in enumerate(problem.classifiers):
-        recognized = outcomes.recognized["design"][i]
-        result["models"][classifier.name] = {
-            "sha256": classifier.sha256,
-            "rate": float(recognized.mean()),
-            "interval": wilson(int(recognized.sum()), n),
-            "confidence": float(outcomes.confidence["design"][i].mean()),
-            "controls": {kind: claim.model_dump() for kind, claim in control_claims(outcomes, i).items()},
-        }
+    for i, claim in enumerate(model_claims(problem, answers)):
+        controls = {kind: control.model_dump() for kind, control in control_claims(answers, i).items()}
+        result["models"][claim.name] = claim.model_dump(exclude={"name"}) | {"controls": controls}
     write_whole(
         run.folder / "evaluate.json", lambda path: path.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
     )
@@ -68,11 +58,6 @@ def _opened(folder: Path, models: tuple[str, ...] | None, device: str) -> tuple[
     return run, set_problem(run.scene, device, models)
 
 
-def _try_part(folder: Path, models, device: str, conditions: Conditions) -> tuple[dict, dict]:
+def _show(folder: Path, models: tuple[str, ...] | None, device: str, conditions: Conditions) -> dict[str, Answers]:
     run, problem = _opened(folder, models, device)
-    outcomes = try_out(problem, run.design, conditions)
-    return outcomes.recognized, outcomes.confidence
-
-
-def _joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {kind: np.concatenate([part[kind] for part in parts], -1) for kind in parts[0]}
+    return responses(problem, shown_with_controls(problem, run.design, CONTROLS), conditions)

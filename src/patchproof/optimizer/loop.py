@@ -79,6 +79,11 @@ def selections(settings: OptimizeSettings) -> int:
     return sum(selects(settings, number) for number in range(1, settings.steps + 1))
 
 
+def views_seen(settings: OptimizeSettings) -> int:
+    """Views that each network sees in training and selection."""
+    return settings.steps * settings.views + selections(settings) * SELECT_VIEWS
+
+
 def steps(problem: Problem, state: State | None = None, conditions: Conditions | None = None) -> Iterator[Step]:
     """The steps from `state` (or from the start) to the last one that the scene's settings ask for; `conditions` of all
     steps, `views` rows each, in place of the draws of the train stream.

@@ -1,17 +1,15 @@
 """The promise: what rate the finished design will reach on conditions that nobody has looked at yet, beside its
 controls.
 
-In: a `Problem`, the design's pixels, and a stream of conditions. Out: `Outcomes` (per classifier and control, per
-condition) and from them the manifest's `Promise`. Controls are shown on the very same conditions, so that differences
-are paired: the bare object, and a mean-color, a gray and a noise design in the same printed frame. The set is drawn and
-looked at once, after the design is frozen.
+In: a `Problem`, the design's pixels, and conditions. Out: the manifest's `Promise`. Controls are shown on the very same
+conditions, so that differences are paired: the bare object, and a mean-color, a gray and a noise design in the same
+printed frame. The set is drawn and looked at once, after the design is frozen.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,153 +19,101 @@ from patchproof.claims import paired_difference, wilson
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, expose
+from patchproof.optimizer.responses import Answers, responses
+from patchproof.render.photograph import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 PROMISE_VIEWS = 400  # the Wilson interval of a rate of 0.9 is then 6 points wide
 CONTROLS = ("bare", "mean", "grey", "noise")
-CHUNK = 4  # views at a time: before a small network 16 took 1.4 times as long, out of the cache
 
 
-@dataclass(frozen=True)
-class Outcomes:
-    """Per shown thing ("design" and the controls): recognized M×N and confidence M×N, M classifiers, N conditions."""
-
-    recognized: dict[str, np.ndarray]
-    confidence: dict[str, np.ndarray]
-    conditions: Conditions
-
-
-def try_out(
+def make_promise(
     problem: Problem,
     design: np.ndarray,
     conditions: Conditions,
-    progress: Callable[[int], None] = lambda n: None,
     controls: Sequence[str] = CONTROLS,
-) -> Outcomes:
-    """Show the design and its controls under every condition to every classifier."""
-    return judged(problem, shown_with_controls(problem, design, controls), conditions, progress)
+    on_views: Callable[[int], None] = lambda n: None,
+) -> Promise:
+    """Show the design and its controls; rate, interval and controls are those of the primary (first) network."""
+    answers = responses(problem, shown_with_controls(problem, design, controls), conditions, on_views=on_views)
+    models = model_claims(problem, answers)
+    target = problem.scene.settings.target
+    return Promise(
+        target=Target(label=str(target.label), indices=problem.indices[0], goal=target.goal),
+        models=models,
+        rate=models[0].rate,
+        interval=models[0].interval,
+        n=len(conditions),
+        controls=control_claims(answers, 0),
+        conditions=_condition_claims(problem, conditions, answers["design"].recognized[0]),
+    )
 
 
 def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Shown]:
     """What shows under "design" and under each control's name."""
-    subject, device = problem.subject, problem.device
-    pixels = {"design": design} | {kind: subject.control(kind, design) for kind in controls if kind != "bare"}
+    subject, shown = problem.subject, {}
     with torch.no_grad():
-        shown = {kind: subject.shown(from_pixels(one, device), kind) for kind, one in pixels.items()}
-    return {kind: shown.get(kind) for kind in ("design", *controls)}
+        for kind in ("design", *controls):
+            pixels = design if kind in ("design", "bare") else subject.control(kind, design)
+            shown[kind] = None if kind == "bare" else subject.shown(from_pixels(pixels, problem.device), kind)
+    return shown
 
 
-def judged(
-    problem: Problem,
-    shown: Mapping[str, Shown],
-    conditions: Conditions,
-    progress: Callable[[int], None] = lambda n: None,
-) -> Outcomes:
-    """Show each thing (None is the bare object) under every condition to every classifier."""
-    first_shown = next((one for one in shown.values() if one is not None), None)
-    parts: dict[str, list] = {kind: [] for kind in shown}
-    with torch.no_grad():
-        for first in range(0, len(conditions), CHUNK):
-            part = conditions[first : first + CHUNK]
-            seen = problem.see(first_shown, part, problem.figure_px)
-            for kind, one in shown.items():
-                parts[kind].append(_judge(problem, expose(seen, one)))
-            progress(len(part))
-    joined = {kind: np.concatenate(part, -1) for kind, part in parts.items()}  # 2×M×N
-    recognized = {kind: both[0] > 0.5 for kind, both in joined.items()}
-    return Outcomes(recognized, {kind: both[1] for kind, both in joined.items()}, conditions)
-
-
-def promise_from(problem: Problem, outcomes: Outcomes) -> Promise:
-    """The manifest's promise; rate and controls are those of the primary (first) classifier."""
-    recognized, n = outcomes.recognized["design"], len(outcomes.conditions)
-    models = []
-    for i, classifier in enumerate(problem.classifiers):
-        models.append(
-            ModelClaim(
-                name=classifier.name,
-                sha256=classifier.sha256,
-                rate=float(recognized[i].mean()),
-                interval=wilson(int(recognized[i].sum()), n),
-                confidence=float(outcomes.confidence["design"][i].mean()),
-            )
+def model_claims(problem: Problem, answers: Mapping[str, Answers]) -> tuple[ModelClaim, ...]:
+    """Each network's rate and confidence of the design."""
+    rows = zip(problem.classifiers, answers["design"].recognized, answers["design"].confidence, strict=True)
+    return tuple(
+        ModelClaim(
+            name=classifier.name,
+            sha256=classifier.sha256,
+            rate=float(recognized.mean()),
+            interval=wilson(int(recognized.sum()), len(recognized)),
+            confidence=float(confidence.mean()),
         )
-    settings = problem.scene.settings.target
-    target = Target(label=str(settings.label), indices=problem.indices[0], goal=settings.goal)
-    return Promise(
-        target=target,
-        models=tuple(models),
-        rate=models[0].rate,
-        interval=models[0].interval,
-        n=n,
-        controls=control_claims(outcomes, 0),
-        conditions=_condition_claims(problem, outcomes),
+        for classifier, recognized, confidence in rows
     )
 
 
-def control_claims(outcomes: Outcomes, model: int) -> dict[str, ControlClaim]:
-    """Each control beside the design on the same conditions, for one classifier."""
-    design, claims = outcomes.recognized["design"][model], {}
-    for kind in (kind for kind in CONTROLS if kind in outcomes.recognized):
-        control = outcomes.recognized[kind][model]
-        difference, interval = paired_difference(design.tolist(), control.tolist())
+def control_claims(answers: Mapping[str, Answers], model: int) -> dict[str, ControlClaim]:
+    """Each control beside the design on the same conditions, for one network."""
+    design, claims = answers["design"].recognized[model], {}
+    for kind in (kind for kind in CONTROLS if kind in answers):
+        recognized = answers[kind].recognized[model]
+        difference, interval = paired_difference(design.tolist(), recognized.tolist())
         claims[kind] = ControlClaim(
-            rate=float(control.mean()),
-            interval=wilson(int(control.sum()), len(control)),
-            confidence=float(outcomes.confidence[kind][model].mean()),
+            rate=float(recognized.mean()),
+            interval=wilson(int(recognized.sum()), len(recognized)),
+            confidence=float(answers[kind].confidence[model].mean()),
             difference=difference,
             difference_interval=interval,
         )
     return claims
 
 
-def _judge(problem: Problem, pictures: torch.Tensor) -> np.ndarray:
-    """2×M×N: recognized and confidence."""
-    rows = []
-    for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
-        logits = classifier.logits(pictures)
-        rows.append(
-            torch.stack([classifier.recognized(logits, indices).double(), classifier.confidence(logits, indices)])
-        )
-    return torch.stack(rows, 1).cpu().numpy()
-
-
-def _condition_claims(problem: Problem, outcomes: Outcomes) -> tuple[ConditionClaim, ...]:
+def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.ndarray) -> tuple[ConditionClaim, ...]:
     """What a photograph could show of each condition; null where the patch's face is turned away or there is none."""
-    scene, conditions, recognized = problem.scene, outcomes.conditions, outcomes.recognized["design"][0]
-    if scene.piece is None:
-        return tuple(
-            ConditionClaim(
-                px_per_mm=None,
-                tilt_deg=None,
-                azimuth_deg=None,
-                contrast=None,
-                blur_px=_rounded(blur),
-                recognized=bool(seen),
-            )
-            for blur, seen in zip(conditions.sensor.blur_px, recognized, strict=True)
+    scene, n = problem.scene, len(conditions)
+    shows: dict[str, np.ndarray] = dict.fromkeys(
+        ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast"), np.full(n, np.nan)
+    )
+    if scene.piece is not None:
+        x, y, width, height = scene.piece.design_rect_mm
+        middle = np.array([x + width / 2, y + height / 2])
+        homographies = scene.piece_homographies(conditions, scene.settings.camera.photo_px)
+        scale, tilt = np.array([geometry.local_scale(homography, middle) for homography in homographies]).T
+        azimuth = scene.piece_azimuth_deg(conditions)
+        values = scale, tilt, azimuth, _contrasts(problem, conditions)
+        away = np.abs(azimuth) >= 90  # unknown angles are of photographs that show it
+        shows = {name: np.where(away, np.nan, value) for name, value in zip(shows, values, strict=True)}
+    return tuple(
+        ConditionClaim(
+            **{name: _rounded(value[i]) for name, value in shows.items()},
+            blur_px=_rounded(conditions.sensor.blur_px[i]),
+            recognized=bool(recognized[i]),
         )
-    x, y, width, height = scene.piece.design_rect_mm
-    middle = np.array([x + width / 2, y + height / 2])
-    homographies = scene.piece_homographies(conditions, scene.settings.camera.photo_px)
-    azimuths, contrast = scene.piece_azimuth_deg(conditions), _contrasts(problem, conditions)
-    claims = []
-    for i, homography in enumerate(homographies):
-        faces = not abs(azimuths[i]) >= 90  # unknown angles are of photographs that show it
-        scale, tilt = geometry.local_scale(homography, middle)
-        claims.append(
-            ConditionClaim(
-                px_per_mm=_rounded(scale) if faces else None,
-                tilt_deg=_rounded(tilt) if faces else None,
-                azimuth_deg=_rounded(azimuths[i]) if faces else None,
-                contrast=_rounded(contrast[i]) if faces else None,
-                blur_px=_rounded(conditions.sensor.blur_px[i]),
-                recognized=bool(recognized[i]),
-            )
-        )
-    return tuple(claims)
+        for i in range(n)
+    )
 
 
 def _contrasts(problem: Problem, conditions: Conditions) -> np.ndarray:

@@ -1,7 +1,7 @@
 """What networks answer when things are shown to them under the same conditions.
 
 In: a `Problem`, things to show (None: the bare object), conditions. Out: per thing its `Answers`: whether each network
-recognized the target, how sure it was of it, and the goal's loss. Views are seen once for all things, a few at a time.
+recognized the target, how sure it was of it, and the loss. Views are seen once for all things, a few at a time.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
@@ -25,7 +24,7 @@ Thing = TypeVar("Thing", bound=Hashable)
 
 @dataclass(frozen=True)
 class Answers:
-    """M×N of M networks and N conditions; `loss` is what the scene's goal descends on."""
+    """M×N of M networks and N conditions; `loss` is what the problem descends on."""
 
     recognized: np.ndarray
     confidence: np.ndarray
@@ -62,13 +61,13 @@ def ask(problem: Problem, pictures: Tensor) -> Answers:
     """Every network's answers to pictures N×3×H×W. One that stands in the problem twice, with other labels, is asked
     once.
     """
-    goal, rows = problem.scene.settings.target.goal, []
+    rows = []
     with torch.no_grad():
         logits = {classifier: classifier.logits(pictures) for classifier in dict.fromkeys(problem.classifiers)}
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
             own = logits[classifier]
             recognized, confidence = classifier.recognized(own, indices), classifier.confidence(own, indices)
-            rows.append(torch.stack([recognized.double(), confidence, target_loss(own, indices, goal)]))
+            rows.append(torch.stack([recognized.double(), confidence, problem.loss(own, indices)]))
     recognized, confidence, loss = torch.stack(rows, 1).cpu().numpy()
     return Answers(recognized > 0.5, confidence, loss)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
 from patchproof.optimizer.problem import Problem
@@ -28,7 +29,7 @@ def save_result(problem: Problem, design: np.ndarray, folder: Path) -> None:
     if not isinstance(problem.subject, Texture):
         _write_png(folder / _DESIGN, design)
         return
-    canvas, textures = problem.scene.canvas, problem.subject.textures(design)
+    canvas, textures = problem.scene.canvas, problem.subject.surface.textures(design)
     write_whole(folder / _OBJECT, lambda path: write_glb(canvas.mesh, textures, path))
     for i, texture in enumerate(textures):
         _write_png(folder / f"texture_{i}.png", texture)
@@ -47,7 +48,7 @@ def read_result(scene: Scene, folder: Path) -> np.ndarray:
             raise Refused(
                 "the textures of this scene", f"{texture.shape[1]} × {texture.shape[0]} pixels", "optimize again"
             )
-    return Texture(scene, "cpu").texels(textures)
+    return Texture(scene, torch.device("cpu")).surface.texels(textures)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

@@ -27,7 +27,7 @@ from patchproof.color import codes_of
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, make_promise
 from patchproof.optimizer.result import RESULT_FILES, read_result, save_result
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.scene import Scene, build_scene, load_scene
@@ -160,8 +160,7 @@ def _promise(
         done += n
         on_promise(done, PROMISE_VIEWS)
 
-    conditions = problem.scene.draw("promise", PROMISE_VIEWS)
-    return promise_from(problem, try_out(problem, design, conditions, progress, controls))
+    return make_promise(problem, design, problem.scene.draw("promise", PROMISE_VIEWS), controls, progress)
 
 
 def _log_line(step: Step) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS, promise_from, try_out
+from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
@@ -69,8 +69,7 @@ def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDes
     scene = run.scene if template is None else run.scene.with_template(template)
     piece, kind = piece_of(scene), control or "design"
     if piece.size_mm != own.size_mm and control is None:
-        problem = set_problem(scene)
-        promise = promise_from(problem, try_out(problem, run.design, scene.draw("promise", PROMISE_VIEWS)))
+        promise = make_promise(set_problem(scene), run.design, scene.draw("promise", PROMISE_VIEWS))
     if control is not None:
         piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, scene.sheet_id, kind)
     one = OneDesign(

@@ -11,13 +11,16 @@ Left out on purpose: cells that depend on one another (one cell trains and tests
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +28,9 @@ from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.report.results import Results, write_json, write_results
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict, nearest, read_toml, validated
-from patchproof.workers import Workers, one_thread, open_workers, result_of
+from patchproof.workers import one_thread, open_workers, result_of
 
-# by name the module whose STUDY it is, imported when asked for
+# by name the module whose STUDY it is; the first line of its docstring says what it is about
 STUDIES: dict[str, str] = {
     "ablation": "patchproof.validation.ablation",
     "deceive": "patchproof.experiments.deceive",
@@ -65,8 +68,12 @@ class Result:
     """
 
     cell: Cell
-    found: Mapping[str, Any]
+    answers: Mapping[str, Any]
     out: Path
+
+    def file(self, key: str) -> Path:
+        """The file of what `run` gave as bytes."""
+        return self.out / self.answers[key]
 
 
 @dataclass(frozen=True)
@@ -80,7 +87,6 @@ class Study:
     """
 
     name: str
-    about: str
     settings: type[Strict]
     cells: Callable[[Any, Path], Sequence[Cell]]
     run: Callable[[Any, Path, Cell], dict[str, Any]]
@@ -88,6 +94,11 @@ class Study:
     figures: Callable[[Any, Sequence[Result]], Sequence[Drawing]]
     files: str = "files"  # folder for what cells gave as bytes; "." is the study's own
     own_files: tuple[str, ...] = ("files",)  # patterns of names that --overwrite may replace besides
+
+    @property
+    def about(self) -> str:
+        """What it is about, in one line."""
+        return first_line(self.run.__module__)
 
 
 @dataclass(frozen=True)
@@ -106,67 +117,73 @@ def load_study(name: str) -> Study:
     return import_module(STUDIES[name]).STUDY
 
 
-def short_name(name: str) -> str:
-    """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
-    word = name.rpartition(":")[2]
-    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
+def first_line(module: str) -> str:
+    """What a study's module is about: the first line of its docstring; it is not imported."""
+    spec = find_spec(module)
+    source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
+    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
 
 
-def run_study(
-    name: str,
-    config: str | Path,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    jobs: int = 1,
-    cluster: str | None = None,
-    on_cell: Callable[[int, int], None] = lambda done, total: None,
-) -> Finished:
+@dataclass(frozen=True)
+class Work:
+    """How a study is carried out: what may lie in its folder already, and who computes (see `open_workers`);
+    `on_cell` is called with (done, all).
+    """
+
+    resume: bool = False
+    overwrite: bool = False
+    jobs: int = 1
+    cluster: str | None = None
+    on_cell: Callable[[int, int], None] = lambda done, total: None
+
+
+HERE = Work()  # in this process, into a new folder
+
+
+def run_study(name: str, config: str | Path, out: str | Path, work: Work = HERE) -> Finished:
     """Run the study that the TOML file describes into the folder `out`."""
     study = load_study(name)
     settings = validated(study.settings, read_toml(config), str(config))
-    base = Path(config).resolve().parent
-    return carry_out(
-        study,
-        settings,
-        base,
-        out,
-        resume=resume,
-        overwrite=overwrite,
-        jobs=jobs,
-        cluster=cluster,
-        on_cell=on_cell,
-    )
+    return carry_out(study, settings, Path(config).resolve().parent, out, work)
 
 
-def carry_out(
-    study: Study,
-    settings: Strict,
-    base: Path,
-    out: str | Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    jobs: int = 1,
-    cluster: str | None = None,
-    on_cell: Callable[[int, int], None] = lambda done, total: None,
-) -> Finished:
-    """Run a study with settings at hand; `on_cell` is called with (done, all)."""
+def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work: Work = HERE) -> Finished:
+    """Run a study with settings at hand."""
     out = Path(out)
-    if not resume:
-        check_folder(out, _own(study), overwrite)
+    if not work.resume:
+        check_folder(out, _own(study), work.overwrite)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
-    with open_workers(jobs, cluster) as workers:
-        _begin(study, settings, out, resume)
-        found = {cell.name: values for cell in cells if (values := _kept(out, cell)) is not None}
-        failed = _do_cells(study, settings, base, cells, out, workers, found, on_cell)
-    results = tuple(Result(cell, found[cell.name], out) for cell in cells if cell.name in found)
+    with open_workers(work.jobs, work.cluster) as workers:
+        _begin(study, settings, out, work.resume)
+        kept = {cell.name: answers for cell in cells if (answers := _kept(out, cell)) is not None}
+        todo = [cell for cell in cells if cell.name not in kept]
+        failed: dict[str, str] = {}
+        work.on_cell(len(kept), len(cells))
+        do = partial(_run_cell, study.run, settings, base)
+        for done, (number, future) in enumerate(workers.completed(do, todo), len(kept) + 1):
+            cell = todo[number]
+            values, files, sentence = _outcome(future)
+            if sentence is None:
+                kept[cell.name] = _keep(study, out, cell, values, files)
+            else:
+                failed[cell.name] = sentence
+            work.on_cell(done, len(cells))
+    results = tuple(Result(cell, kept[cell.name], out) for cell in cells if cell.name in kept)
     tables = tuple(study.tables(settings, results)) if results else ()
-    figures = tuple(study.figures(settings, results)) if results else ()
-    _write(study, settings, out, tables, figures, results, failed)
-    return Finished(tables, results, failed)
+    page = Results(
+        kind="study",
+        name=study.name,
+        about=study.about,
+        extent=f"{len(results)} of {len(cells)} cells finished",
+        settings=settings.model_dump(mode="json"),
+        tables=tables,
+        figures=tuple(study.figures(settings, results)) if results else (),
+        failed={cell.name: failed[cell.name] for cell in cells if cell.name in failed},
+        more={"cells": {one.cell.name: {"cell": dict(one.cell.values), "found": one.answers} for one in results}},
+    )
+    write_results(out, page)
+    return Finished(tables, results, dict(page.failed))
 
 
 def _check_cells(study: Study, cells: Sequence[Cell]) -> None:
@@ -184,9 +201,9 @@ def _own(study: Study) -> tuple[str, ...]:
 
 def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
     """The study's settings in `out`, which must be the same where one goes on."""
-    path, said = out / f"{study.name}.json", settings.model_dump(mode="json")
+    path, asked = out / f"{study.name}.json", settings.model_dump(mode="json")
     if resume and path.is_file():
-        if _read(path).get("settings") != said:
+        if _read(path).get("settings") != asked:
             do = "give it the same settings, or another --out"
             raise Refused(f"the settings that {out} was begun with, to resume it", "others", do)
         return
@@ -197,7 +214,7 @@ def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
             for old in out.glob(pattern):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
     make_folder(out / "cells")
-    write_json(path, {"study": study.name, "settings": said})
+    write_json(path, {"study": study.name, "settings": asked})
 
 
 def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
@@ -214,33 +231,24 @@ def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
     return kept["found"]
 
 
-def _do_cells(study, settings, base, cells, out, workers: Workers, found, on_cell) -> dict[str, str]:
-    """Do what is not in `found` and put it there; the sentences of those that failed, in the order of cells."""
-    todo, failed = [cell for cell in cells if cell.name not in found], {}
-    done = len(cells) - len(todo)
-    on_cell(done, len(cells))
-    for number, future in workers.completed(partial(_run_cell, study.run, settings, base), todo):
-        cell, done = todo[number], done + 1
-        try:
-            values, files, sentence = result_of(future)
-        except Exception as error:  # a worker that died
-            values, files, sentence = {}, {}, _sentence(error)
-        if sentence is None:
-            found[cell.name] = _keep(study, out, cell, values, files)
-        else:
-            failed[cell.name] = sentence
-        on_cell(done, len(cells))
-    return {cell.name: failed[cell.name] for cell in cells if cell.name in failed}
+Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]  # (JSON values, bytes, None), or why there are none
 
 
-def _run_cell(run, settings: Strict, base: Path, cell: Cell) -> tuple[dict, dict[str, bytes], str | None]:
-    """(JSON values, bytes, None), or why not: errors do not travel, since not every one survives it."""
+def _run_cell(run: Callable[[Any, Path, Cell], dict[str, Any]], settings: Strict, base: Path, cell: Cell) -> Outcome:
+    """What a cell gave; errors do not travel, since not every one survives it."""
     try:
         with one_thread():
-            found = run(settings, base, cell)
-        files = {key: value for key, value in found.items() if isinstance(value, bytes)}
-        return _through_json({key: value for key, value in found.items() if key not in files}), files, None
+            answers = run(settings, base, cell)
+        files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
+        return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
     except Exception as error:  # also what a user's own network raises
+        return {}, {}, _sentence(error)
+
+
+def _outcome(future: Future) -> Outcome:
+    try:
+        return result_of(future)
+    except Exception as error:  # a worker that died
         return {}, {}, _sentence(error)
 
 
@@ -255,20 +263,9 @@ def _keep(study: Study, out: Path, cell: Cell, values: dict, files: dict[str, by
     for key, name in names.items():
         make_folder((out / name).parent)
         write_whole(out / name, lambda path, key=key: path.write_bytes(files[key]))
-    found = values | names
-    write_json(
-        out / "cells" / f"{cell.name}.json", {"cell": dict(cell.values), "found": found, "files": list(names.values())}
-    )
-    return found
-
-
-def _write(study, settings, out: Path, tables, figures, results, failed) -> None:
-    cells = {one.cell.name: {"cell": dict(one.cell.values), "found": one.found} for one in results}
-    extent = f"{len(results)} of {len(results) + len(failed)} cells finished"
-    said = settings.model_dump(mode="json")
-    write_results(
-        out, Results("study", study.name, study.about, extent, said, tables, figures, failed, {"cells": cells})
-    )
+    kept = {"cell": dict(cell.values), "found": values | names, "files": list(names.values())}
+    write_json(out / "cells" / f"{cell.name}.json", kept)
+    return values | names
 
 
 def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:

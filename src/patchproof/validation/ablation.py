@@ -1,5 +1,6 @@
-"""What each modeled effect earns: it is left out of training, and the design is tried in the whole world.
+"""What each modeled effect earns when training knows it.
 
+It is left out of training, and the design is tried in the whole world.
 In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect how much rate and
 confidence designs lose that were trained without it, against designs trained with all, under the same conditions; by
 our renderer, and in path-traced photographs (`path_traced`), whose light is not ours. What takes an effect's place is
@@ -12,24 +13,21 @@ costs is the share of a step's time that goes when it is left out, steps taken i
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import torch
 from pydantic import Field
 
 from patchproof.channel.printer import identity_printer
 from patchproof.claims import Estimate, mean
-from patchproof.classifier.network import recognized
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import judged
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import ask, joined, responses
 from patchproof.plan.cost import relative_costs
 from patchproof.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.render.photograph import Shown
@@ -38,10 +36,14 @@ from patchproof.render.views import Views, see
 from patchproof.report.tables import Drawing, Table
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
-from patchproof.settings import SceneSettings
-from patchproof.strict import Refused, Strict, expand, read_toml, validated
-from patchproof.study.study import Cell, Result, Study, short_name
-from patchproof.study.trained import scene_of
+from patchproof.strict import Refused
+from patchproof.study.figures import whiskers
+from patchproof.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
+from patchproof.study.record import Record, recorded
+from patchproof.study.study import Cell, Result, Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ALL = "all"
 # What goes together, because alone it is too little to tell.
@@ -58,15 +60,12 @@ def _default_effects() -> tuple[str, ...]:
 
 
 EFFECTS = _default_effects()
-Names = Annotated[tuple[str, ...], Field(min_length=1)]
+WORLDS = ("modeled", "path_traced")  # whose photographs: our renderer's, or the path tracer's
 
 
-class AblationSettings(Strict):
-    """Every scene with every network and seed."""
+class AblationSettings(GridSettings):
+    """A design for each scene, network and seed with all effects, and one without each."""
 
-    scenes: Names  # scene files
-    networks: Names  # each trains and judges its own designs
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
     effects: Names = EFFECTS  # left out one by one; "a + b" leaves out both at once
     n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design
     photos: Annotated[int, Field(ge=0, le=1000)] = 40  # path-traced photographs of each design
@@ -103,42 +102,33 @@ def without(problem: Problem, effect: str) -> Problem:
         if not isinstance(subject, Patch):
             raise Refused("a printed patch", "a texture", f'leave "{PRINTER}" out')
         subject = replace(subject, printer=identity_printer())
-    parts = {field.name: getattr(problem, field.name) for field in fields(Problem)} | {"subject": subject}
-    return Without(**parts, changes=tuple(terms[name].change for name in on if name != PRINTER))
+    changes = tuple(terms[name].change for name in on if name != PRINTER)
+    return Without(**vars(replace(problem, subject=subject)), changes=changes)
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed: a design trained with all effects, and one without each."""
-    found = []
-    for file in settings.scenes:
-        path = Path(expand(file, base))
-        scene = validated(SceneSettings, read_toml(path), path.name)
-        for network in settings.networks:
-            for seed in settings.seeds:
-                for effect in (ALL, *settings.effects):
-                    word = re.sub(r"[^\w=,-]+", "-", effect)[:40]
-                    name = re.sub(r"[^\w=+.,-]", "-", f"{path.stem}.{short_name(network)}.{seed}.{word}")
-                    values = {"name": path.stem, "file": file, "scene": scene.model_dump(mode="json"), "seed": seed}
-                    found.append(Cell(name, values | {"network": network, "effect": effect}))
-    return found
+    return [
+        cell_of(values | {"effect": effect}, seed, values["network"], effect[:40])
+        for values in pairs(settings, base)
+        for seed in settings.seeds
+        for effect in (ALL, *settings.effects)
+    ]
 
 
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train without the effect; hits and confidences in the whole world."""
-    values, scene = cell.values, scene_of(base, cell)
-    problem = set_problem(scene, models=(expand(values["network"], base),))
-    whole = values["effect"] == ALL
-    design = best_design(problem if whole else without(problem, values["effect"]))
+    problem, effect = problem_of(base, cell.values), cell.values["effect"]
+    design = best_design(problem if effect == ALL else without(problem, effect))
     shown = problem.subject.shown(from_pixels(design, problem.device))
-    outcomes = judged(problem, {"design": shown}, scene.draw("evaluate", settings.n))
-    traced = _traced(problem, shown, scene.draw("reprint", settings.photos)) if settings.photos else ([], [])
-    return {
-        "hits": outcomes.recognized["design"][0].astype(int).tolist(),
-        "confidence": np.round(outcomes.confidence["design"][0], 5).tolist(),
-        "traced_hits": traced[0],
-        "traced_confidence": traced[1],
-        "cost": _costs(problem, settings.effects) if whole else {},
-    }
+    answers = {"modeled": responses(problem, {"design": shown}, problem.scene.draw("evaluate", settings.n))}
+    if settings.photos:
+        drawn = problem.scene.draw("reprint", settings.photos)
+        piece = shown if isinstance(shown, PiecePicture) else None
+        photos = (photograph_traced(problem.stage, piece, drawn[i : i + 1]) for i in range(len(drawn)))
+        answers["path_traced"] = joined([{"design": ask(problem, photo)} for photo in photos])
+    costs = _costs(problem, settings.effects) if effect == ALL else {}
+    return {"cost": costs, **{world: recorded(some) for world, some in answers.items()}}
 
 
 def _costs(problem: Problem, effects: Sequence[str]) -> dict[str, float]:
@@ -147,56 +137,47 @@ def _costs(problem: Problem, effects: Sequence[str]) -> dict[str, float]:
     return {name: 1 - ratio for name, ratio in relative_costs(problem, less, problem.subject.start()).items()}
 
 
-def _traced(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[list[int], list[float]]:
-    hits, confidences = [], []
-    (classifier,), (indices,) = problem.classifiers, problem.indices
-    for i in range(len(conditions)):
-        picture = photograph_traced(problem.stage, shown, conditions[i : i + 1])
-        with torch.no_grad():
-            logits = classifier.logits(picture)
-        hits.append(int(recognized(logits, indices)[0]))
-        confidences.append(round(float(classifier.confidence(logits, indices)[0]), 5))
-    return hits, confidences
-
-
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """What each effect earned over all groups, and in each."""
-    groups = _groups(results)
     head = ("trained without", "groups", "rate", "confidence", "rate, path-traced", "confidence, path-traced")
-    cost = "share of a step's time"
-    keys = ("hits", "confidence", "traced_hits", "traced_confidence")
-    rows = []
-    for effect in settings.effects:
-        both = [(one[ALL], one[effect]) for one in groups.values() if ALL in one and effect in one]
-        if both:
-            costs = mean([whole["cost"][effect] for whole, _ in both])
-            rows.append((effect, len(both), *(_earned(both, key) for key in keys), costs))
     about = f"trained with all effects minus without: positive is what the effect earned; {settings.n} conditions and "
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
-    every = []
-    for (name, network, seed), one in groups.items():
-        for effect, found in one.items():
-            means = [float(np.mean(found[key])) if found[key] else None for key in keys]
-            every.append((name, short_name(network), seed, effect, *means))
-    said = ("scene", "network", "seed", "trained without", *head[2:])
+    rows, designs = [], []
+    for group in _groups(results):
+        designs += [(*who(result), result.cell.values["effect"], *_means(result)) for result in group.values()]
+    for effect in settings.effects:
+        both = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
+        if both:
+            rows.append((effect, len(both), *_earned(both), mean([whole.answers["cost"][effect] for whole, _ in both])))
+    start = ("scene", "network", "seed", "trained without", *head[2:])
+    cost = "share of a step's time"
     return (
         Table("earned", "What each effect earns", (*head, cost), tuple(rows), about),
-        Table("designs", "Every design", said, tuple(every), "its own rates and confidences in the whole world"),
+        Table("designs", "Every design", start, tuple(designs), "its own rates and confidences in the whole world"),
     )
 
 
-def _groups(results: Sequence[Result]) -> dict[tuple[str, str, int], dict[str, Any]]:
-    found: dict[tuple[str, str, int], dict[str, Any]] = {}
-    for one in results:
-        values = one.cell.values
-        found.setdefault((values["name"], values["network"], values["seed"]), {})[values["effect"]] = one.found
-    return found
+def _groups(results: Sequence[Result]) -> list[dict[str, Result]]:
+    """By scene, network and seed the results of each effect."""
+    groups = grouped(results, who).values()
+    return [{result.cell.values["effect"]: result for result in group} for group in groups]
 
 
-def _earned(both: Sequence[tuple], key: str) -> Estimate | None:
-    if not both[0][0][key]:
-        return None
-    return mean([float(np.mean(whole[key]) - np.mean(less[key])) for whole, less in both])
+def _means(result: Result) -> list[float | None]:
+    """Rate and confidence of a design in each world; None where nothing was photographed."""
+    records = [Record([result], "design", world) if world in result.answers else None for world in WORLDS]
+    figures = [some for record in records for some in ((record.hits(), record.confidences()) if record else ((), ()))]
+    return [float(np.mean(some)) if some else None for some in figures]
+
+
+def _earned(both: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
+    """What the first of each pair is better by: rate and confidence in each world."""
+    differences = [
+        [None if a is None or b is None else a - b for a, b in zip(_means(whole), _means(less), strict=True)]
+        for whole, less in both
+    ]
+    columns = ([value for value in column if value is not None] for column in zip(*differences, strict=True))
+    return [mean(column) for column in columns]
 
 
 def figures(settings: AblationSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
@@ -205,31 +186,20 @@ def figures(settings: AblationSettings, results: Sequence[Result]) -> tuple[Draw
     if not rows:
         return ()
 
-    def draw(figure) -> None:
+    def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for shift, at, label in ((-0.15, 3, "our renderer"), (0.15, 5, "path-traced")):
-            some = [(i + shift, row[at]) for i, row in enumerate(rows) if row[at] is not None]
-            if some:
-                places, found = zip(*some, strict=True)
-                low = [max(0.0, one.value - one.low) for one in found]
-                high = [max(0.0, one.high - one.value) for one in found]
-                axes.errorbar([one.value for one in found], places, xerr=[low, high], fmt="o", label=label, capsize=2)
+            earned = {i + shift: value for i, row in enumerate(rows) if isinstance(value := row[at], Estimate)}
+            if earned:
+                values, reach = whiskers(list(earned.values()))
+                axes.errorbar(values, list(earned), xerr=reach, fmt="o", label=label, capsize=2)
         axes.axvline(0, color="0.6", linewidth=1)
         axes.set_yticks(range(len(rows)), [str(row[0]).replace(" + ", ",\n") for row in rows], fontsize=8)
         axes.invert_yaxis()
         axes.set_xlabel("confidence earned in the whole world (95 %)")
         axes.legend(fontsize=8)
 
-    size = (7.0, 1.5 + 0.38 * len(rows))
-    return (Drawing("earned", "What each effect earns", draw, size),)
+    return (Drawing("earned", "What each effect earns", draw, (7.0, 1.5 + 0.38 * len(rows))),)
 
 
-STUDY = Study(
-    "ablation",
-    "What each modeled effect earns when training knows it.",
-    AblationSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("ablation", AblationSettings, cells, run, tables, figures)

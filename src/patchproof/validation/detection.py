@@ -1,5 +1,6 @@
-"""Where sheets are found, how far off they are measured, and whether the stated uncertainty holds.
+"""Finding and measuring the sheet in rendered photographs, against the renderer's truth.
 
+Also whether the stated uncertainty holds.
 In: a scene with wide ranges of view, light and camera. Out: by photograph its status and code, and against the
 renderer's truth the error of the design's corners; over all of them shares with Wilson intervals by tilt, distance,
 blur, noise, light, hiding and JPEG, and maps. The sheet carries noise in place of a design, since only markers are
@@ -173,7 +174,7 @@ def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 
 def tables(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Bounds over all photographs, shares by each quantity, and codes."""
-    found = [one.found for one in results]
+    found = [one.answers for one in results]
     return (_bounds(found), _by_quantity(found), _codes(found))
 
 
@@ -247,7 +248,7 @@ def _codes(found: Sequence[Mapping]) -> Table:
 
 def figures(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Drawing]:
     """Maps of what was measured, judged and rejected, and errors against the stated uncertainty."""
-    found = [one.found for one in results]
+    found = [one.answers for one in results]
     pairs = (("module_px", "tilt_deg"), ("module_px", "blur_px"), ("hidden", "tilt_deg"), ("noise", "jpeg"))
     maps = [
         Drawing(f"{x}_{y}", f"By {_LABELS[x]} and {_LABELS[y]}", lambda figure, x=x, y=y: _map(figure, found, x, y))
@@ -277,12 +278,4 @@ def _stated(figure, found: Sequence[Mapping]) -> None:
     axes.set_ylabel("largest corner error, mm")
 
 
-STUDY = Study(
-    "detection",
-    "Finding and measuring the sheet in rendered photographs, against the renderer's truth.",
-    DetectionSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("detection", DetectionSettings, cells, run, tables, figures)

@@ -1,42 +1,43 @@
-"""What gamut in the loop buys: one scene, optimized with and without knowing its printer, reprinted by others.
+"""What gamut in the loop buys: designs optimized with and without their printer, reprinted by others.
 
-In: scenes, seeds, the printer that is known while optimizing and those that print in the end. Out: a row per way to
-optimize and printer: rate and confidence on the same fresh conditions (the evaluate stream), their intervals, and
-paired differences to the design that was optimized as if any color could be printed. All ways share the piece's frame,
-their training views and the number of steps.
+In: scenes, seeds, the printer that is known while optimizing (the scene's) and those that print in the end. Out: a row
+per way to optimize and printer: rate and confidence on the same fresh conditions (the evaluate stream), their
+intervals, and paired differences to the design that was optimized as if any color could be printed. All ways share the
+piece's frame, their training views and the number of steps.
 
-Intervals are over conditions, with the designs as they are: what another seed would do shows in `gain_by_seed`.
+Intervals are over conditions, with the designs as they are: what another seed would do shows in `gain by seed`.
 Left out on purpose: page, detection and photographs at full size; no way to optimize differs in them. Views are as
 large as in training, a tenth of the work of whole ones: what is read off here are differences.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import Field
 
 from patchproof.channel.printer import IN_GAMUT, Printer, identity_printer, load_printer, vary
-from patchproof.claims import Estimate, difference, rate
+from patchproof.claims import Estimate
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.render.photograph import expose
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.scene import Scene, build_scene, load_scene
-from patchproof.strict import Refused, Strict, shipped
+from patchproof.strict import shipped
+from patchproof.study.figures import whiskers
+from patchproof.study.grid import GridSettings, Seeds, cell_of, grouped, of_values, problem_of, teams
+from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 
-VIEWS = 200
-CHUNK = 16
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -59,69 +60,56 @@ WAYS = (
 )
 
 
-class GamutSettings(Strict):
-    """Every scene with every seed; paths are relative to the config's folder."""
+class GamutSettings(GridSettings):
+    """A design in each way for each scene and seed, for all networks together; the first one tells."""
 
-    # Scene files; their `printer.profile` is the printer that is known while optimizing.
-    scenes: Annotated[tuple[str, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[int, ...], Field(min_length=1)] = (0, 1)  # of the optimizer
-    views: Annotated[int, Field(ge=2)] = VIEWS  # unseen conditions that measure
+    seeds: Seeds = (0, 1)  # of the scenes' draws
+    n: Annotated[int, Field(ge=2)] = 200  # views per seed
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A way's designs as one printer prints them; `difference` (of rates) and `gain` (of confidence) are to the designs
-    of `UNPRINTED` in the same views. `out_of_gamut`: share of the designs' pixels that the known printer misses by more
-    than IN_GAMUT.
+    of `UNPRINTED` in the same views. `missed`: share of the designs' pixels that the known printer shows more than
+    IN_GAMUT off.
     """
 
     printer: str
     way: str
-    rate: Estimate
-    difference: Estimate
-    confidence: Estimate
-    gain: Estimate
-    gain_by_seed: tuple[float, ...]
-    out_of_gamut: float
+    rate: Estimate | None
+    difference: Estimate | None
+    confidence: Estimate | None
+    gain: Estimate | None
+    gain_by_seed: str
+    missed: float
 
 
-@dataclass(frozen=True)
-class Outcomes:
-    """One seed's results: ways × printers × {recognized, confidence} × views, and per way the share of its design's
-    pixels that are out of the known printer's gamut.
-    """
-
-    ways: tuple[str, ...]
-    printers: tuple[str, ...]
-    outcomes: np.ndarray
-    out_of_gamut: np.ndarray
+def cells(settings: GamutSettings, base: Path) -> list[Cell]:
+    """One per scene and seed."""
+    return [cell_of(values, seed) for values in teams(settings, base) for seed in settings.seeds]
 
 
-def gamut_cell(
-    scene: Scene,
-    seed: int,
-    printers: Sequence[Printer],
-    ways: Sequence[Way] = WAYS,
-    views: int = VIEWS,
-) -> Outcomes:
-    """A design for each way, all from this seed, in the same `views` conditions by every printer."""
-    problem, designs = set_problem(build_scene(scene.settings, scene.base, seed)), []
+def run(settings: GamutSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """All ways, by all printers."""
+    problem = problem_of(base, cell.values)
+    return reprinted(problem, other_printers(problem.printer), WAYS, settings.n)
+
+
+def reprinted(problem: Problem, printers: Sequence[Printer], ways: Sequence[Way], n: int) -> dict[str, Any]:
+    """A design for each way, shown in the same n conditions as every printer prints it."""
+    shown, missed = {}, {}
     for way in ways:
-        designs.append(best_design(way_problem(problem, way)))
-    missed = np.array([_missed(problem.printer, design) for design in designs])
-    outcomes = _reprinted(problem, designs, printers, views)
-    return Outcomes(tuple(w.name for w in ways), tuple(p.name for p in printers), outcomes, missed)
+        design = from_pixels(best_design(way_problem(problem, way)), problem.device)
+        distance = problem.printer.gamut_distance(design[None])
+        missed[way.name] = float((distance > IN_GAMUT).double().mean())
+        with torch.no_grad():
+            for printer in printers:
+                shown[_thing(way.name, printer.name)] = replace(problem.subject, printer=printer).shown(design)
+    answers = responses(problem, shown, problem.scene.draw("evaluate", n), problem.training_px)
+    return recorded(answers) | {"missed": missed, "printers": [printer.name for printer in printers]}
 
 
-def gamut_rows(seeds: Sequence[Outcomes]) -> list[Row]:
-    """A row per printer and way, over all seeds."""
-    first, outcomes = seeds[0], np.stack([seed.outcomes for seed in seeds])
-    base, missed = first.ways.index(UNPRINTED.name), np.mean([seed.out_of_gamut for seed in seeds], 0)
-    return [
-        _row(way, printer, outcomes[:, i, k], outcomes[:, base, k], float(missed[i]))
-        for k, printer in enumerate(first.printers)
-        for i, way in enumerate(first.ways)
-    ]
+def _thing(way: str, printer: str) -> str:
+    return f"{way}, printed by {printer}"
 
 
 def other_printers(known: Printer) -> list[Printer]:
@@ -130,141 +118,70 @@ def other_printers(known: Printer) -> list[Printer]:
     """
     names = sorted(path.stem for path in shipped("calibration", "printers").glob("*.npz"))
     others = [load_printer(name) for name in names if name != known.name]
-    light = vary(linear_from_srgb(others[-1].lut), torch.tensor([0.10, 0.0, 0.05]))
-    made = replace(others[-1], name=f"{others[-1].name}, +10 % dot gain, pale black", lut=srgb_from_linear(light))
+    light = vary(torch.as_tensor(linear_from_srgb(others[-1].lut)), torch.tensor([0.10, 0.0, 0.05]))
+    name = f"{others[-1].name}, +10 % dot gain, pale black"
+    made = replace(others[-1], name=name, lut=torch.as_tensor(srgb_from_linear(light)))
     return [known, *others, made]
 
 
 def way_problem(problem: Problem, way: Way) -> Problem:
     """The problem as this way poses it."""
-    scene = problem.scene
-    changed = {"gamut": way.gamut, "in_gamut": way.in_gamut}
-    optimize = scene.settings.optimize.model_copy(update=changed)
-    scene = replace(scene, settings=scene.settings.model_copy(update={"optimize": optimize}))
+    settings = problem.scene.settings.changed(optimize={"gamut": way.gamut, "in_gamut": way.in_gamut})
+    scene = replace(problem.scene, settings=settings)
     printer = problem.printer if way.printed else identity_printer()
     subject = replace(problem.subject, scene=scene, printer=printer)
     return replace(problem, scene=scene, printer=printer, subject=subject)
 
 
-def _reprinted(problem: Problem, designs: Sequence[np.ndarray], printers, views: int) -> np.ndarray:
-    """ways × printers × {recognized, confidence} × views, of the primary classifier."""
-    classifier, indices = problem.classifiers[0], problem.indices[0]
-    conditions = problem.scene.draw("evaluate", views)
-    result = np.zeros((len(designs), len(printers), 2, views))
-    with torch.no_grad():
-        shown = [
-            [replace(problem.subject, printer=p).shown(from_pixels(d, problem.device)) for p in printers]
-            for d in designs
-        ]
-        for first in range(0, views, CHUNK):
-            part = conditions[first : first + CHUNK]
-            seen = problem.see(shown[0][0], part, problem.training_px)
-            for i, row in enumerate(shown):
-                for k, picture in enumerate(row):
-                    logits = classifier.logits(expose(seen, picture))
-                    both = classifier.recognized(logits, indices).double(), classifier.confidence(logits, indices)
-                    result[i, k, :, first : first + len(part)] = torch.stack(both).cpu().numpy()
-    return result
+def rows_of(results: Sequence[Result]) -> list[Row]:
+    """A row per printer and way, over all seeds of a scene."""
+    rows = []
+    for printer in results[0].answers["printers"]:
+        for way in results[0].answers["missed"]:
+            of_way, usual = (partial(Record, thing=_thing(name, printer)) for name in (way, UNPRINTED.name))
+            rate, confidence = of_way(results).level()
+            difference, gain = of_way(results).gain(usual(results))
+            gains = [np.mean(of_way([r]).confidences()) - np.mean(usual([r]).confidences()) for r in results]
+            by_seed = " ".join(f"{one:+.3f}" for one in gains)
+            missed = float(np.mean([result.answers["missed"][way] for result in results]))
+            rows.append(Row(printer, way, rate, difference, confidence, gain, by_seed, missed))
+    return rows
 
 
-def _missed(printer: Printer, design: np.ndarray) -> float:
-    distance = printer.gamut_distance(from_pixels(design)[None])
-    return float((distance > IN_GAMUT).double().mean())
-
-
-def _row(way: str, printer: str, outcome: np.ndarray, base: np.ndarray, out_of_gamut: float) -> Row:
-    """`outcome` and `base` seeds × {recognized, confidence} × views."""
-    (hit, confidence), (base_hit, base_confidence) = (one.transpose(1, 0, 2) for one in (outcome, base))
-    hits, base_hits = ([bool(one) for one in which.ravel()] for which in (hit, base_hit))
-    gains = confidence - base_confidence
-    return Row(
-        printer,
-        way,
-        rate(hits),
-        difference(hits, base_hits),
-        _mean(confidence),
-        _mean(gains),
-        tuple(gains.mean(1).tolist()),
-        out_of_gamut,
-    )
-
-
-def _mean(values: np.ndarray) -> Estimate:
-    """A mean with its normal 95 % interval."""
-    mean, half = float(values.mean()), 1.96 * float(values.std(ddof=1)) / math.sqrt(values.size)
-    return Estimate(mean, mean - half, mean + half, values.size)
-
-
-# ------------------------------------------------------------------------------------------------ as a study
-
-
-def _cells(settings: GamutSettings, base: Path) -> list[Cell]:
-    names = [Path(scene).stem for scene in settings.scenes]
-    if len(set(names)) < len(names):
-        raise Refused("scene files with names of their own", ", ".join(settings.scenes), "rename one")
-    return [
-        Cell(f"{name}-seed-{seed}", {"scene": scene, "name": name, "seed": seed})
-        for name, scene in zip(names, settings.scenes, strict=True)
-        for seed in settings.seeds
-    ]
-
-
-def _run(settings: GamutSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    scene = load_scene(base / cell.values["scene"])
-    known = load_printer(scene.settings.printer.profile, scene.base)
-    found = gamut_cell(scene, cell.values["seed"], other_printers(known), views=settings.views)
-    return {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in vars(found).items()}
-
-
-def _by_scene(results: Sequence[Result]) -> dict[str, list[Row]]:
-    found: dict[str, list[Outcomes]] = {}
-    for result in results:
-        one = result.found
-        arrays = (np.array(one[key]) for key in ("outcomes", "out_of_gamut"))
-        outcomes = Outcomes(tuple(one["ways"]), tuple(one["printers"]), *arrays)
-        found.setdefault(result.cell.values["name"], []).append(outcomes)
-    return {name: gamut_rows(seeds) for name, seeds in found.items()}
-
-
-def _tables(settings: GamutSettings, results: Sequence[Result]) -> list[Table]:
+def tables(settings: GamutSettings, results: Sequence[Result]) -> list[Table]:
+    """One per scene."""
     head = ("printed by", "optimized", "rate", "difference", "confidence", "gain", "gain by seed", "missed")
     about = (
-        f"{settings.views} views per seed, the same for all rows. Differences (of rates) and gains (of confidence) are "
+        f"{settings.n} views per seed, the same for all rows. Differences (of rates) and gains (of confidence) are "
         "to the first way, paired. The first printer is the known one. Missed: pixels that it shows more than ΔE00 "
         f"{IN_GAMUT:g} off."
     )
+    scenes = grouped(results, of_values("name"))
+    return [Table(name, name, head, tuple(rows_of(group)), about) for (name,), group in scenes.items()]
+
+
+def figures(settings: GamutSettings, results: Sequence[Result]) -> list[Drawing]:
+    """What each way gained, one per scene."""
+    title = "gain in confidence over designs of any color"
+    scenes = grouped(results, of_values("name"))
     return [
-        Table(name, name, head, tuple(_table_row(row) for row in rows), about)
-        for name, rows in _by_scene(results).items()
+        Drawing(name, f"{name}: {title}", partial(_draw, rows_of(group)), (7.0, 3.4))
+        for (name,), group in scenes.items()
     ]
 
 
-def _table_row(row: Row) -> tuple:
-    by_seed = " ".join(f"{gain:+.3f}" for gain in row.gain_by_seed)
-    return row.printer, row.way, row.rate, row.difference, row.confidence, row.gain, by_seed, row.out_of_gamut
-
-
-def _figures(settings: GamutSettings, results: Sequence[Result]) -> list[Drawing]:
-    return [
-        Drawing(name, f"{name}: gain in confidence over designs of any color", partial(_draw, rows), (7.0, 3.4))
-        for name, rows in _by_scene(results).items()
-    ]
-
-
-def _draw(rows: Sequence[Row], figure) -> None:
+def _draw(rows: Sequence[Row], figure: Figure) -> None:
     """A group of intervals per printer, a color per way."""
     axes = figure.add_subplot()
     printers, ways = (list(dict.fromkeys(names)) for names in zip(*((r.printer, r.way) for r in rows), strict=True))
     for i, way in enumerate(ways[1:]):
-        mine = [row.gain for row in rows if row.way == way]
-        x = np.arange(len(mine)) + (i - len(ways) / 2 + 1) * 0.13
-        reach = [[one.value - one.low for one in mine], [one.high - one.value for one in mine]]
-        axes.errorbar(x, [one.value for one in mine], reach, fmt="o", ms=4, capsize=2, label=way)
+        values, reach = whiskers([row.gain for row in rows if row.way == way and row.gain is not None])
+        x = np.arange(len(values)) + (i - len(ways) / 2 + 1) * 0.13
+        axes.errorbar(x, values, reach, fmt="o", ms=4, capsize=2, label=way)
     axes.axhline(0, color="0.5", lw=0.8)
     axes.set_xticks(range(len(printers)), printers)
     axes.set(ylabel="confidence, paired difference", xlabel="printed by")
     axes.legend(fontsize=7, frameon=False)
 
 
-_ABOUT = "What gamut in the loop buys: designs optimized with and without their printer, reprinted by others."
-STUDY = Study("gamut", _ABOUT, GamutSettings, _cells, _run, _tables, _figures)
+STUDY = Study("gamut", GamutSettings, cells, run, tables, figures)

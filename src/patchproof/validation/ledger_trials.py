@@ -1,5 +1,6 @@
-"""Whether the gap ledger names the culprit: photographs with one known trouble each, beside the same without it.
+"""Whether the gap ledger names a known culprit in simulated photographs.
 
+They have one known trouble each, and stand beside the same ones without it.
 In: finished runs. Out: for each trial the culprit that was put in and the one that `verify` named; rates with Wilson
 intervals and the table of confusions. A trial draws views of the reprint stream and one trouble: another printer, blur,
 a color cast or dim light. Only troubles that cost at least 10 points of confidence, in the photographs that the ledger
@@ -237,7 +238,7 @@ def _faded(printer: Printer, kept: np.ndarray, srgb: np.ndarray) -> np.ndarray:
 
 def tables(settings: LedgerSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Rates by culprit, confusions, and every trial."""
-    asked = [one for one in results if one.found["outcome"] == "asked"]
+    asked = [one for one in results if one.answers["outcome"] == "asked"]
     return (_rates(results, asked), _confusions(asked), _trials(results))
 
 
@@ -245,18 +246,18 @@ def _rates(results: Sequence[Result], asked: Sequence[Result]) -> Table:
     rows = []
     for kind in (*STEP, None):
         mine = [one for one in asked if kind in (None, one.cell.values["culprit"])]
-        outcomes = [one.found["outcome"] for one in results if kind in (None, one.cell.values["culprit"])]
-        hits = [one.found["named"] == STEP[one.cell.values["culprit"]] for one in mine]
+        outcomes = [one.answers["outcome"] for one in results if kind in (None, one.cell.values["culprit"])]
+        hits = [one.answers["named"] == STEP[one.cell.values["culprit"]] for one in mine]
         rows.append((kind or "all", rate(hits), outcomes.count("weak"), outcomes.count("unreadable")))
     about = f"of trials that cost at least {LEAST_COST:.0%} of confidence; the shares' sum is the whole within "
-    about += f"{max((one.found['sum_error'] for one in asked), default=0):.0e}"
+    about += f"{max((one.answers['sum_error'] for one in asked), default=0):.0e}"
     return Table("rates", "Culprits named", ("culprit", "named", "cost less", "unreadable"), tuple(rows), about)
 
 
 def _confusions(asked: Sequence[Result]) -> Table:
     names = ("print", "light_and_camera", "blur_and_noise", "print_light_and_camera", None)
     rows = tuple(
-        (kind, *(sum(o.cell.values["culprit"] == kind and o.found["named"] == n for o in asked) for n in names))
+        (kind, *(sum(o.cell.values["culprit"] == kind and o.answers["named"] == n for o in asked) for n in names))
         for kind in STEP
     )
     return Table("confusions", "Put in and named", ("put in", *(n or "none" for n in names)), rows, "trials")
@@ -266,7 +267,7 @@ def _trials(results: Sequence[Result]) -> Table:
     head = ("trial", "run", "culprit", "trouble", "outcome", "cost", "photographs", "named", "shares")
     rows = []
     for one in results:
-        values, found = one.cell.values, one.found
+        values, found = one.cell.values, one.answers
         shares = "  ".join(f"{step} {share:+.2f}" for step, share in found.get("shares", {}).items())
         said = (found["trouble"], found["outcome"], found["cost"], found["photos"], found.get("named") or "–", shares)
         rows.append((values["number"], Path(values["run"]).name, values["culprit"], *said))
@@ -278,12 +279,4 @@ def figures(settings: LedgerSettings, results: Sequence[Result]) -> tuple[()]:
     return ()
 
 
-STUDY = Study(
-    "ledger",
-    "Whether the gap ledger names a known culprit in simulated photographs.",
-    LedgerSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("ledger", LedgerSettings, cells, run, tables, figures)

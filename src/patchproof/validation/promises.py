@@ -1,5 +1,6 @@
-"""Whether promises hold: many runs, each promised, printed, photographed by a renderer that is not ours, and verified.
+"""Whether promised rates hold in independently rendered photographs.
 
+Many runs are promised, printed, photographed by a renderer that is not ours, and verified.
 In: scene files, networks, printers, seeds. Out: for every combination the promised rate, the interval of counts that
 its photographs should show, and the count that they did show; the share of intervals that held, their widths, the bias
 of each scene, and what a correction would be worth: a shift of the promise's log odds, fitted on every other scene and
@@ -11,9 +12,9 @@ Photographs are path-traced (`path_traced`), since those of our own renderer wou
 
 from __future__ import annotations
 
-import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,45 +23,45 @@ from pydantic import Field
 
 from patchproof.claims import mean, prediction_interval, rate
 from patchproof.report.tables import Drawing, Table
-from patchproof.settings import SceneSettings
-from patchproof.strict import Strict, expand, read_toml, validated
-from patchproof.study.study import Cell, Result, Study, short_name
+from patchproof.study.grid import (
+    GridSettings,
+    Names,
+    cell_of,
+    networks_at,
+    pairs,
+    scene_of,
+    short_name,
+    with_tables,
+)
+from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Names = Annotated[tuple[str, ...], Field(min_length=1)]
 _LOW, _HIGH = 1e-3, 1 - 1e-3  # rates whose odds are taken
 
 
-class PromisesSettings(Strict):
-    """Every scene with every network, printer and seed; paths are relative to the config's folder."""
+class PromisesSettings(GridSettings):
+    """A run for each scene, network, printer and seed."""
 
-    scenes: Names  # scene files
-    networks: Names  # each trains and judges its own designs
     printers: Names = ("coated",)  # that print the designs, and are known while optimizing
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (0,)  # of the optimizer
     photos: Annotated[int, Field(ge=10, le=1000)] = 40  # of each print
     path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
 
 
 def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
     """One per combination, with the whole scene in it."""
-    found = []
-    for file in settings.scenes:
-        path = Path(expand(file, base))
-        data = read_toml(path)
-        for network in settings.networks:
-            for printer in settings.printers:
-                tables = {"target": {"models": [network]}, "printer": {"profile": printer}}
-                whole = data | {name: {**data.get(name, {}), **keys} for name, keys in tables.items()}
-                scene = validated(SceneSettings, whole, path.name).model_dump(mode="json")
-                for seed in settings.seeds:
-                    words = (path.stem, short_name(network), short_name(printer), str(seed))
-                    name = re.sub(r"[^\w=+.,-]", "-", ".".join(words))
-                    values = {"name": path.stem, "file": file, "scene": scene, "seed": seed}
-                    found.append(Cell(name, values | {"network": network, "printer": printer}))
-    return found
+    return [
+        cell_of(
+            with_tables(values, {"target": {"models": values["networks"]}, "printer": {"profile": printer}}),
+            seed,
+            values["network"],
+            short_name(printer),
+        )
+        for values in pairs(settings, base)
+        for printer in settings.printers
+        for seed in settings.seeds
+    ]
 
 
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
@@ -70,12 +71,13 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     from patchproof.printing.sheet import sheet_of
     from patchproof.reprints.hung_sheet import Hanging
     from patchproof.reprints.reprint import reprint
-    from patchproof.study.trained import scene_of
 
+    scene = scene_of(base, cell.values)
+    scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         # one control is enough for a page, and all of them would take most of a promise's time
-        made = optimize_scene(scene_of(base, cell), folder / "run", controls=("bare",))
+        made = optimize_scene(scene, folder / "run", controls=("bare",))
         sheet_of(made, folder / "sheet.pdf")
         pdf, photos = folder / "sheet.pdf", folder / "photos"
         reprint(pdf, made, settings.photos, photos, Hanging(path_traced=settings.path_traced))
@@ -95,16 +97,19 @@ def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table
     return _shares(settings, results), _correction(results), _each(results)
 
 
-def interval_of(found, shift: float = 0.0) -> tuple[int, int]:
+Count = Mapping[str, Any]  # what a cell counted: promised rate and its n, photographs judged and recognized
+
+
+def interval_of(count: Count, shift: float = 0.0) -> tuple[int, int]:
     """Counts that the promise allows, with its log odds shifted."""
-    promised = round(float(shifted(found["rate"], shift)) * found["n"])
-    return prediction_interval(promised, found["n"], found["judged"])
+    promised = round(float(shifted(count["rate"], shift)) * count["n"])
+    return prediction_interval(promised, count["n"], count["judged"])
 
 
-def held(found, shift: float = 0.0) -> bool:
+def held(count: Count, shift: float = 0.0) -> bool:
     """Whether the count lies in the promise's interval."""
-    low, high = interval_of(found, shift)
-    return low <= found["recognized"] <= high
+    low, high = interval_of(count, shift)
+    return low <= count["recognized"] <= high
 
 
 def shifted(rates, shift: float) -> np.ndarray:
@@ -115,55 +120,51 @@ def shifted(rates, shift: float) -> np.ndarray:
     return 1 / (1 + (1 / rates - 1) * np.exp(-shift))
 
 
-def fitted_shift(founds: Sequence) -> float:
+def fitted_shift(counts: Sequence[Count]) -> float:
     """The shift that makes the counts most likely."""
-    from scipy.optimize import minimize_scalar
+    from scipy.optimize import fminbound
 
-    rates, hits, n = (np.array([found[key] for found in founds], float) for key in ("rate", "recognized", "judged"))
+    rates, hits, n = (np.array([count[key] for count in counts], float) for key in ("rate", "recognized", "judged"))
 
     def unlikely(shift: float) -> float:
         p = shifted(rates, shift or 1e-12)
         return -float((hits * np.log(p) + (n - hits) * np.log(1 - p)).sum())
 
-    return float(minimize_scalar(unlikely, bounds=(-3, 3), method="bounded").x)
+    return float(np.asarray(fminbound(unlikely, -3, 3)))
 
 
-def _judged(results: Sequence[Result]) -> list[Result]:
-    return [one for one in results if one.found["judged"]]
+def _bias(counts: Sequence[Count], shift: float = 0.0) -> list[float]:
+    return [count["recognized"] / count["judged"] - float(shifted(count["rate"], shift)) for count in counts]
 
 
-def _bias(founds: Sequence, shift: float = 0.0) -> list[float]:
-    return [found["recognized"] / found["judged"] - float(shifted(found["rate"], shift)) for found in founds]
-
-
-def _width(founds: Sequence, shift: float = 0.0) -> float:
+def _width(counts: Sequence[Count]) -> float:
     """The median width of the intervals, as a share of the photographs."""
-    ends = [(interval_of(found, shift), found["judged"]) for found in founds]
+    ends = [(interval_of(count), count["judged"]) for count in counts]
     return float(np.median([(high - low) / judged for (low, high), judged in ends]))
 
 
-def _by_scene(results: Sequence[Result]) -> dict[str, list]:
-    found: dict[str, list] = {}
-    for one in _judged(results):
-        found.setdefault(one.cell.values["name"], []).append(one.found)
-    return found
+def _by_scene(results: Sequence[Result]) -> dict[str, list[Count]]:
+    """By scene the counts of those that could be judged."""
+    scenes: dict[str, list[Count]] = {}
+    for result in results:
+        if result.answers["judged"]:
+            scenes.setdefault(result.cell.values["name"], []).append(result.answers)
+    return scenes
 
 
 def _shares(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     scenes = _by_scene(results)
-    groups = {**scenes, "all": [found for some in scenes.values() for found in some]}
-    rows = tuple(
-        (name, rate([held(found) for found in some]), _width(some), mean(_bias(some))) for name, some in groups.items()
-    )
+    groups = {**scenes, "all": [count for counts in scenes.values() for count in counts]} if scenes else {}
+    rows = tuple((name, rate(list(map(held, some))), _width(some), mean(_bias(some))) for name, some in groups.items())
     how = "path-traced" if settings.path_traced else "our own renderer's"
     about = f"{settings.photos} {how} photographs for each promise; width: median, as a share of the photographs; "
     about += "bias: recognized minus promised rate"
-    return Table("held", "Promises that held", ("scene", "held", "width", "bias"), rows if scenes else (), about)
+    return Table("held", "Promises that held", ("scene", "held", "width", "bias"), rows, about)
 
 
 def _correction(results: Sequence[Result]) -> Table:
     scenes = list(_by_scene(results).items())
-    halves = [[found for _, some in scenes[i::2] for found in some] for i in (0, 1)]
+    halves = [[count for _, counts in scenes[i::2] for count in counts] for i in (0, 1)]
     head = ("fitted on", "judged on", "shift of the log odds", "held without", "held with", "bias without", "bias with")
     rows = []
     for fit, judge in ((0, 1), (1, 0)):
@@ -171,7 +172,7 @@ def _correction(results: Sequence[Result]) -> Table:
             continue
         shift, others = fitted_shift(halves[fit]), halves[judge]
         names = [", ".join(name for name, _ in scenes[half::2]) for half in (fit, judge)]
-        shares = [rate([held(found, by) for found in others]) for by in (0.0, shift)]
+        shares = [rate([held(count, by) for count in others]) for by in (0.0, shift)]
         rows.append((*names, shift, *shares, *(mean(_bias(others, by)) for by in (0.0, shift))))
     about = "one shift for all; verify does not use it"
     return Table("correction", "What a correction would be worth", head, tuple(rows), about)
@@ -180,11 +181,13 @@ def _correction(results: Sequence[Result]) -> Table:
 def _each(results: Sequence[Result]) -> Table:
     head = ("scene", "network", "printer", "seed", "promised", "judged", "recognized", "low", "high")
     rows = []
-    for one in _judged(results):
-        values, found = one.cell.values, one.found
-        who = (values["name"], short_name(values["network"]), short_name(values["printer"]), values["seed"])
-        what = (found["rate"], found["judged"], found["recognized"], *interval_of(found))
-        rows.append((*who, *what, held(found), found["verdict"]))
+    for result in results:
+        values, count = result.cell.values, result.answers
+        if count["judged"]:
+            printer = short_name(values["scene"]["printer"]["profile"])
+            start = (values["name"], values["network"], printer, values["seed"])
+            what = (count["rate"], count["judged"], count["recognized"], *interval_of(count))
+            rows.append((*start, *what, held(count), count["verdict"]))
     unseen = len(results) - len(rows)
     about = f"{unseen} combinations without a photograph that could be judged are left out" if unseen else ""
     return Table("promises", "Every promise", (*head, "held", "verdict"), tuple(rows), about)
@@ -199,14 +202,12 @@ def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Draw
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
-        for name, some in scenes.items():
-            promised, seen = [f["rate"] for f in some], [f["recognized"] / f["judged"] for f in some]
-            ends = np.array([np.array(interval_of(f)) / f["judged"] for f in some]).T
-            middle = ends.mean(0)
-            (line,) = axes.plot(promised, seen, "o", label=name, markersize=5)
-            axes.errorbar(
-                promised, middle, yerr=middle - ends[0], fmt="none", ecolor=line.get_color(), alpha=0.35, linewidth=3
-            )
+        for name, counts in scenes.items():
+            promised = [count["rate"] for count in counts]
+            shares = [count["recognized"] / count["judged"] for count in counts]
+            low, high = np.array([np.array(interval_of(count)) / count["judged"] for count in counts]).T
+            (line,) = axes.plot(promised, shares, "o", label=name, markersize=5)
+            axes.vlines(promised, low, high, colors=line.get_color(), alpha=0.35, linewidth=3)
         axes.set(xlabel="promised rate", ylabel="share recognized in photographs", xlim=(0, 1.02), ylim=(-0.02, 1.04))
         axes.legend(loc="upper left", fontsize=8)
 
@@ -214,12 +215,4 @@ def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Draw
     return (Drawing("calibration", "Promised and seen", draw, (6.0, 5.0), about),)
 
 
-STUDY = Study(
-    "promises",
-    "Whether promised rates hold in independently rendered photographs.",
-    PromisesSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("promises", PromisesSettings, cells, run, tables, figures)

@@ -16,7 +16,10 @@ from patchproof.reprints.hung_sheet import scaled_print
 from patchproof.scene.bend import curled
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.placement import Placement
 from patchproof.scene.scene import Scene
+from patchproof.sheets.piece import Piece
+from patchproof.strict import Refused
 
 Point = Mapping[str, float]
 """Values by axis; what is not named is as drawn, or as the run has it."""
@@ -43,12 +46,25 @@ class Axis:
         return float(easy * (hard / easy) ** position if self.ratio else easy + (hard - easy) * position)
 
 
-def _distances(scene: MeshScene) -> tuple[float, float]:
+def _distances(scene: Scene) -> tuple[float, float]:
     """From the scene's closest to where a marker's module is two thirds of a pixel."""
+    scene, piece, _ = hung(scene)
     photo_px = scene.settings.camera.photo_px
     nearest = scene.settings.view.distance_mm[0]
-    far = 1.5 * float(scene.matrix_px(photo_px)[0, 0]) * scene.piece.module_mm
+    far = 1.5 * float(scene.matrix_px(photo_px)[0, 0]) * piece.module_mm
     return nearest, max(far, 2 * nearest)
+
+
+def hung(scene: Scene) -> tuple[MeshScene, Piece, Placement]:
+    """The scene, its piece, and where that lies on the object."""
+    if not isinstance(scene, MeshScene) or scene.piece is None or scene.placement is None:
+        raise Refused("a patch on an object with a mesh", "another scene", "leave this axis out")
+    return scene, scene.piece, scene.placement
+
+
+def _radii(scene: Scene) -> tuple[float, float]:
+    width, _ = hung(scene)[2].size_mm
+    return 8 * width, 0.35 * width
 
 
 def _pixels(share: float) -> Callable[[Scene], float]:
@@ -69,8 +85,8 @@ AXES: dict[str, Axis] = {
     "noise": Axis("noise", "of white", lambda scene: (0.004, 1.0), ratio=True, needs_mesh=False),
     "jpeg": Axis("JPEG", "quality", lambda scene: (95.0, 1.0), ratio=True, needs_mesh=False),
     "hidden": Axis("hidden corners", "quarters", lambda scene: (0.0, 4.0), needs_mesh=False),
-    "curl": Axis("curl", "mm radius", lambda scene: tuple(k * scene.placement.size_mm[0] for k in (8, 0.35)), True),
-    "gap": Axis("gap behind", "mm", lambda scene: (0.0, round(scene.settings.object.length_mm / 3))),
+    "curl": Axis("curl", "mm radius", _radii, True),
+    "gap": Axis("gap behind", "mm", lambda scene: (0.0, round((scene.settings.object.length_mm or 0) / 3))),
     "mismatch": Axis("print mismatch", "× other printer", lambda scene: (0.0, 6.0), needs_mesh=False),
     "size": Axis("patch size", "× its own", lambda scene: (1.0, 0.1), ratio=True),
 }
@@ -90,7 +106,7 @@ def possible(scene: Scene, name: str) -> bool:
     """Whether this scene can be photographed at other values of the axis."""
     if not isinstance(scene, MeshScene):
         return not AXES[name].needs_mesh
-    return name != "curl" or scene.placement.is_flat
+    return name != "curl" or hung(scene)[2].is_flat
 
 
 def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditions:
@@ -111,10 +127,12 @@ _FIELDS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg
 def placed_at(scene: Scene, point: Point) -> Scene:
     """The scene with its piece printed smaller, standing off, or curled."""
     if "size" in point:
-        scene = scaled_print(scene, (point["size"],) * 2)
+        scene = scaled_print(scene, (point["size"], point["size"]))
     if not {"curl", "gap"} & point.keys():
         return scene
-    placement = scene.placement if "curl" not in point else curled(scene.placement, point["curl"])
+    scene, _, placement = hung(scene)
+    if "curl" in point:
+        placement = curled(placement, point["curl"])
     if "gap" in point:
         off, frame = point["gap"] * placement.normal, placement.world_from_piece.copy()
         frame[:3, 3] += off

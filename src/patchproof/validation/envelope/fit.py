@@ -58,8 +58,10 @@ def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
         return Break(None, None, None, p, tuple(best.tolist()))
     low, high, _ = _fit(counts, n, at)
     middle = np.where(high < BEYOND, (low + high) / 2, low)
-    ends = [(middle, 0.5), (low, 0.025), (high, 0.975)]
-    return Break(*(float(np.quantile(v, q, method="inverted_cdf")) for v, q in ends), p, tuple(best.tolist()))
+    value, low, high = (
+        float(np.quantile(drawn, q, method="inverted_cdf")) for drawn, q in ((middle, 0.5), (low, 0.025), (high, 0.975))
+    )
+    return Break(value, low, high, p, tuple(best.tolist()))
 
 
 def curve_at(curve: np.ndarray, at: np.ndarray) -> np.ndarray:

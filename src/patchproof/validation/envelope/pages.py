@@ -8,7 +8,7 @@ is open there.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,16 +16,19 @@ import numpy as np
 from patchproof.claims import Estimate, rate
 from patchproof.goal import Goal
 from patchproof.report.tables import Drawing, Table, Value
+from patchproof.study.figures import number_grid, whiskers
 from patchproof.validation.envelope.axes import AXES
 from patchproof.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from patchproof.study.study import Result
 
 STAGES = {"recognized": "recognized", "found": "sheet found", "measured": "measured"}
 _COLORS = {"recognized": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
+End = Break = Mapping[str, Any]  # of a cell's values its axis with both ends; of its answers where a stage breaks
 HOLDS, NEVER = "holds", "never worked"
 _PAGE_IN = (11.69, 8.27)  # A4, lying
 
@@ -39,7 +42,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
             "breaks",
             "Breaking points",
             (*ends, *STAGES.values(), "not monotone"),
-            tuple(_break_row(one) for one in sweeps),
+            tuple(_break_row(result) for result in sweeps),
             "Where a fitted falling curve has lost half of what it loses over the sweep: median of the bootstrap over "
             f"conditions, 95 % interval. “{HOLDS}”: it loses less than {LEAST_LOST:.0%} of its rate. n conditions: "
             f"{settings.n} shown to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
@@ -48,14 +51,14 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
             "beyond",
             "What the tool says beyond",
             ("axis", "photographs", "measured all the same", "said of the others"),
-            tuple(_beyond_row(one) for one in sweeps),
+            tuple(_beyond_row(result) for result in sweeps),
             "Photographs at points harder than the breaking point of measuring, or at the hardest point.",
         ),
         Table(
             "sweeps",
             "All points",
             ("axis", "value", *STAGES.values(), "median error mm", "largest error mm", "said"),
-            tuple(row for one in sweeps for row in _point_rows(one)),
+            tuple(row for result in sweeps for row in _point_rows(result)),
             "Errors are the largest of the design's four corners, against the simulation's truth, where a flat sheet "
             "was measured. Intervals: Wilson.",
         ),
@@ -63,7 +66,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
             "maps",
             "Maps",
             ("x", "y", "at x", "at y", *STAGES.values()),
-            tuple(row for one in maps for row in _map_rows(one)),
+            tuple(row for result in maps for row in _map_rows(result)),
             f"n per point: {settings.map_n} recognized, {settings.map_photos} photographed.",
         ),
     )
@@ -94,53 +97,55 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
 
 
 def _split(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
-    return [one for one in results if "y" not in one.cell.values], [one for one in results if "y" in one.cell.values]
+    return [result for result in results if "y" not in result.cell.values], [
+        result for result in results if "y" in result.cell.values
+    ]
 
 
-def _worked(found: dict) -> dict[str, np.ndarray]:
+def worked(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """P×N bool by stage."""
-    status = np.array(found["status"])
+    status = np.array(answers["status"])
     return {
-        "recognized": np.array(found["recognized"], bool),
+        "recognized": np.array(answers["recognized"], bool),
         "found": status != "rejected",
         "measured": status == "measured",
     }
 
 
-def _break_row(one: Result) -> tuple[Value, ...]:
-    x, breaks = one.cell.values["x"], one.found["breaks"]
-    axis, worked = AXES[x["axis"]], _worked(one.found)
+def _break_row(result: Result) -> tuple[Value, ...]:
+    x, breaks = result.cell.values["x"], result.answers["breaks"]
+    axis, works = AXES[x["axis"]], worked(result.answers)
     rising = [f"{STAGES[name]} (p = {b['monotone_p']:.3f})" for name, b in breaks.items() if _rises(b)]
-    values = [_break_value(x, breaks[name], worked[name].shape[1]) for name in STAGES]
+    values = [_break_value(x, breaks[name], works[name].shape[1]) for name in STAGES]
     return axis.title, axis.unit, x["easy"], x["hard"], *values, ", ".join(rising)
 
 
-def _rises(found_break: dict) -> bool:
-    return found_break["monotone_p"] < NOT_MONOTONE
+def _rises(break_: Break) -> bool:
+    return break_["monotone_p"] < NOT_MONOTONE
 
 
-def _break_value(x: dict, found_break: dict, n: int) -> Value:
-    if found_break["value"] is None:
+def _break_value(x: End, break_: Break, n: int) -> Value:
+    if break_["value"] is None:
         return NEVER
-    if found_break["value"] >= BEYOND:
+    if break_["value"] >= BEYOND:
         return HOLDS
-    ends = [_at(x, found_break[name]) for name in ("low", "high")]
-    return Estimate(_at(x, found_break["value"]), min(ends), max(ends), n)
+    ends = [_at(x, break_[name]) for name in ("low", "high")]
+    return Estimate(_at(x, break_["value"]), min(ends), max(ends), n)
 
 
-def _at(x: dict, position: float) -> float:
+def _at(x: End, position: float) -> float:
     return AXES[x["axis"]].value(x["easy"], x["hard"], min(position, 1.0))
 
 
-def _beyond_row(one: Result) -> tuple[Value, ...]:
-    x, found = one.cell.values["x"], one.found
-    where = found["breaks"]["measured"]["value"]
+def _beyond_row(result: Result) -> tuple[Value, ...]:
+    x, answers = result.cell.values["x"], result.answers
+    where = answers["breaks"]["measured"]["value"]
     at = np.linspace(0, 1, x["points"])
     beyond = [i for i in range(x["points"]) if at[i] > min(1.0 if where is None else where, 1 - 1e-9)]
     if where is None:
         beyond = list(range(x["points"]))
-    status = [s for i in beyond for s in found["status"][i]]
-    codes = [c for i in beyond for s, c in zip(found["status"][i], found["code"][i], strict=True) if s != "measured"]
+    photos = [photo for i in beyond for photo in zip(answers["status"][i], answers["code"][i], strict=True)]
+    status, codes = [status for status, _ in photos], [code for status, code in photos if status != "measured"]
     return AXES[x["axis"]].title, len(status), status.count("measured"), _counted(codes)
 
 
@@ -148,49 +153,56 @@ def _counted(codes: Sequence[str | None]) -> str:
     return ", ".join(f"{code} {count}" for code, count in Counter(code for code in codes if code).most_common())
 
 
-def _point_rows(one: Result) -> list[tuple[Value, ...]]:
-    name, found = one.cell.values["x"]["axis"], one.found
-    worked, rows = _worked(found), []
-    for i, point in enumerate(found["points"]):
-        errors = [e for e in found["error_mm"][i] if e is not None]
+def _point_rows(result: Result) -> list[tuple[Value, ...]]:
+    name, answers = result.cell.values["x"]["axis"], result.answers
+    works, rows = worked(answers), []
+    for i, point in enumerate(answers["points"]):
+        errors = [e for e in answers["error_mm"][i] if e is not None]
         median, largest = (float(np.median(errors)), max(errors)) if errors else (None, None)
-        rates = [rate(worked[stage][i].tolist()) for stage in STAGES]
-        rows.append((AXES[name].title, point[name], *rates, median, largest, _counted(found["code"][i])))
+        rates = [rate(works[stage][i].tolist()) for stage in STAGES]
+        rows.append((AXES[name].title, point[name], *rates, median, largest, _counted(answers["code"][i])))
     return rows
 
 
-def _map_rows(one: Result) -> list[tuple[Value, ...]]:
-    x, y = (one.cell.values[key]["axis"] for key in ("x", "y"))
-    worked = _worked(one.found)
+def _map_rows(result: Result) -> list[tuple[Value, ...]]:
+    x, y = (result.cell.values[key]["axis"] for key in ("x", "y"))
+    works = worked(result.answers)
     return [
-        (AXES[x].title, AXES[y].title, point[x], point[y], *(rate(worked[stage][i].tolist()) for stage in STAGES))
-        for i, point in enumerate(one.found["points"])
+        (AXES[x].title, AXES[y].title, point[x], point[y], *(rate(works[stage][i].tolist()) for stage in STAGES))
+        for i, point in enumerate(result.answers["points"])
     ]
 
 
-def _draw_page(figure, sweeps: Sequence[Result], maps: Sequence[Result]) -> None:
-    found = (sweeps or maps)[0].found
-    goal = "seen as" if Goal(found["goal"]).sign > 0 else "not seen as"
-    figure.suptitle(f"Operating envelope of sheet {found['sheet']}: {goal} {found['label']} by {found['model']}")
-    parts = figure.subfigures(1, 2, width_ratios=(1.15, 1)) if sweeps and maps else [figure, figure]
+def _draw_page(figure: Figure, sweeps: Sequence[Result], maps: Sequence[Result]) -> None:
+    first = (sweeps or maps)[0].answers
+    goal = "seen as" if Goal(first["goal"]).sign > 0 else "not seen as"
+    figure.suptitle(f"Operating envelope of sheet {first['sheet']}: {goal} {first['label']} by {first['model']}")
+    left, right = figure, figure
+    if sweeps and maps:
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1))[0]
     if sweeps:
-        _draw_bars(parts[0].add_subplot(), sweeps)
+        _draw_bars(left.add_subplot(), sweeps)
     if maps:
         rows = -(-len(maps) // 2)
-        for axes, one in zip(parts[1].subplots(rows, 2, squeeze=False).flat, maps, strict=False):
-            _draw_map(axes, one)
-        for axes in parts[1].axes[len(maps) :]:
+        for axes, result in zip(right.subplots(rows, 2, squeeze=False).flat, maps, strict=False):
+            _draw_map(axes, result)
+        for axes in right.axes[len(maps) :]:
             axes.set_axis_off()
         note = "number: share recognized, %; ×: fewer than half of the photographs can be measured"
-        parts[1].supxlabel(note, fontsize=7)
+        right.supxlabel(note, fontsize=7)
 
 
 def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
-    for row, one in enumerate(sweeps):
-        x = one.cell.values["x"]
+    for row, result in enumerate(sweeps):
+        x = result.cell.values["x"]
         for k, (stage, color) in enumerate(_COLORS.items()):
             _draw_bar(
-                axes, row + 0.24 * (k - 1), x, one.found["breaks"][stage], color, STAGES[stage] if not row else None
+                axes,
+                row + 0.24 * (k - 1),
+                x,
+                result.answers["breaks"][stage],
+                color,
+                STAGES[stage] if not row else None,
             )
         axis = AXES[x["axis"]]
         axes.text(-0.02, row, f"{axis.title}\n{axis.unit}", ha="right", va="center", fontsize=7.5)
@@ -202,8 +214,8 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
     axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.55, 1.04), frameon=False, fontsize=8)
 
 
-def _draw_bar(axes: Axes, y: float, x: dict, found_break: dict, color: str, label: str | None) -> None:
-    value, low, high = (found_break[name] for name in ("value", "low", "high"))
+def _draw_bar(axes: Axes, y: float, x: End, break_: Break, color: str, label: str | None) -> None:
+    value, low, high = (break_[name] for name in ("value", "low", "high"))
     axes.barh(y, min(value or 0.0, 1.0), height=0.2, color=color, alpha=0.75, label=label)
     if value is None:
         axes.text(0.01, y, NEVER, va="center", fontsize=6.5)
@@ -212,8 +224,8 @@ def _draw_bar(axes: Axes, y: float, x: dict, found_break: dict, color: str, labe
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)
         return
     axes.plot([low, min(high, 1.0)], [y, y], color="black", linewidth=0.9)
-    curve = found_break["curve"]
-    text = f"{_short(_at(x, value))} ({curve[0]:.2f}–{curve[-1]:.2f})" + (" !" if _rises(found_break) else "")
+    curve = break_["curve"]
+    text = f"{_short(_at(x, value))} ({curve[0]:.2f}–{curve[-1]:.2f})" + (" !" if _rises(break_) else "")
     axes.text(min(high, 1.0) + 0.01, y, text, va="center", fontsize=6.5)
 
 
@@ -221,14 +233,15 @@ def _short(value: float) -> str:
     return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
 
 
-def _draw_map(axes: Axes, one: Result) -> None:
-    x, y = one.cell.values["x"], one.cell.values["y"]
+def _draw_map(axes: Axes, result: Result) -> None:
+    x, y = result.cell.values["x"], result.cell.values["y"]
     shape = (y["points"], x["points"])
-    worked = _worked(one.found)
-    share, can = (worked[stage].mean(1).reshape(shape) for stage in ("recognized", "measured"))
-    axes.imshow(share, cmap="RdYlGn", vmin=0, vmax=1, origin="lower", aspect="auto", alpha=0.8)
-    for (i, j), value in np.ndenumerate(share):
-        axes.text(j, i, f"{100 * value:.0f}" + ("×" if can[i, j] < 0.5 else ""), ha="center", va="center", fontsize=6)
+    works = worked(result.answers)
+    share, can = (works[stage].mean(1).reshape(shape) for stage in ("recognized", "measured"))
+    rows = zip(share, can, strict=True)
+    texts = [[f"{100 * a:.0f}" + ("×" if b < 0.5 else "") for a, b in zip(*row, strict=True)] for row in rows]
+    number_grid(axes, share, texts, colors="RdYlGn", fontsize=6)
+    axes.invert_yaxis()
     for set_ticks, set_label, end in (
         (axes.set_xticks, axes.set_xlabel, x),
         (axes.set_yticks, axes.set_ylabel, y),
@@ -239,29 +252,26 @@ def _draw_map(axes: Axes, one: Result) -> None:
         set_label(f"{axis.title}, {axis.unit}", fontsize=7)
 
 
-def _draw_curves(figure, sweeps: Sequence[Result], rows: int) -> None:
+def _draw_curves(figure: Figure, sweeps: Sequence[Result], rows: int) -> None:
     grid = figure.subplots(rows, 3, squeeze=False)
-    for axes, one in zip(grid.flat, sweeps, strict=False):
-        _draw_sweep(axes, one)
+    for axes, result in zip(grid.flat, sweeps, strict=False):
+        _draw_sweep(axes, result)
     for axes in grid.flat[len(sweeps) :]:
         axes.set_axis_off()
     grid.flat[0].legend(fontsize=7, frameon=False)
 
 
-def _draw_sweep(axes: Axes, one: Result) -> None:
-    x, worked = one.cell.values["x"], _worked(one.found)
+def _draw_sweep(axes: Axes, result: Result) -> None:
+    x, works = result.cell.values["x"], worked(result.answers)
     at, fine = np.linspace(0, 1, x["points"]), np.linspace(0, 1, 101)
     for k, (stage, color) in enumerate(_COLORS.items()):
-        shares = [rate(row.tolist()) for row in worked[stage]]
-        ends = np.array([[s.value - s.low, s.high - s.value] for s in shares]).T
+        values, reach = whiskers([rate(row.tolist()) for row in works[stage]])
         here = at + 0.012 * (k - 1)
-        axes.errorbar(
-            here, [s.value for s in shares], ends.clip(0), fmt="o", ms=3, lw=0.8, color=color, label=STAGES[stage]
-        )
-        found_break = one.found["breaks"][stage]
-        axes.plot(fine, found_break["curve"], color=color, linewidth=1)
-        if found_break["value"] is not None and found_break["value"] < BEYOND:
-            axes.axvline(found_break["value"], color=color, linestyle=":", linewidth=1)
+        axes.errorbar(here, values, reach, fmt="o", ms=3, lw=0.8, color=color, label=STAGES[stage])
+        break_ = result.answers["breaks"][stage]
+        axes.plot(fine, break_["curve"], color=color, linewidth=1)
+        if break_["value"] is not None and break_["value"] < BEYOND:
+            axes.axvline(break_["value"], color=color, linestyle=":", linewidth=1)
     axis = AXES[x["axis"]]
     values = axis.values(x["easy"], x["hard"], x["points"])
     axes.set_xticks(at, [_short(v) for v in values], fontsize=7)

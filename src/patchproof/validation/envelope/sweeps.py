@@ -1,6 +1,6 @@
-"""The operating envelope: where recognition, detection and measurement of one run's patch stop working, and what the
-tool says beyond.
+"""Where recognition, detection and measurement of this patch on this scene stop working, in simulation.
 
+This is the patch's operating envelope, with what the tool says beyond.
 In: a run, sweeps of one axis and maps of two (`envelope_axes`; left out, all that the scene allows). Out: tables, a
 page to print beside the patch, and the curves and maps behind it. All points of a study share their draws of everything
 that is not varied, so that differences between them are not luck. Draws cover the ranges evenly (scrambled Sobol points
@@ -24,7 +24,7 @@ from patchproof.strict import Finite, Refused, Strict, nearest
 from patchproof.study.study import Cell, Study
 from patchproof.validation.envelope.axes import AXES, MAPS, possible
 from patchproof.validation.envelope.fit import find_break
-from patchproof.validation.envelope.pages import figures, tables
+from patchproof.validation.envelope.pages import figures, tables, worked
 from patchproof.validation.envelope.world import measured, open_world, recognized
 
 _SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
@@ -120,42 +120,28 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
         points = [point | {y: value} for value in across for point in points]
     shown = max(n // 4, photos) if "jpeg" in points[0] else n
     seen = recognized(world, points, drawn[:shown])
-    said = measured(world, points, drawn[:photos])
+    photographed = measured(world, points, drawn[:photos])
     works = seen if world.scene.settings.target.goal.sign > 0 else ~seen
-    found = {
+    answers = {
         "goal": world.scene.settings.target.goal,
         "label": str(world.scene.settings.target.label),
         "model": world.problem.classifiers[0].name,
         "sheet": world.scene.sheet_id,
         "points": points,
         "recognized": works.astype(int).tolist(),
-        "status": [[one.status for one in row] for row in said],
-        "code": [[one.code for one in row] for row in said],
-        "error_mm": [[one.error_mm for one in row] for row in said],
+        "status": [[photo.status for photo in row] for row in photographed],
+        "code": [[photo.code for photo in row] for row in photographed],
+        "error_mm": [[photo.error_mm for photo in row] for row in photographed],
     }
-    return found if is_map else found | {"breaks": _breaks(found, len(points), settings.seed)}
+    if is_map:
+        return answers
+    at = np.linspace(0, 1, len(points))
+    breaks = {stage: vars(find_break(works.T, at, settings.seed)) for stage, works in worked(answers).items()}
+    return answers | {"breaks": breaks}
 
 
 def _values(axis: dict) -> tuple[str, list[float]]:
     return axis["axis"], AXES[axis["axis"]].values(axis["easy"], axis["hard"], axis["points"]).tolist()
 
 
-def _breaks(found: dict, points: int, seed: int) -> dict[str, Any]:
-    status, at = np.array(found["status"]), np.linspace(0, 1, points)
-    stages = {
-        "recognized": np.array(found["recognized"], bool),
-        "found": status != "rejected",
-        "measured": status == "measured",
-    }
-    return {name: vars(find_break(worked.T, at, seed)) for name, worked in stages.items()}
-
-
-STUDY = Study(
-    "envelope",
-    "Where recognition, detection and measurement of this patch on this scene stop working, in simulation.",
-    EnvelopeSettings,
-    cells,
-    run,
-    tables,
-    figures,
-)
+STUDY = Study("envelope", EnvelopeSettings, cells, run, tables, figures)

@@ -25,7 +25,7 @@ from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CHUNK
+from patchproof.optimizer.responses import AT_A_TIME
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
@@ -118,7 +118,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
     with torch.inference_mode():
         for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
             every = np.arange(first, len(conditions), 4)
-            size = 1 if as_file else CHUNK
+            size = 1 if as_file else AT_A_TIME
             for rows in (every[i : i + size] for i in range(0, len(every), size)):
                 views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
                 for i in _by_cost(points):

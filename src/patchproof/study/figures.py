@@ -1,0 +1,84 @@
+"""Figures that several studies draw: pictures that cells left behind, numbers in a grid, estimates with whiskers.
+
+In: files of pictures; rates as lists; estimates. Out: `Drawing`s for a study's page, or what matplotlib takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from patchproof.claims import Estimate
+from patchproof.report.tables import Drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+
+def picture_sheet(
+    name: str,
+    title: str,
+    files: Sequence[tuple[str, Path]],
+    size_in: tuple[float, float],
+    about: str = "",
+    per_line: int = 1,
+    rows: Sequence[str] = (),
+    columns: Sequence[str] = (),
+) -> Drawing:
+    """PNGs under their titles, `per_line` side by side; `rows` and `columns` name equal parts of each picture."""
+
+    def draw(figure: Figure) -> None:
+        from matplotlib.image import imread
+
+        panels = figure.subplots(math.ceil(len(files) / per_line), per_line, squeeze=False).ravel()
+        for axes in panels[len(files) :]:
+            axes.set_axis_off()
+        for axes, (caption, path) in zip(panels, files, strict=False):
+            picture = imread(path)
+            axes.imshow(picture)
+            axes.set_title(caption, fontsize=8, loc="left", pad=2)
+            axes.spines[:].set_visible(False)
+            axes.tick_params(length=0, bottom=False, top=False, labelbottom=False, labeltop=True)
+            axes.set_yticks(_middles(picture.shape[0], len(rows)), rows)
+            axes.set_xticks(_middles(picture.shape[1], len(columns)), columns)
+
+    return Drawing(name, title, draw, size_in, about)
+
+
+def number_grid(
+    axes: Axes,
+    values: np.ndarray,
+    texts: Sequence[Sequence[str]],
+    framed: Sequence[tuple[int, int]] = (),
+    colors: str = "viridis",
+    limits: tuple[float, float] = (0.0, 1.0),
+    fontsize: float = 7,
+) -> AxesImage:
+    """R×C colored cells with a text in each; `framed` are (row, column)."""
+    from matplotlib.patches import Rectangle
+
+    image = axes.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
+    for (row, column), value in np.ndenumerate(values):
+        red, green, blue, _ = image.cmap(image.norm(value))
+        ink = "black" if 0.3 * red + 0.6 * green + 0.1 * blue > 0.45 else "white"
+        axes.text(column, row, str(texts[row][column]), ha="center", va="center", color=ink, fontsize=fontsize)
+    for row, column in framed:
+        axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="red", linewidth=2))
+    return image
+
+
+def whiskers(estimates: Sequence[Estimate | None]) -> tuple[list[float], np.ndarray]:
+    """Values and 2×N distances to the ends of their intervals, as matplotlib's error bars take them; NaN of None."""
+    known = [estimate or Estimate(math.nan, math.nan, math.nan, 0) for estimate in estimates]
+    reach = [(max(0.0, each.value - each.low), max(0.0, each.high - each.value)) for each in known]
+    return [each.value for each in known], np.array(reach).reshape(-1, 2).T
+
+
+def _middles(length: int, parts: int) -> list[float]:
+    return [length * (i + 0.5) / parts for i in range(parts)]

@@ -1,0 +1,56 @@
+"""Pictures that a study's cells leave behind, as bytes of files: photographs side by side, designs large, objects.
+
+In: a problem and what shows, or pixels. Out: tensors N×3×S×S in [0, 1], and PNG or GLB bytes.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.texture import Texture
+from patchproof.render.photograph import Shown, expose
+from patchproof.report.images import png
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.export import write_glb
+
+
+def photographs(problem: Problem, shown: Shown, conditions: Conditions, side_px: int) -> Tensor:
+    """N×3×S×S square photographs of one thing; None is the bare object."""
+    with torch.no_grad():
+        return expose(problem.see(shown, conditions, side_px), shown)
+
+
+def contact_sheet(rows: Sequence[Sequence[Tensor] | Tensor]) -> bytes:
+    """Rows of pictures 3×S×S as one PNG."""
+    return png(as_pixels(torch.cat([torch.cat(list(row), 2) for row in rows], 1)))
+
+
+def enlarged(pixels: np.ndarray, side_px: int) -> Tensor:
+    """A design H×W×3 in the middle of a white square 3×S×S, as large as fits, so that its pixels can be seen."""
+    height, width = pixels.shape[:2]
+    scale = side_px / max(height, width)
+    size = (round(width * scale), round(height * scale))
+    tile = Image.new("RGB", (side_px, side_px), "white")
+    large = Image.fromarray(pixels).resize(size, Image.Resampling.NEAREST)
+    tile.paste(large, ((side_px - size[0]) // 2, (side_px - size[1]) // 2))
+    return from_pixels(np.asarray(tile))
+
+
+def object_file(problem: Problem, design: np.ndarray) -> tuple[str, bytes]:
+    """(suffix, bytes): the object with its new textures as GLB, or the patch as PNG."""
+    canvas = getattr(problem.scene, "canvas", None)
+    if canvas is None or not isinstance(problem.subject, Texture):
+        return "png", png(design)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "object.glb"
+        write_glb(canvas.mesh, problem.subject.surface.textures(design), path)
+        return "glb", path.read_bytes()
