@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS
+from patchproof.optimizer.promise import PROMISE_VIEWS, make_promise
 from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
