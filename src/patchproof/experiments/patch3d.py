@@ -88,13 +88,13 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         twin = flat_twin(problem, settings, Path(folder))
     designs = {"3d": best_design(problem), "2d": best_design(twin)}
-    conditions, in_images = (one.scene.draw("evaluate", settings.n) for one in (problem, twin))
+    conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in (problem, twin))
     return {
         **recorded(responses(problem, things_of(problem, designs), conditions)),
         "in_images": recorded(responses(twin, things_of(twin, designs), in_images)),
         "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
         "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
-        "passes": {name: views_seen(one.scene.settings.optimize) for name, one in (("3d", problem), ("2d", twin))},
+        "passes": {name: views_seen(world.scene.settings.optimize) for name, world in (("3d", problem), ("2d", twin))},
         "share": twin.scene.settings.view.patch_share,
         "warnings": list(problem.scene.warnings),
         f"{cell.name}.png": picture_of(problem, twin, designs),

@@ -105,7 +105,9 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
             rates.append((*key, short_name(network), *levels, gain, verdict(gain)))
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
-        sums += [(*key, *(sum(one.answers[what]) / _SIDES for what in ("change", "attributed"))) for one in of_key]
+        sums += [
+            (*key, *(sum(result.answers[what]) / _SIDES for what in ("change", "attributed"))) for result in of_key
+        ]
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
     about += left_out_note(settings, results)
     of_colors = "Mean light of the object's pixels over a full turn in even white light, as sRGB codes."

@@ -138,13 +138,13 @@ def occluded(problem: Problem, settings: OcclusionSettings, seed: int) -> tuple[
     fresh = problem.scene.draw("evaluate", settings.n, seed + _MEASURING)
     again = _under(problem, fresh, [None, boxes[worst]])
     picture = _photographs(problem, problem.scene.draw("select", 1, seed))
-    found = {
+    answers_by_place = {
         "hits": [bits(answers[box].recognized[0]) for box in boxes],
         "worst": [worst % settings.positions, worst // settings.positions],
         "clean_again": bits(again[None].recognized[0]),
         "worst_again": bits(again[boxes[worst]].recognized[0]),
     }
-    return found, _blackened(picture, boxes[worst])[0]
+    return answers_by_place, _blackened(picture, boxes[worst])[0]
 
 
 Box = tuple[int, int, int, int]  # first column and row, and those after the last

@@ -110,7 +110,7 @@ def map_of(problem: Problem, axes: tuple[Axis, Axis], drawn: Conditions) -> tupl
     """The clean object's hits (bool) and confidence, each P×L×N: poses, lights, draws."""
     shape = (len(axes[0]), len(axes[1]), len(drawn))
     answers = [clean(problem, in_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])]
-    hits, confidence = ([getattr(one, name)[0] for one in answers] for name in ("recognized", "confidence"))
+    hits, confidence = ([getattr(answer, name)[0] for answer in answers] for name in ("recognized", "confidence"))
     return np.reshape(hits, shape), np.reshape(confidence, shape)
 
 

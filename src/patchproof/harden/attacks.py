@@ -97,13 +97,13 @@ def even_loss(logits: Sequence[Tensor], labels: Sequence[Tensor], loss: Loss) ->
     value over all networks: a sign does not change by that, and float32 does not round it to 0.
     """
     with torch.enable_grad():
-        leaves = [one.detach().double().requires_grad_(True) for one in logits]
-        total = torch.stack([loss(one, truth).sum() for one, truth in zip(leaves, labels, strict=True)]).sum()
+        leaves = [own.detach().double().requires_grad_(True) for own in logits]
+        total = torch.stack([loss(leaf, truth).sum() for leaf, truth in zip(leaves, labels, strict=True)]).sum()
         slopes = torch.autograd.grad(total, leaves)
         largest = torch.stack([slope.abs().amax(1) for slope in slopes]).amax(0)
         largest = torch.where(largest > 0, largest, 1)
         pairs = zip(logits, slopes, strict=True)
-        return torch.stack([(one * (slope / largest[:, None])).sum() for one, slope in pairs]).sum()
+        return torch.stack([(own * (slope / largest[:, None])).sum() for own, slope in pairs]).sum()
 
 
 def _gradient(network: Logits, pictures: Tensor, labels: Tensor, loss: Loss) -> Tensor:

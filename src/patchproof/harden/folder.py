@@ -11,7 +11,6 @@ in `images/`. Originals are judged in cells of their own, once per network.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -20,7 +19,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
-from PIL import Image
 from pydantic import Field
 
 from patchproof.claims import difference, rate
@@ -30,7 +28,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.harden.attacks import ATTACKS, right
 from patchproof.harden.harden import Epsilon, Method, epsilon_words, harden, moved, squares
 from patchproof.harden.labeled import in_blocks, labeled_files, read_large_enough
-from patchproof.output import write_whole
+from patchproof.output import image_bytes, write_whole
 from patchproof.photo.cannot import CannotJudge
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Positive, Refused, Share, Strict, expand
@@ -114,7 +112,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
         networks, truth = [_classifier(name, base) for name in names], [_truth(name, base, labels) for name in names]
         pictures = harden(originals, truth, networks, *how, settings.steps, settings.step_size)
         for photo, original, picture in zip(photos, originals, pictures, strict=True):
-            files[values["folder"] + photo["png"]] = _png(picture)
+            files[values["folder"] + photo["png"]] = image_bytes(picture, "PNG")
             photo["rms"], photo["ssim"] = moved(original, picture)
     for name in values["judges"] if photos else ():
         truth = torch.tensor(_truth(name, base, labels))
@@ -122,12 +120,6 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
         for i, photo in enumerate(photos):
             photo["right"][name] = [bool(outcome[i]) for outcome in outcomes]
     return {"photos": photos, "unread": unread} | files
-
-
-def _png(picture: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG")
-    return buffer.getvalue()
 
 
 def _judged(
@@ -266,8 +258,8 @@ def _classifier(name: str, base: Path) -> Classifier:
 def _truth(name: str, base: Path, labels: Sequence[str]) -> list[int]:
     """A network's indices of labels; refused where it does not have one."""
     known = _classifier(name, base).labels
-    found = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
-    return [found[label] for label in labels]
+    index = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
+    return [index[label] for label in labels]
 
 
 def _photos(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:

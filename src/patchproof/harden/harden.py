@@ -76,25 +76,25 @@ def harden(
     `epsilon` is in units of the full range, None for no bound; `step_size` replaces the method's own at the start.
     """
     start = [_tensor(photo) for photo in photos]
-    truth = [torch.tensor(one) for one in labels]
-    pixels = [one.clone().requires_grad_(True) for one in start]
+    truth = [torch.tensor(indices) for indices in labels]
+    pixels = [picture.clone().requires_grad_(True) for picture in start]
     step = step_size or _step(method, epsilon, steps)
     adam = torch.optim.Adam(pixels, lr=step) if method == "adam" else None
     for number in range(steps):
         alpha = step if method == "fgsm" else step * (1 - number / steps)
         gradients = torch.autograd.grad(_evened_loss(pixels, truth, classifiers, loss), pixels)
         with torch.no_grad():
-            for one, gradient in zip(pixels, gradients, strict=True):
+            for picture, gradient in zip(pixels, gradients, strict=True):
                 if adam is None:
-                    one -= alpha * gradient.sign()
+                    picture -= alpha * gradient.sign()
                 else:
-                    one.grad = gradient
+                    picture.grad = gradient
             if adam is not None:
                 adam.param_groups[0]["lr"] = alpha
                 adam.step()
-            for one, original in zip(pixels, start, strict=True):
-                one.copy_(_projected(one, original, epsilon))
-    return [_rounded(one.detach(), photo, epsilon) for one, photo in zip(pixels, photos, strict=True)]
+            for picture, original in zip(pixels, start, strict=True):
+                picture.copy_(_projected(picture, original, epsilon))
+    return [_rounded(picture.detach(), photo, epsilon) for picture, photo in zip(pixels, photos, strict=True)]
 
 
 def squares(photos: Sequence[np.ndarray], classifier: Classifier) -> Tensor:
@@ -115,8 +115,8 @@ def moved(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
 def _evened_loss(
     pixels: Sequence[Tensor], truth: Sequence[Tensor], classifiers: Sequence[Classifier], loss: Loss
 ) -> Tensor:
-    seen = [torch.cat([center_square(one, classifier.input_px) for one in pixels]) for classifier in classifiers]
-    return even_loss([c.network(squares) for c, squares in zip(classifiers, seen, strict=True)], truth, loss)
+    views = (torch.cat([center_square(picture, c.input_px) for picture in pixels]) for c in classifiers)
+    return even_loss([c.network(view) for c, view in zip(classifiers, views, strict=True)], truth, loss)
 
 
 def _step(method: Method, epsilon: float | None, steps: int) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -59,6 +59,11 @@ class Problem:
         """Square views of these conditions, for what is shown now and any other design in its place."""
         piece = shown if isinstance(shown, PiecePicture) else None
         return see(self.stage, piece, conditions, (side_px, side_px))
+
+    def before(self, chosen: Sequence[int]) -> Problem:
+        """The same before some of its networks, by number."""
+        classifiers, indices = (tuple(each[i] for i in chosen) for each in (self.classifiers, self.indices))
+        return replace(self, classifiers=classifiers, indices=indices)
 
     def _view_px(self, at_least: int) -> int:
         """The smallest whole multiple of the largest input size that is no smaller, at most the photograph's."""

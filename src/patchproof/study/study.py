@@ -180,7 +180,7 @@ def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work:
         tables=tables,
         figures=tuple(study.figures(settings, results)) if results else (),
         failed={cell.name: failed[cell.name] for cell in cells if cell.name in failed},
-        more={"cells": {one.cell.name: {"cell": dict(one.cell.values), "found": one.answers} for one in results}},
+        more={"cells": {each.cell.name: {"cell": dict(each.cell.values), "found": each.answers} for each in results}},
     )
     write_results(out, page)
     return Finished(tables, results, dict(page.failed))

@@ -7,7 +7,6 @@ that group by what was trained. Left out on purpose: promises, which belong to r
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,9 +75,7 @@ def trained_cells(
 
 def trained_on(problem: Problem, cell: Cell) -> Problem:
     """The same problem before the networks that train."""
-    chosen = [cell.values["networks"].index(name) for name in cell.values["trained"]]
-    classifiers, indices = (tuple(each[i] for i in chosen) for each in (problem.classifiers, problem.indices))
-    return replace(problem, classifiers=classifiers, indices=indices)
+    return problem.before([cell.values["networks"].index(name) for name in cell.values["trained"]])
 
 
 def tested_in(results: Sequence[Result]) -> list[str]:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from patchproof.claims import Estimate, rate
+from patchproof.claims import Estimate, clustered_median, rate
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
@@ -209,15 +209,7 @@ def _covered(found: Mapping) -> bool:
 
 
 def _median(found: Sequence[Mapping], name: str) -> Estimate | None:
-    """The median with its 95 % interval over resampled photographs."""
-    values = [np.atleast_1d(f[name]) for f in found]
-    if not values:
-        return None
-    rng, table = np.random.default_rng(0), np.array(values)
-    picks = rng.integers(0, len(table), (1000, len(table)))
-    medians = [float(np.median(table[pick])) for pick in picks]
-    low, high = np.quantile(medians, (0.025, 0.975))
-    return Estimate(float(np.median(table)), float(low), float(high), len(values))
+    return clustered_median(np.array([f[name] for f in found])) if found else None
 
 
 def _by_quantity(found: Sequence[Mapping]) -> Table:

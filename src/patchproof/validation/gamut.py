@@ -142,7 +142,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
             rate, confidence = of_way(results).level()
             difference, gain = of_way(results).gain(usual(results))
             gains = [np.mean(of_way([r]).confidences()) - np.mean(usual([r]).confidences()) for r in results]
-            by_seed = " ".join(f"{one:+.3f}" for one in gains)
+            by_seed = " ".join(f"{gain:+.3f}" for gain in gains)
             missed = float(np.mean([result.answers["missed"][way] for result in results]))
             rows.append(Row(printer, way, rate, difference, confidence, gain, by_seed, missed))
     return rows

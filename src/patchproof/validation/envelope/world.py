@@ -25,7 +25,7 @@ from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.surface import Surface, surface_of
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.responses import AT_A_TIME
+from patchproof.optimizer.responses import AT_A_TIME, ask
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
@@ -114,7 +114,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
     out = np.zeros((len(points), len(conditions)), bool)
     as_file = any("jpeg" in point for point in points)
     side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
-    stages = _Stages(world)
+    stages, first_network = _Stages(world), world.problem.before([0])
     with torch.inference_mode():
         for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
             every = np.arange(first, len(conditions), 4)
@@ -123,7 +123,7 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
                 views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
                 for i in _by_cost(points):
                     pictures = views.at(points[i]) if not as_file else from_pixels(views.file(points[i])[0])[None]
-                    out[i, rows] = _judge(world.problem, pictures)
+                    out[i, rows] = ask(first_network, pictures).recognized
     return out
 
 
@@ -205,11 +205,6 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
         back = geometry.apply_homography(np.linalg.inv(np.array(entry.geometry.homography_px_from_mm)), true_px)
         error_mm = float(np.linalg.norm(back - corners, axis=1).max())
     return Measurement(entry.status, entry.code, error_mm)
-
-
-def _judge(problem: Problem, pictures: Tensor) -> np.ndarray:
-    classifier, indices = problem.classifiers[0], problem.indices[0]
-    return classifier.recognized(classifier.logits(pictures), indices).cpu().numpy()
 
 
 def _geometry(point: Point) -> tuple:
