@@ -258,7 +258,7 @@ def test_evaluate_knows_scenes_without_a_mesh(request, kind):
     run = request.getfixturevalue(kind).folder / "run"
     assert command("evaluate", run, "--n", 4) == 0
     result = json.loads((run / "evaluate.json").read_text())
-    assert set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "grey", "noise"}
+    assert set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "gray", "noise"}
 
 
 def test_another_page_keeps_the_piece_and_its_promise_or_is_refused(photos, tmp_path):

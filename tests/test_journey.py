@@ -170,7 +170,7 @@ def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_
 
 
 def test_control_photographs_test_the_effect(journey, tmp_path, report):
-    for control in ("bare", "grey"):
+    for control in ("bare", "gray"):
         arguments = ("--run", journey / "run", "--n", PHOTOS, "--out", tmp_path / "controls" / control)
         assert command("reprint", journey / "sheet.pdf", *arguments, "--control", control) == 0
     arguments = ("--sheet", journey / "sheet.json", "--out", tmp_path / "report", "--controls", tmp_path / "controls")
@@ -196,7 +196,7 @@ def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
 def test_evaluate_writes_fresh_rates(journey):
     assert command("evaluate", journey / "run", "--n", 40) == 0
     result = json.loads((journey / "run" / "evaluate.json").read_text())
-    assert result["n"] == 40 and set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "grey", "noise"}
+    assert result["n"] == 40 and set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "gray", "noise"}
 
 
 def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):

@@ -230,7 +230,7 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
     assert set(promise.controls) == set(CONTROLS)
     for claim in promise.controls.values():
         assert claim.difference == pytest.approx(promise.rate - claim.rate)
-    assert promise.rate > 0.9 and all(promise.controls[kind].rate < 0.5 for kind in ("bare", "grey"))
+    assert promise.rate > 0.9 and all(promise.controls[kind].rate < 0.5 for kind in ("bare", "gray"))
     views = problem.scene.settings.view
     assert all(views.azimuth_deg[0] - 12 < c.azimuth_deg < views.azimuth_deg[1] + 12 for c in promise.conditions)
 
@@ -280,7 +280,7 @@ def test_a_design_that_never_moved_is_said_to_be_none(tmp_path, few_views, model
         promise = optimize_scene(scene, tmp_path / "run").promise
     told = [str(one.message) for one in caught if "began as" in str(one.message)]
     assert told == [] if says is None else says in told[0]
-    low, high = promise.controls["grey"].difference_interval
+    low, high = promise.controls["gray"].difference_interval
     assert says is None or low <= 0 <= high
 
 

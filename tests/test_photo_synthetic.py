@@ -83,7 +83,7 @@ def make_manifest(promise: dict | None = None, first_id: int = 0, design: np.nda
 
 
 def page_raster(manifest: Manifest, only_piece: bool) -> np.ndarray:
-    """The page as float32 linear light at 10 px/mm; `only_piece` leaves the rest of the page white paper out (grey)."""
+    """The page as float32 linear light at 10 px/mm; `only_piece` leaves the rest of the page white paper out (gray)."""
     page = np.ones((round(PAGE_MM[1] * PX_PER_MM), round(PAGE_MM[0] * PX_PER_MM), 3), np.float32)
     printed = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
     for marker in manifest.markers:

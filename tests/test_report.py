@@ -42,7 +42,7 @@ def some_report(verdict="kept"):
         effect="not_tested", matched_rate=None, reason="3 of 3 photographs were recognized.",
     )  # fmt: skip
     origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
-    controls = (Control("grey", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 0.5, False),)
+    controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 0.5, False),)
     return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
 
 

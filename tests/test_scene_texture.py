@@ -143,7 +143,7 @@ def test_an_image_chooses_texels_at_any_size(tmp_path):
     Image.fromarray(deep).save(tmp_path / "deep.png")
     mesh = from_parts([square(0)], 100)
     for name in ("mask.png", "deep.png"):
-        canvas = texture_canvas(mesh, masked(mask=name, start="grey"), tmp_path)
+        canvas = texture_canvas(mesh, masked(mask=name, start="gray"), tmp_path)
         assert canvas.mask[0][:, 8:].all() and not canvas.mask[0][:, :8].any()
         assert (canvas.start_srgb[0][:, 8:] == 128).all() and np.array_equal(canvas.start_srgb[0][:, :8], PAINT[:, :8])
         assert np.array_equal(canvas.mesh.materials[0].texture_srgb, PAINT)  # the bare object stays as it is

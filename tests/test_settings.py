@@ -9,7 +9,7 @@ import pytest
 from patchproof import strict
 from patchproof.goal import Goal
 from patchproof.settings import SceneSettings, identifying, load_scene_settings
-from patchproof.sheets.manifest import Target
+from patchproof.sheets.manifest import Promise, Target
 from patchproof.strict import Refused, Strict, expand, nearest, shipped, validated
 
 SCENE = """
@@ -259,3 +259,13 @@ def test_a_goal_that_is_none_is_refused_wherever_it_stands(tmp_path):
     with pytest.raises(Refused, match="goal"):
         validated(Target, {"label": "jeep", "indices": [1], "goal": "confuse"}, "sheet.json")
     assert [(str(goal), goal.sign) for goal in Goal] == [("assist", 1), ("deceive", -1)]
+
+
+def test_the_former_spelling_of_gray_is_read(tmp_path):
+    former = ("[patch]\n", '[patch]\nkind = "texture"\nstart = "grey"\n')
+    assert load_scene_settings(scene(tmp_path, former)).patch.start == "gray"
+    claim = {"rate": 0.5, "interval": [0.4, 0.6], "confidence": 0.5, "difference": 0.1, "difference_interval": [0, 0.2]}
+    target = {"label": "jeep", "indices": [1], "goal": "assist"}
+    model = {"name": "net", "sha256": None, "rate": 0.6, "interval": [0.5, 0.7], "confidence": 0.6}
+    promise = {"target": target, "models": [model], "rate": 0.6, "interval": [0.5, 0.7], "n": 400, "conditions": []}
+    assert list(validated(Promise, promise | {"controls": {"grey": claim}}, "sheet.json").controls) == ["gray"]

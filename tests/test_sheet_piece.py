@@ -59,8 +59,8 @@ def test_kinds_of_one_sheet_share_no_id():
 def test_marker_ids_refuse_too_many_and_unknown_kinds():
     with pytest.raises(Refused, match="at most 166 markers"):
         marker_ids(ID, "design", 167)
-    with pytest.raises(Refused, match='did you mean "grey"'):
-        marker_ids(ID, "gray", 4)
+    with pytest.raises(Refused, match='did you mean "gray"'):
+        marker_ids(ID, "grayy", 4)
 
 
 def test_ids_do_not_depend_on_the_hash_seed():
@@ -251,7 +251,7 @@ def test_controls_have_the_design_s_size_however_small(size, kind):
 
 def test_plain_controls():
     design = photo_like_design()
-    assert (control_design("grey", design, ID) == 128).all()
+    assert (control_design("gray", design, ID) == 128).all()
     assert (control_design("blank", design, ID) == 255).all()
     assert np.array_equal(control_design("design", design, ID), design)
     with pytest.raises(Refused, match='did you mean "noise"'):

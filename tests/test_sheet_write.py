@@ -299,10 +299,10 @@ def test_check_sheet_tells_the_print_shop(sheet, tmp_path):
 
 
 def test_control_sheets_share_the_geometry_but_no_id(tmp_path, sheet):
-    grey = write(tmp_path / "grey.pdf", kind="grey")
-    assert grey.cut_mm == sheet[1].cut_mm and grey.design.rect_mm == sheet[1].design.rect_mm
-    assert not {m.id for m in grey.markers} & {m.id for m in sheet[1].markers}
-    assert grey.sheet_id == sheet[1].sheet_id and grey.chart == sheet[1].chart
+    gray = write(tmp_path / "gray.pdf", kind="gray")
+    assert gray.cut_mm == sheet[1].cut_mm and gray.design.rect_mm == sheet[1].design.rect_mm
+    assert not {m.id for m in gray.markers} & {m.id for m in sheet[1].markers}
+    assert gray.sheet_id == sheet[1].sheet_id and gray.chart == sheet[1].chart
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):

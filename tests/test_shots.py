@@ -21,7 +21,7 @@ def promise_of(rate: float, control: float, n: int = 400, goal: str = "assist") 
         rate=rate,
         interval=(0, 1),
         n=n,
-        controls={"bare": dict(rate=control, **beside), "grey": dict(rate=control / 2, **beside)},
+        controls={"bare": dict(rate=control, **beside), "gray": dict(rate=control / 2, **beside)},
         conditions=(),
     )
 
@@ -49,5 +49,5 @@ def test_the_hardest_control_decides_and_small_differences_cannot_be_shown():
     plan = plan_shots(promise_of(0.9, 0.3))
     assert plan.control == "bare" and 5 <= plan.unpaired <= plan.paired < 40
     assert plan_shots(promise_of(0.5, 0.5)).paired is None
-    assert plan_shots(promise_of(0.1, 0.8, goal="deceive")).control == "grey"
+    assert plan_shots(promise_of(0.1, 0.8, goal="deceive")).control == "gray"
     assert fewest(lambda n: n >= 9) == 9 and fewest(lambda n: False) is None

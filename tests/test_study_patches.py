@@ -218,7 +218,7 @@ def test_a_2d_patch_has_its_size_in_the_networks_pixels_and_no_frame(scene_file,
     assert np.median(widths) == pytest.approx(20, rel=0.05)
     problem = patch2d.flat_problem(settings, tmp_path, scene, classifier, one)
     shown = patch2d.shown_by_kind(problem, problem.subject.pixels(torch.full((3, 60, 60), 0.25)))
-    assert shown["patch"].srgb.shape == shown["grey"].srgb.shape == (120, 120, 3)  # printed pixels, and no frame
+    assert shown["patch"].srgb.shape == shown["gray"].srgb.shape == (120, 120, 3)  # printed pixels, and no frame
     largest = replace(classifier, input_px=30)
     with pytest.raises(Refused, match="pixels before a network of 30"):
         scene_settings(settings, one, largest, "images", "images/labels.csv")

@@ -44,7 +44,7 @@ views = 2
 """
 PATCHES = {
     "texture": 'kind = "texture"\nepsilon = 0.1',
-    "masked": 'kind = "masked"\nstart = "grey"\nmaterials = ["paint"]',
+    "masked": 'kind = "masked"\nstart = "gray"\nmaterials = ["paint"]',
     "image": 'kind = "masked"\nmask = "half.png"',
 }
 
@@ -172,7 +172,7 @@ def test_a_texture_run_is_read_back_evaluated_and_refused_a_sheet(tmp_path, caps
     again = load_run(tmp_path / "run")
     np.testing.assert_array_equal(again.design, finished.design)
     assert again.promise == finished.promise and again.promise.n == 16
-    assert set(again.promise.controls) == {"bare", "mean", "grey", "noise"}
+    assert set(again.promise.controls) == {"bare", "mean", "gray", "noise"}
     result = evaluate_run(tmp_path / "run", n=8)
     assert result["n"] == 8 and (tmp_path / "run" / "evaluate.json").is_file()
     assert command("sheet", tmp_path / "run", "--out", tmp_path / "sheet.pdf") == 1

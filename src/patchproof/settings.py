@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from patchproof.goal import Goal
 from patchproof.strict import (
     Finite,
+    Gray,
     NotNegative,
     NotNegativeRange,
     Positive,
@@ -71,7 +72,7 @@ class PatchSettings(Strict):
     mask: str | None = None  # an image over the UV map, white where the texture may change
     materials: tuple[str, ...] = ()  # names of the mesh's materials whose texture may change
     faces: str | None = None  # a text file of numbers of the faces whose texture may change
-    start: Literal["original", "grey"] = "original"  # what a texture is optimized from
+    start: Annotated[Literal["original", "gray"], Gray] = "original"  # what a texture is optimized from
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
     @model_validator(mode="after")

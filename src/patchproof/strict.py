@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 from typing_extensions import Self
 
@@ -70,6 +70,10 @@ Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Model = TypeVar("Model", bound=BaseModel)
 
 Model = TypeVar("Model", bound=BaseModel)
+
+
+# runs and sheets from before the spelling was one say "grey"
+Gray = BeforeValidator(lambda word: "gray" if word == "grey" else word)
 
 
 class Strict(BaseModel):

@@ -29,7 +29,7 @@ class Control(str, Enum):
     """Controls that can be printed."""
 
     mean = "mean"
-    grey = "grey"
+    gray = "gray"
     noise = "noise"
     shuffled = "shuffled"
     blank = "blank"
@@ -40,7 +40,7 @@ class Shown(str, Enum):
 
     bare = "bare"
     mean = "mean"
-    grey = "grey"
+    gray = "gray"
     noise = "noise"
 
 

@@ -29,7 +29,7 @@ from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import TrainedSettings, Way, Word, left_out_note, tested_in, trained_cells, trained_on
 
-CONTROLS = ("bare", "grey", "noise", "shuffled")
+CONTROLS = ("bare", "gray", "noise", "shuffled")
 _KINDS = ("design", *CONTROLS)
 _SHEET_PX, _SHEET_VIEWS = 160, 4
 

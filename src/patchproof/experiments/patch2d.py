@@ -53,7 +53,7 @@ from patchproof.study.study import Cell, Result, Study
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KINDS = ("bare", "grey", "noise", "patch")
+KINDS = ("bare", "gray", "noise", "patch")
 OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target
 _TILE_PX = 192
 
@@ -167,14 +167,14 @@ def _gains(results: Sequence[Result]) -> Table:
         own = [_target(result) for result in group]
         hits = {kind: _hits(own, kind, OWN) for kind in KINDS}
         start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= SPLIT_FROM)
-        gains = (difference(hits["patch"], hits[control]) for control in ("bare", "grey"))
+        gains = (difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
         rows.append((*start, *(rate(hits[kind]) for kind in KINDS), *gains))
     about = (
         "Recognition of images of the patch's own class, seeds together. Where images are not held out, these are the"
         " images that the patch was made with, at new places. Classes marked as renders show renders of an object over"
         " backgrounds, since there are no photographs of it."
     )
-    head = ("target", "network", "images", "held out", *KINDS, "patch minus bare", "patch minus grey")
+    head = ("target", "network", "images", "held out", *KINDS, "patch minus bare", "patch minus gray")
     return Table("gain", "Gain on the target", head, tuple(rows), about)
 
 
@@ -187,15 +187,15 @@ def _harm(results: Sequence[Result]) -> Table:
             of_class = [result.answers["classes"][i] for result in group]
             own = {kind: _hits(of_class, kind, OWN) for kind in KINDS}
             called, usual = (_hits(of_class, kind, TARGET) for kind in ("patch", "bare"))
-            rates = (rate(own[kind]) for kind in ("bare", "grey", "patch"))
-            harm = (difference(own["patch"], own[control]) for control in ("bare", "grey"))
+            rates = (rate(own[kind]) for kind in ("bare", "gray", "patch"))
+            harm = (difference(own["patch"], own[control]) for control in ("bare", "gray"))
             start = (_target(group[0])["name"], network, other["name"])
             rows.append((*start, *rates, *harm, rate(called), difference(called, usual)))
     about = (
         "Images of another class with the same patch. Recognized means its own labels; a negative difference is harm."
         " Called the target: the patch has made an adversarial example of it."
     )
-    head = ("target", "network", "images of", "bare", "grey", "patch", "patch minus bare", "patch minus grey")
+    head = ("target", "network", "images of", "bare", "gray", "patch", "patch minus bare", "patch minus gray")
     head += ("called the target", "more than bare")
     return Table("harm", "Harm on each other class", head, tuple(rows), about)
 
@@ -216,7 +216,7 @@ def _pooled(results: Sequence[Result]) -> Table:
         "Mean differences of rates over targets and networks; the interval is a bootstrap over these clusters, each"
         " with all its seeds, images and other classes; n counts clusters, and fewer than 5 get none."
     )
-    head = ("rate", "patch minus bare", "patch minus grey", "patch minus noise")
+    head = ("rate", "patch minus bare", "patch minus gray", "patch minus noise")
     return Table("pooled", "Over all targets and networks", head, tuple(rows), about)
 
 

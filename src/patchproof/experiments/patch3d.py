@@ -52,7 +52,7 @@ from patchproof.study.study import Cell, Result, Study
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KINDS = ("bare", "grey", "noise", "2d", "3d")
+KINDS = ("bare", "gray", "noise", "2d", "3d")
 HARD = 0.2  # clean rate up to which an object counts as misread
 _TILE_PX = 192
 _SIZES = (0.05, 0.95)  # quantiles of the design's size over the 3D views that bound its size in 2D
@@ -168,7 +168,7 @@ def picture_of(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray
 
 def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
     """Pooled, by mesh, by network and view, in the flat images, and cell by cell."""
-    objects, images = _by_object(results, ("3d", "2d"), None), _by_object(results, ("2d", "grey"), "in_images")
+    objects, images = _by_object(results, ("3d", "2d"), None), _by_object(results, ("2d", "gray"), "in_images")
     about = "Networks and seeds together; the difference is paired (Newcombe), as if all conditions were independent."
     in_images = (
         "The same designs in the 2D patch's own world: pasted at random places, sizes and angles into renders of the"
@@ -179,7 +179,7 @@ def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
         _pooled(results),
         Table("meshes", "By object", ("object", *KINDS, "3d minus 2d"), objects, about),
         _by_view(settings, results),
-        Table("images", "Pasted into images", ("object", *KINDS, "2d minus grey"), images, in_images),
+        Table("images", "Pasted into images", ("object", *KINDS, "2d minus gray"), images, in_images),
         _by_cell(results),
     ]
 
@@ -188,7 +188,7 @@ def _pooled(results: Sequence[Result]) -> Table:
     groups = grouped(results, of_values("name", "network"))
     hard = {key: group for key, group in groups.items() if _mean(group, "bare") <= HARD}
     rows = []
-    for a, b in (("3d", "2d"), ("3d", "grey"), ("3d", "noise"), ("2d", "grey"), ("2d", "noise"), ("3d", "bare")):
+    for a, b in (("3d", "2d"), ("3d", "gray"), ("3d", "noise"), ("2d", "gray"), ("2d", "noise"), ("3d", "bare")):
         gains = [[_mean(group, a) - _mean(group, b) for group in some.values()] for some in (groups, hard)]
         rows.append((f"{a} minus {b}", *map(clustered, gains)))
     about = (

@@ -50,7 +50,7 @@ class RobustSettings(TrainedSettings):
 
     classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
     # By name: tables of the scene file with the keys that change.
-    ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "grey"}}}, min_length=1)
+    ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
 
 
 def cells(settings: RobustSettings, base: Path) -> list[Cell]:

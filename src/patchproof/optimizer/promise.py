@@ -25,7 +25,7 @@ from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 PROMISE_VIEWS = 400  # the Wilson interval of a rate of 0.9 is then 6 points wide
-CONTROLS = ("bare", "mean", "grey", "noise")
+CONTROLS = ("bare", "mean", "gray", "noise")
 
 
 def make_promise(

@@ -35,7 +35,7 @@ from patchproof.strict import Refused
 def sheet_of(
     run: Run, pdf_path: str | Path, *, template: str | None = None, control: str | None = None, copies: int = 1
 ) -> Manifest:
-    """Write the run's sheet; `control` is mean, grey, noise, shuffled or blank, `template` a name or file in place of
+    """Write the run's sheet; `control` is mean, gray, noise, shuffled or blank, `template` a name or file in place of
     the scene's.
     """
     one, scene, page = _design(run, template, control)

@@ -129,7 +129,7 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
     if plan.unpaired is not None:
         lines.append(f"Without pairs: {plan.unpaired} of each.")
     lines.append(
-        "Print the other controls (mean, grey, noise) too, if you can: the effect is shown only where the patch beats "
+        "Print the other controls (mean, gray, noise) too, if you can: the effect is shown only where the patch beats "
         "every control that you photograph."
     )
     return tuple(lines)

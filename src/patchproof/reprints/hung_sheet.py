@@ -48,7 +48,7 @@ _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal
 @dataclass(frozen=True)
 class Hanging:
     """How a sheet was printed and what hangs there: by another printer than the scene's (a name or a file), larger or
-    smaller along x and y, in its place that `control`'s own sheet (mean, grey, noise) or nothing (bare); `path_traced`
+    smaller along x and y, in its place that `control`'s own sheet (mean, gray, noise) or nothing (bare); `path_traced`
     photographs are by a renderer that is not ours (see `path_traced`).
     """
 

@@ -73,7 +73,7 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
     if not any(mask.any() for mask in masks):
         raise Refused("a mask that is white on some face", "none of that", "compare it with the texture coordinates")
     start = tuple(_texture(mesh, i) for i in range(len(masks)))
-    if patch.start == "grey":
+    if patch.start == "gray":
         start = tuple(np.where(mask[..., None], np.uint8(GRAY), old) for mask, old in zip(masks, start, strict=True))
     return Canvas(mesh, start, masks, (*warnings, *_doubts(mesh, chosen, masks)))
 

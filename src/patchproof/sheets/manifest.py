@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from patchproof.goal import Goal
 from patchproof.output import image_bytes
-from patchproof.strict import Finite, Positive, Refused, Share, Strict, validated
+from patchproof.strict import Finite, Gray, Positive, Refused, Share, Strict, validated
 
 Point = tuple[Finite, Finite]
 Rect = tuple[Finite, Finite, Positive, Positive]
@@ -129,7 +129,7 @@ class Promise(Strict):
     rate: Share
     interval: Interval
     n: Annotated[int, Field(ge=1)]
-    controls: dict[str, ControlClaim]
+    controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
 
 
@@ -137,7 +137,7 @@ class Manifest(Strict):
     """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
 
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
-    kind: str  # "design", or the control that this sheet is: "mean", "grey", "noise", "shuffled", "blank"
+    kind: Annotated[str, Gray]  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
     page_mm: tuple[Positive, Positive]
     design: Design | None
     markers: Annotated[tuple[Marker, ...], Field(min_length=1)]

@@ -28,7 +28,7 @@ from patchproof.sheets.swatches import frame_swatches
 from patchproof.strict import Refused, nearest
 
 DICTIONARY = "DICT_5X5_1000"
-KINDS = ("design", "mean", "grey", "noise", "shuffled", "blank")
+KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
 MODULES = 7  # a 5×5 code and its black border
 SCISSORS_MM = 2.0
 SMALLEST_MARKER_MM = 8.0
@@ -207,7 +207,7 @@ def frame_image(piece: Piece, design_px: tuple[int, int]) -> FrameImage:
 def control_design(kind: str, design: np.ndarray, sheet_id: str) -> np.ndarray:
     """What a control sheet prints in place of a uint8 H×W×3 design, in as many pixels.
 
-    "mean": its mean color, averaged in light; "grey": sRGB 128; "noise": random cells, 16 along the shorter side;
+    "mean": its mean color, averaged in light; "gray": sRGB 128; "noise": random cells, 16 along the shorter side;
     "shuffled": the design's own 16 × 16 cells in another order (pixels left over at the right and bottom stay);
     "blank": white paper; "design": the design.
     """
@@ -221,7 +221,7 @@ def control_design(kind: str, design: np.ndarray, sheet_id: str) -> np.ndarray:
         return _shuffled(design, sheet_id)
     if kind == "design":
         return design.copy()
-    return np.full_like(design, 128 if kind == "grey" else 255)
+    return np.full_like(design, 128 if kind == "gray" else 255)
 
 
 def _known(kind: str) -> str:
