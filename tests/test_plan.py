@@ -237,7 +237,7 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
     photos = [
         BasePhoto(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)
     ]
-    return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos), ())
+    return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos), (), {})
 
 
 def test_photographs_have_light_blur_and_noise_of_their_own(tmp_path):
