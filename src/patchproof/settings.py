@@ -74,6 +74,13 @@ class PatchSettings(Strict):
     start: Literal["original", "grey"] = "original"  # what a texture is optimized from
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
+    @property
+    def design_mm(self) -> tuple[float, float]:
+        """Width and height of the design; a ValueError of textures and of patches as large as a blank's."""
+        if self.width_mm is None or self.height_mm is None:
+            raise ValueError("no size of the patch is given")
+        return self.width_mm, self.height_mm
+
     @model_validator(mode="after")
     def _fits_kind(self):
         if (self.width_mm is None) != (self.height_mm is None):

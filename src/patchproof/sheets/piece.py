@@ -139,7 +139,7 @@ def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
     return replace(piece, markers=tuple(replace(one, id=id_) for id_, one in zip(ids, piece.markers, strict=True)))
 
 
-def marker_at(id_: int, corner_mm: tuple[float, float], size_mm: float) -> PieceMarker:
+def marker_at(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
     """A marker with its top-left corner there."""
     (x, y), side = map(float, corner_mm), float(size_mm)
     return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))
