@@ -245,6 +245,6 @@ def load_scene_settings(path: str | Path) -> SceneSettings:
     return validated(SceneSettings, read_toml(path), str(path))
 
 
-def identifying(settings: SceneSettings) -> dict[str, Any]:
+def identifying(settings: Strict) -> dict[str, Any]:
     """What a sheet id is made of: settings that differ from their defaults, so that a key more changes no sheet."""
     return settings.model_dump(mode="json", exclude_defaults=True)

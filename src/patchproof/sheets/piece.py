@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.settings import identifying
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
 from patchproof.sheets.swatches import frame_swatches
+from patchproof.sheets.template import Template
 from patchproof.strict import Refused, nearest
 
 DICTIONARY = "DICT_5X5_1000"
@@ -72,6 +74,11 @@ def sheet_id(settings: dict[str, Any], seed: int) -> str:
     text = json.dumps({"settings": settings, "seed": seed}, sort_keys=True, separators=(",", ":"), allow_nan=False)
     number = int.from_bytes(hashlib.sha256(text.encode()).digest(), "big")
     return "".join("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"[number // 36**i % 36] for i in range(10))
+
+
+def page_id(template: Template) -> str:
+    """The sheet id of a page that shows nothing but its template: equal templates give equal pages."""
+    return sheet_id({"template": identifying(template)}, 0)
 
 
 def marker_ids(sheet_id: str, kind: str, count: int) -> list[int]:
