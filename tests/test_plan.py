@@ -192,20 +192,20 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
     settings = {"object__mesh": "primitive:mug", "patch__side": "-x", "patch__width_mm": 50, "patch__height_mm": 40}
     settings |= {"camera__photo_px": [800, 600], "view__distance_mm": [350, 400]}
     bent = scene_with(tmp_path, **settings, patch__bend=True)
-    card, sentence = bent..other_surface()
+    card, sentence = bent.other_surface()
     assert card.is_flat and not bent.placement.is_flat and sentence.startswith("bend = false would be a card")
     errors, _ = errors_of(bent, card)
     (name,) = (name for name in errors if name.endswith("not a card"))
     assert errors[name].codes_mean > 0.1 and errors[name].verdict in {"keep", "can go"}
     flat = scene_with(tmp_path, **settings)
-    other, sentence = flat..other_surface()
+    other, sentence = flat.other_surface()
     assert not other.is_flat and f"bend = true would be a {other.family}" in sentence
     problem = set_problem(flat)
     assert not scene_terms(problem, problem.subject.start(), other)[-1].modeled
 
 
 def test_a_refused_bend_is_said_in_its_own_sentence(tmp_path):
-    other, sentence = other_surface(scene_with(tmp_path))
+    other, sentence = scene_with(tmp_path).other_surface()
     assert other is None and sentence.startswith("bend = true is refused. Expected ")
 
 

@@ -6,7 +6,6 @@ and the pixels that go to the printer. How the whole piece looks on paper stands
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,6 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from patchproof.channel.printer import Printer
@@ -24,6 +22,7 @@ from patchproof.optimizer import pyramid
 from patchproof.optimizer.goals import total_variation
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.subject import Grid, write_png
+from patchproof.output import image_bytes
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene
@@ -99,9 +98,7 @@ class Patch:
 
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
         """The design as PNG."""
-        file = io.BytesIO()
-        Image.fromarray(pixels).save(file, "PNG", optimize=True)
-        return "png", file.getvalue()
+        return "png", image_bytes(pixels, "PNG", {"optimize": True})
 
     @property
     def grid(self) -> Grid:

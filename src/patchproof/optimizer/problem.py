@@ -60,6 +60,13 @@ class Problem:
         piece = shown if isinstance(shown, PiecePicture) else None
         return see(self.stage, piece, conditions, (side_px, side_px))
 
+    @property
+    def patch(self) -> Patch:
+        """What is optimized, as a printed patch; refused of textures."""
+        if isinstance(self.subject, Patch):
+            return self.subject
+        raise Refused("a printed patch", "the object's own texture", 'leave patch.kind out, or "patch"')
+
     def _view_px(self, at_least: int) -> int:
         """The smallest whole multiple of the largest input size that is no smaller, at most the photograph's."""
         network_px = max(classifier.input_px for classifier in self.classifiers)

@@ -26,8 +26,7 @@ from patchproof.settings import identifying
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
 from patchproof.sheets.swatches import frame_swatches
-from patchproof.sheets.template import Template
-from patchproof.strict import Refused, nearest
+from patchproof.strict import Refused, Strict, nearest
 
 DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "grey", "noise", "shuffled", "blank")
@@ -76,7 +75,7 @@ def sheet_id(settings: dict[str, Any], seed: int) -> str:
     return "".join("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"[number // 36**i % 36] for i in range(10))
 
 
-def page_id(template: Template) -> str:
+def page_id(template: Strict) -> str:
     """The sheet id of a page that shows nothing but its template: equal templates give equal pages."""
     return sheet_id({"template": identifying(template)}, 0)
 
