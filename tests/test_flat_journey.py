@@ -29,7 +29,7 @@ from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
 from patchproof.scene.conditions import with_values
-from patchproof.scene.mesh_scene import MeshScene, load_mesh_scene
+from patchproof.scene.patch_scene import PatchScene, load_mesh_scene
 from patchproof.scene.placement import place_card
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Manifest, load_manifest
@@ -81,7 +81,7 @@ class Journey:
 
     folder: Path
     run: Run
-    world: MeshScene
+    world: PatchScene
     conditions: object  # of the photographs
 
 
@@ -121,12 +121,12 @@ def images(tmp_path_factory):
     return optimized(folder, world, conditions, *tables)
 
 
-def hang(world: MeshScene, manifest: Manifest) -> MeshScene:
+def hang(world: PatchScene, manifest: Manifest) -> PatchScene:
     """The world with this sheet's piece in the middle of the object's side."""
     return replace(world, placement=place_card(world.mesh, world.frame, tuple(manifest.cut_mm[2:]), 0.0))
 
 
-def shoot(world: MeshScene, pdf: Path | None, conditions, folder: Path) -> None:
+def shoot(world: PatchScene, pdf: Path | None, conditions, folder: Path) -> None:
     """photo_0.jpg ... of the world with the PDF's piece on the object, or with nothing."""
     folder.mkdir()
     stage, piece = set_stage(world), None
@@ -137,7 +137,7 @@ def shoot(world: MeshScene, pdf: Path | None, conditions, folder: Path) -> None:
         (folder / f"photo_{i}.jpg").write_bytes(take_photo(stage, piece, conditions[i : i + 1]))
 
 
-def optimized(folder: Path, world: MeshScene, conditions, object_: str, patch: str, goal: str) -> Journey:
+def optimized(folder: Path, world: PatchScene, conditions, object_: str, patch: str, goal: str) -> Journey:
     (folder / "scene.toml").write_text(SCENE.format(object=object_, patch=patch, goal=goal), encoding="utf-8")
     assert command("optimize", folder / "scene.toml", "--out", folder / "run") == 0
     assert command("sheet", folder / "run", "--out", folder / "SHEET.pdf") == 0

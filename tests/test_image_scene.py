@@ -115,7 +115,7 @@ def test_paper_is_white_and_clean(tmp_path):
     conditions = scene.draw("train", 3)
     light = scene.piece_light(conditions)
     assert light.shape == (3, 3, 6) and (light @ [1, 0.3, -0.7, 0.09, -0.21, 0.49] == 1).all()
-    assert not scene.piece_blur_px(conditions).any() and not scene.piece_noise(conditions).any()
+    assert not np.any(scene.own_blur_and_noise(conditions))
     assert scene.design_px(96)[0] > scene.design_px(96)[1] >= 32
 
 

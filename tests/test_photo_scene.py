@@ -128,8 +128,7 @@ def test_geometry_light_blur_and_noise_are_recovered(world, scene):
     found = zip(
         scene.piece_homographies(conditions, SIZE),
         scene.piece_light(conditions),
-        scene.piece_blur_px(conditions),
-        scene.piece_noise(conditions),
+        *scene.own_blur_and_noise(conditions),
         world.truth.values(),
         strict=True,
     )
@@ -203,7 +202,7 @@ def test_picture_and_homography_move_alike(scene, size_px):
         dotted.append(replace(photo, picture=flat.Picture(np.round(picture).astype(np.uint8))))
     scene = replace(scene, photos=tuple(dotted))
     conditions = scene.draw("evaluate", 12)
-    assert np.ptp(scene.piece_blur_px(conditions)) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
+    assert np.ptp(scene.own_blur_and_noise(conditions)[0]) > 0.1 and np.ptp(conditions.pose.roll_deg) > 4
     pictures = scene.pictures(conditions, size_px)
     for picture, where in zip(pictures, scene.piece_homographies(conditions, size_px), strict=True):
         weight = picture[..., 0].astype(float)
@@ -218,7 +217,7 @@ def test_zoom_takes_the_blur_along(scene):
     background = conditions.pose.background.copy()
     background[:, 1] = 0
     small = with_values(conditions, background=background)
-    assert scene.piece_blur_px(small) == pytest.approx(scene.piece_blur_px(conditions) * low)
+    assert scene.own_blur_and_noise(small)[0] == pytest.approx(scene.own_blur_and_noise(conditions)[0] * low)
 
 
 def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_path):

@@ -20,7 +20,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.plan.cost import measure_cost
 from patchproof.plan.errors import measure_terms
 from patchproof.plan.lines import plan_lines
-from patchproof.plan.plan import Plan, marker_plan, other_surface, plan_scene, resolution_plan, scales
+from patchproof.plan.plan import Plan, marker_plan, plan_scene, resolution_plan
 from patchproof.plan.samples import sample_plan
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.scene.conditions import draw
@@ -133,7 +133,7 @@ def test_pixels_per_millimetre_by_hand(tmp_path):
     """Straight on with 90 degrees across 300 px: the focal length is 150 px, over the distance to the piece."""
     scene = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[500, 500])
     away_mm = 500 - scene.placement.center_mm @ scene.frame.normal
-    assert scales(scene, (400, 300)) == pytest.approx(150 / away_mm, rel=0.02)  # the piece's middle is off the axis
+    assert scene.px_per_mm((400, 300)) == pytest.approx(150 / away_mm, rel=0.02)  # the piece's middle is off the axis
     found = resolution_plan(set_problem(scene))
     assert found.px_per_mm_photo == pytest.approx([150 / away_mm] * 2, rel=0.02)
     assert found.px_per_mm_network == pytest.approx([16 / away_mm] * 2, rel=0.02) and found.network_px == 32
@@ -146,7 +146,7 @@ def test_the_marker_rule_by_hand(tmp_path):
     """7 modules of 2.5 px at the only scale there is; from far away none that fits is readable."""
     scene = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[400, 400], camera__photo_px=[1600, 1200])
     away_mm = 400 - scene.placement.center_mm @ scene.frame.normal
-    markers = marker_plan(scene, scene.piece)
+    markers = marker_plan(scene)
     assert markers.needed_mm == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
     assert markers.printed_mm == pytest.approx(markers.needed_mm, rel=0.03) and markers.unreadable_share == 0
     distant = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[9000, 9000])
@@ -192,20 +192,20 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
     settings = {"object__mesh": "primitive:mug", "patch__side": "-x", "patch__width_mm": 50, "patch__height_mm": 40}
     settings |= {"camera__photo_px": [800, 600], "view__distance_mm": [350, 400]}
     bent = scene_with(tmp_path, **settings, patch__bend=True)
-    card, sentence = other_surface(bent)
+    card, sentence = bent.other_surface()
     assert card.is_flat and not bent.placement.is_flat and sentence.startswith("bend = false would be a card")
     errors, _ = errors_of(bent, card)
     (name,) = (name for name in errors if name.endswith("not a card"))
     assert errors[name].codes_mean > 0.1 and errors[name].verdict in {"keep", "can go"}
     flat = scene_with(tmp_path, **settings)
-    other, sentence = other_surface(flat)
+    other, sentence = flat.other_surface()
     assert not other.is_flat and f"bend = true would be a {other.family}" in sentence
     problem = set_problem(flat)
     assert not scene_terms(problem, problem.subject.start(), other)[-1].modeled
 
 
 def test_a_refused_bend_is_said_in_its_own_sentence(tmp_path):
-    other, sentence = other_surface(scene_with(tmp_path))
+    other, sentence = scene_with(tmp_path).other_surface()
     assert other is None and sentence.startswith("bend = true is refused. Expected ")
 
 
@@ -237,7 +237,7 @@ def photo_scene(tmp_path, blur_px: float, noise: float) -> PhotoScene:
     photos = [
         BasePhoto(str(i), Picture(np.full((150, 200, 3), 90 + i, np.uint8)), where, light, blur_px) for i in range(2)
     ]
-    return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos), (), {})
+    return PhotoScene(validated(SceneSettings, tables, "test"), tmp_path, 0, "A" * 10, piece, tuple(photos))
 
 
 def test_photographs_have_light_blur_and_noise_of_their_own(tmp_path):

@@ -27,7 +27,6 @@ from patchproof.plan.terms import Setup, scene_terms
 from patchproof.render.photograph import expose, photograph, shade
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
-from patchproof.reprints.hung_sheet import scaled_print
 from patchproof.scene.conditions import with_values
 from patchproof.strict import Refused
 from patchproof.study.study import Cell, Result, run_study
@@ -157,7 +156,7 @@ def test_a_print_of_another_size_covers_as_much_as_one_of_a_scene_made_for_it(tm
     drawn = with_values(conditions, printed_scale=np.full(2, scale))
     plain, scaled = (area(outline(scene, one, (200, 200))) for one in (conditions, drawn))
     assert scaled[0] / plain[0] == pytest.approx(scale**2, rel=1e-6)
-    piece, twin = piece_of(scene), scaled_print(scene, (scale, scale))
+    piece, twin = piece_of(scene), scene.printed_at((scale, scale))
     np.testing.assert_allclose(outline(scene, drawn, (200, 200)), outline(twin, conditions, (200, 200)), atol=1e-6)
     pictures = [photograph(set_stage(s), piece, c, (200, 200)) for s, c in ((scene, drawn), (twin, conditions))]
     assert (pictures[0] - pictures[1]).abs().max() < 2e-3

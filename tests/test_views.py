@@ -18,8 +18,8 @@ from patchproof.channel.lens import distort_points
 from patchproof.color import srgb_from_linear
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
-from patchproof.render.photograph import ObjectTextures, expose, photograph, shade
-from patchproof.render.pixels import PiecePicture
+from patchproof.render.photograph import expose, photograph, shade
+from patchproof.render.pixels import ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see

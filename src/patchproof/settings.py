@@ -75,6 +75,13 @@ class PatchSettings(Strict):
     start: Annotated[Literal["original", "gray"], Gray] = "original"  # what a texture is optimized from
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
+    @property
+    def design_mm(self) -> tuple[float, float]:
+        """Width and height of the design; a ValueError of textures and of patches as large as a blank's."""
+        if self.width_mm is None or self.height_mm is None:
+            raise ValueError("no size of the patch is given")
+        return self.width_mm, self.height_mm
+
     @model_validator(mode="after")
     def _fits_kind(self):
         if (self.width_mm is None) != (self.height_mm is None):
@@ -239,6 +246,6 @@ def load_scene_settings(path: str | Path) -> SceneSettings:
     return validated(SceneSettings, read_toml(path), str(path))
 
 
-def identifying(settings: SceneSettings) -> dict[str, Any]:
+def identifying(settings: Strict) -> dict[str, Any]:
     """What a sheet id is made of: settings that differ from their defaults, so that a key more changes no sheet."""
     return settings.model_dump(mode="json", exclude_defaults=True)

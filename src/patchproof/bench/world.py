@@ -49,10 +49,7 @@ def set_world(count: int, on_stage: OnStage) -> World:
     for step in steps(problem, state):
         state = step.state
         on_stage("design", state.number, count)
-    patch, piece = problem.subject, problem.scene.piece
-    assert isinstance(patch, Patch)
-    assert piece is not None
-    return World(problem, patch, piece, from_pixels(as_pixels(state.best)))
+    return World(problem, problem.patch, problem.patch.scene.piece, from_pixels(as_pixels(state.best)))
 
 
 def demo_problem() -> Problem:

@@ -24,7 +24,7 @@ from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.figures import picture_sheet
 from patchproof.study.grid import grouped, of_values, problem_of, short_name
-from patchproof.study.pictures import contact_sheet, object_file, photographs
+from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import TrainedSettings, Way, Word, left_out_note, tested_in, trained_cells, trained_on
@@ -55,7 +55,7 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     problem = problem_of(base, cell.values)
     design = best_design(trained_on(problem, cell))
     things = shown_with_controls(problem, design, CONTROLS)
-    suffix, content = object_file(problem, design)
+    suffix, content = problem.subject.file(design)
     views = sides(problem, _SHEET_VIEWS)
     sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
     return {

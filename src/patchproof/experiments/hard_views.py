@@ -41,7 +41,7 @@ def training_conditions(problem: Problem, tries: int) -> Conditions:
     candidates = count // 2 * CANDIDATES
     drawn = problem.scene.draw("train", count + tries + candidates)
     tried, others = drawn[count : count + tries], drawn[count + tries :]
-    tried, others = tried[_shows_what_is_trained(problem, tried)], others[_shows_what_is_trained(problem, others)]
+    tried, others = (part[problem.scene.facing(part)] for part in (tried, others))  # behind it no patch can help
     if len(tried) < 2 or len(others) < CANDIDATES:
         return drawn[:count]
     expected = expected_losses(tried, clean(problem, tried, problem.training_px).loss.mean(0), others)
@@ -93,10 +93,3 @@ def _features(conditions: Conditions) -> np.ndarray:
             else:
                 columns += [values, values**2]
     return np.stack(columns, 1)
-
-
-def _shows_what_is_trained(problem: Problem, conditions: Conditions) -> np.ndarray:
-    """N bool: not from behind the patch, where the object may well fail, but no patch can help it."""
-    if problem.scene.piece is None:
-        return np.ones(len(conditions), bool)
-    return ~(np.abs(problem.scene.piece_azimuth_deg(conditions)) >= 90)  # unknown angles are of photographs of it

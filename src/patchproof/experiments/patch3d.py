@@ -27,7 +27,6 @@ from pydantic import Field
 
 from patchproof.claims import clustered, difference, rate
 from patchproof.experiments.image_classes import write_labels, write_renders
-from patchproof.geometry import local_scale
 from patchproof.optimizer.loop import best_design, views_seen
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
@@ -39,9 +38,9 @@ from patchproof.render.stage import set_stage
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import largest_share, load_image_scene
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.scene import needs_patch
 from patchproof.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
-from patchproof.sheets.piece import Piece
 from patchproof.strict import Range, Refused, Share
 from patchproof.study.figures import picture_sheet, whiskers
 from patchproof.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
@@ -105,19 +104,17 @@ def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Problem:
     """The same patch as a classic 2D one: its scene is made of renders that are written to `folder`."""
-    scene, subject = problem.scene, problem.subject
-    if not isinstance(scene, MeshScene) or not isinstance(subject, Patch):
-        raise Refused("a printed patch on a mesh", "another scene", "choose another")
+    scene = needs_patch(problem.scene, "a printed patch on a mesh")
     names = write_renders(problem.stage, settings.renders, problem.training_px, folder)
     write_labels([(name, scene.settings.target.label) for name in names], folder)
     flat = load_image_scene(flat_settings(scene, settings), folder, scene.seed)
-    pasted = Patch(flat, problem.printer, subject.design_px, problem.device)
+    pasted = Patch(flat, problem.printer, problem.patch.design_px, problem.device)
     return replace(problem, scene=flat, stage=set_stage(flat, problem.device), subject=pasted)
 
 
-def flat_settings(scene: MeshScene, settings: Patch3dSettings) -> SceneSettings:
+def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings:
     """A scene of images with the patch, printer, camera and optimizer of a scene with a mesh, and as large in it."""
-    *_, width, height = piece_of(scene).design_rect_mm
+    *_, width, height = scene.piece.design_rect_mm
     patch = PatchSettings(width_mm=width, height_mm=height)
     low, high = np.quantile(design_shares(scene), _SIZES)
     largest = largest_share((width, height), settings.roll_deg)
@@ -131,21 +128,11 @@ def flat_settings(scene: MeshScene, settings: Patch3dSettings) -> SceneSettings:
     )
 
 
-def design_shares(scene: MeshScene, views: int = 256) -> np.ndarray:
+def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
     """The design's longer side over the picture's shorter one, in training views that see its face."""
     conditions, photo_px = scene.draw("train", views), scene.settings.camera.photo_px
-    facing = np.abs(scene.piece_azimuth_deg(conditions)) < 90
-    piece = piece_of(scene)
-    middle = np.array(piece.size_mm) / 2
-    scales = [local_scale(view, middle)[0] for view in scene.piece_homographies(conditions[facing], photo_px)]
-    return np.array(scales) * max(piece.design_rect_mm[2:]) / min(photo_px)
-
-
-def piece_of(scene: MeshScene) -> Piece:
-    """The piece that hangs on the object."""
-    if scene.piece is None:
-        raise Refused("a printed patch", "the object's own texture", 'leave patch.kind at "patch"')
-    return scene.piece
+    scales = scene.piece_scales(conditions[scene.facing(conditions)], photo_px)
+    return scales * max(scene.piece.design_rect_mm[2:]) / min(photo_px)
 
 
 def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Shown]:

@@ -25,7 +25,7 @@ from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.figures import picture_sheet
 from patchproof.study.grid import grouped, of_values, problem_of, short_name
-from patchproof.study.pictures import contact_sheet, object_file, photographs
+from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import (
@@ -71,7 +71,7 @@ def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     views = sides(problem, _SIDES)
     before, after = (photographs(problem, thing, views, training.training_px) for thing in things.values())
     attributed = attributions(training, before, after)
-    suffix, content = object_file(problem, design)
+    suffix, content = problem.subject.file(design)
     turned = [turn(problem, thing, _TURN_VIEWS, _SHEET_PX) for thing in things.values()]
     return {
         **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),

@@ -25,10 +25,9 @@ from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import Shown
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.figures import number_grid, picture_sheet
 from patchproof.study.grid import Count, grouped, of_values, problem_of, short_name
-from patchproof.study.pictures import contact_sheet, object_file, photographs
+from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import (
@@ -78,12 +77,12 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if cell.values["trained"]:
         design = best_design(trained_on(problem, cell))
         things = shown_with_controls(problem, design, ())
-        suffix, content = object_file(problem, design)
+        suffix, content = problem.subject.file(design)
         answers[f"{cell.name}.{suffix}"] = content
     answers |= recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n)))
     views = photographs(problem, things["design"], sides(problem, 3), _SHEET_PX)
     answers[f"{cell.name}.sheet.png"] = contact_sheet([views])
-    if isinstance(problem.scene, MeshScene):
+    if problem.scene.HAS_OBJECT:
         fixed = three_views(problem, settings.lights)
         answers["views"] = recorded(responses(problem, things, fixed))
         answers["azimuths"] = fixed.pose.azimuth_deg[:: settings.lights].tolist()

@@ -18,7 +18,6 @@ from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, shade
 from patchproof.scene.conditions import Conditions, with_values
-from patchproof.scene.mesh_scene import MeshScene
 from patchproof.study.pictures import photographs
 
 _PATH_STEPS = 24  # of the integral; builtin's attributions then add up to within a few percent
@@ -40,7 +39,7 @@ def from_sides(problem: Problem, azimuth_deg: np.ndarray) -> Conditions:
 
 def sides(problem: Problem, count: int) -> Conditions:
     """Views for a contact sheet: evenly through the scene's azimuths, or draws where there is no mesh to go round."""
-    if not isinstance(problem.scene, MeshScene):
+    if not problem.scene.HAS_OBJECT:
         return problem.scene.draw("evaluate", count)
     low, high = problem.scene.settings.view.azimuth_deg
     return from_sides(problem, low + (high - low) * (np.arange(count) + 0.5) / count)

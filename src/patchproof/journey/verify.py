@@ -8,7 +8,7 @@ the judge, its networks and the page. The promise's primary network always judge
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,6 +16,7 @@ from pathlib import Path
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
@@ -36,7 +37,7 @@ def verify_photos(
     sheet: str | Path,
     out: str | Path,
     *,
-    models: tuple[str, ...] | None = None,
+    models: Sequence[str | Classifier] | None = None,
     controls: str | Path | None = None,
     scan_dpi: float | None = None,
     ruler_mm: tuple[float, float] | None = None,
@@ -50,13 +51,13 @@ def verify_photos(
 ) -> Report:
     """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
 
-    `camera` is a camera file's name or path. Model and printer names are looked up from the manifest's folder, then as
-    the scene's were. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are
-    new, or differ, are measured.
+    `models` are names, or classifiers in memory; `camera` is a camera file's name or path. Model and printer names are
+    looked up from the manifest's folder, then as the scene's were. `resume` goes on from what an earlier run finished,
+    whole or killed: only photographs that are new, or differ, are measured.
     """
     out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
     _check_out(out, resume, overwrite)
-    networks = [load_classifier(name, base) for name in _names(manifest, models)]
+    networks = [load_classifier(network, base) for network in _networks(manifest, models)]
     options = Options(
         models=networks,
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
@@ -114,13 +115,13 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _names(manifest: Manifest, models: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The primary network first, then the others asked for, or else the promise's."""
+def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
+    """The primary network first, then the others asked for, or else the promise's; of one given in memory, itself."""
+    given = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
     if manifest.promise is None:
-        if not models:
-            raise Refused(
-                "a sheet that promises something", f"the {manifest.kind} sheet {manifest.sheet_id}", "name --models"
-            )
-        return models
+        if not given:
+            got = f"the {manifest.kind} sheet {manifest.sheet_id}"
+            raise Refused("a sheet that promises something", got, "name --models")
+        return tuple(given.values())
     promised = tuple(model.name for model in manifest.promise.models)
-    return tuple(dict.fromkeys((promised[0], *(models or promised))))
+    return tuple(given.get(name, name) for name in dict.fromkeys((promised[0], *(given or promised))))

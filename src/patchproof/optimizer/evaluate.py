@@ -8,24 +8,28 @@ process or by others, each of which opens the run for itself.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+from patchproof.classifier.network import Classifier
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, shown_with_controls
 from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined, responses
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import write_whole
 from patchproof.scene.conditions import Conditions
+from patchproof.strict import Refused
 from patchproof.workers import open_workers
+
+Networks = tuple[str | Classifier, ...] | None
 
 
 def evaluate_run(
     run_folder: str | Path,
     *,
-    models: tuple[str, ...] | None = None,
+    models: Sequence[str | Classifier] | None = None,
     n: int = PROMISE_VIEWS,
     seed: int | None = None,
     device: str = "cpu",
@@ -33,12 +37,17 @@ def evaluate_run(
     cluster: str | None = None,
     on_view: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Rates of the run's design and its controls on n fresh conditions; written to RUN/evaluate.json and returned."""
-    folder = Path(run_folder).resolve()
+    """Rates of the run's design and its controls on n fresh conditions; written to RUN/evaluate.json and returned.
+
+    `models` are names, or classifiers in memory, which other processes cannot have.
+    """
+    folder, networks = Path(run_folder).resolve(), None if models is None else tuple(models)
+    if (jobs > 1 or cluster is not None) and any(isinstance(network, Classifier) for network in networks or ()):
+        raise Refused("networks that other processes load by name", "one in memory", "leave jobs and cluster out")
     with open_workers(jobs, cluster) as workers:
-        run, problem = _opened(folder, models, device)
+        run, problem = _opened(folder, networks, device)
         parts = in_parts(run.scene.draw("evaluate", n, seed))
-        show = partial(_show, folder, models, device)
+        show = partial(_show, folder, networks, device)
         answers = joined(workers.map(show, parts, lambda done, _: on_view(min(done * AT_A_TIME, n), n)))
     _opened.cache_clear()
     result = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
@@ -52,12 +61,12 @@ def evaluate_run(
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: Path, models: tuple[str, ...] | None, device: str) -> tuple[Run, Problem]:
+def _opened(folder: Path, models: Networks, device: str) -> tuple[Run, Problem]:
     """A run and its problem, once in each process."""
     run = load_run(folder)
     return run, set_problem(run.scene, device, models)
 
 
-def _show(folder: Path, models: tuple[str, ...] | None, device: str, conditions: Conditions) -> dict[str, Answers]:
+def _show(folder: Path, models: Networks, device: str, conditions: Conditions) -> dict[str, Answers]:
     run, problem = _opened(folder, models, device)
     return responses(problem, shown_with_controls(problem, run.design, CONTROLS), conditions)

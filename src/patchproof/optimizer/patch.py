@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -20,14 +21,17 @@ from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.goals import total_variation
 from patchproof.optimizer.pixels import as_pixels
+from patchproof.optimizer.subject import Grid, write_png
+from patchproof.output import image_bytes
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
-from patchproof.scene.scene import Scene
+from patchproof.scene.interface import PieceScene
 from patchproof.sheets.piece import control_design
 
 # A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
 # and not by others, and the frame, drawn on the same grid, would lose its markers.
 PRINTED_PX_PER_MM = 2.0
+DESIGN_FILE = "design.png"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +40,12 @@ class Patch:
     block.
     """
 
-    scene: Scene
+    scene: PieceScene
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
     STEP_SIZE: ClassVar[float] = 0.05
+    LOOK: ClassVar[str] = "printer"
 
     def start(self) -> Tensor:
         """A mid-gray design."""
@@ -82,6 +87,25 @@ class Patch:
     def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
         """The printed piece round a design of any grid (the optimized one, or as printed); differentiable."""
         return self._printed.shown(design, kind)
+
+    def printed_by(self, printer: Printer) -> Patch:
+        """The same patch as another printer prints it."""
+        return replace(self, printer=printer)
+
+    def save(self, pixels: np.ndarray, folder: Path) -> None:
+        """Write `design.png`."""
+        write_png(folder / DESIGN_FILE, pixels)
+
+    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
+        """The design as PNG."""
+        return "png", image_bytes(pixels, "PNG", {"optimize": True})
+
+    @property
+    def grid(self) -> Grid:
+        """How fine designs are."""
+        (width, height), (printed, _) = self.design_px, self.printed_px
+        width_mm = self.design_mm[0]
+        return Grid(self.design_px, self.printed_px, printed / width_mm, width * height, width / width_mm)
 
     @property
     def design_mm(self) -> tuple[float, float]:

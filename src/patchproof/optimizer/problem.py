@@ -19,13 +19,13 @@ from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.subject import Subject
 from patchproof.optimizer.texture import Texture
-from patchproof.render.photograph import Shown
-from patchproof.render.pixels import PiecePicture
+from patchproof.render.pixels import PiecePicture, Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import Scene
+from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
 # Sides at which views are rendered. Against 40 full photographs of the demo's patch the mean confidence was off by 0.09
@@ -42,7 +42,7 @@ class Problem:
     printer: Printer
     classifiers: tuple[Classifier, ...]
     indices: tuple[tuple[int, ...], ...]
-    subject: Patch | Texture
+    subject: Subject
     loss: Loss
 
     @property
@@ -64,6 +64,13 @@ class Problem:
         """The same before some of its networks, by number."""
         classifiers, indices = (tuple(each[i] for i in chosen) for each in (self.classifiers, self.indices))
         return replace(self, classifiers=classifiers, indices=indices)
+
+    @property
+    def patch(self) -> Patch:
+        """What is optimized, as a printed patch; refused of textures."""
+        if isinstance(self.subject, Patch):
+            return self.subject
+        raise Refused("a printed patch", "the object's own texture", 'leave patch.kind out, or "patch"')
 
     def _view_px(self, at_least: int) -> int:
         """The smallest whole multiple of the largest input size that is no smaller, at most the photograph's."""
@@ -91,11 +98,11 @@ def set_problem(
         do = "leave optimize.in_gamut out: pictures are made through the printer's table anyway"
         raise Refused(f"a printer that shows colors as they are sent within ΔE00 {IN_GAMUT:g}", got, do)
     stage = set_stage(scene, device)
-    if scene.piece is None:
-        subject = Texture(scene, stage.device)
+    if scene.HAS_PIECE:
+        hung, network_px = needs_piece(scene), max(classifier.input_px for classifier in classifiers)
+        subject = Patch(hung, printer, hung.design_px(network_px), stage.device)
     else:
-        network_px = max(classifier.input_px for classifier in classifiers)
-        subject = Patch(scene, printer, scene.design_px(network_px), stage.device)
+        subject = Texture(needs_texture(scene), stage.device)
     loss = loss or partial(target_loss, goal=settings.target.goal)
     return Problem(scene, stage, printer, classifiers, indices, subject, loss)
 

@@ -14,14 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from patchproof import geometry
 from patchproof.claims import paired_difference, wilson
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, responses
-from patchproof.render.photograph import Shown
+from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.scene import PieceScene, needs_piece
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 PROMISE_VIEWS = 400  # the Wilson interval of a rate of 0.9 is then 6 points wide
@@ -93,17 +93,15 @@ def control_claims(answers: Mapping[str, Answers], model: int) -> dict[str, Cont
 
 def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.ndarray) -> tuple[ConditionClaim, ...]:
     """What a photograph could show of each condition; null where the patch's face is turned away or there is none."""
-    scene, n = problem.scene, len(conditions)
+    n = len(conditions)
     shows: dict[str, np.ndarray] = dict.fromkeys(
         ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast"), np.full(n, np.nan)
     )
-    if scene.piece is not None:
-        x, y, width, height = scene.piece.design_rect_mm
-        middle = np.array([x + width / 2, y + height / 2])
-        homographies = scene.piece_homographies(conditions, scene.settings.camera.photo_px)
-        scale, tilt = np.array([geometry.local_scale(homography, middle) for homography in homographies]).T
+    if problem.scene.HAS_PIECE:
+        scene = needs_piece(problem.scene)
+        scale, tilt = scene.scales_and_tilts(conditions, scene.photo_px).T
         azimuth = scene.piece_azimuth_deg(conditions)
-        values = scale, tilt, azimuth, _contrasts(problem, conditions)
+        values = scale, tilt, azimuth, _contrasts(problem, scene, conditions)
         away = np.abs(azimuth) >= 90  # unknown angles are of photographs that show it
         shows = {name: np.where(away, np.nan, value) for name, value in zip(shows, values, strict=True)}
     return tuple(
@@ -116,9 +114,9 @@ def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.n
     )
 
 
-def _contrasts(problem: Problem, conditions: Conditions) -> np.ndarray:
+def _contrasts(problem: Problem, scene: PieceScene, conditions: Conditions) -> np.ndarray:
     """Paper white minus printed black in the photograph's linear light."""
-    exposed = problem.scene.white_light(conditions) * conditions.print.paper[:, 1] * 2**conditions.sensor.exposure_ev
+    exposed = scene.white_light(conditions) * conditions.print.paper[:, 1] * 2**conditions.sensor.exposure_ev
     black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
     return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
 

@@ -26,19 +26,21 @@ from patchproof.classifier.network import Classifier
 from patchproof.color import codes_of
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
+from patchproof.optimizer.patch import DESIGN_FILE
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, make_promise
-from patchproof.optimizer.result import RESULT_FILES, read_result, save_result
+from patchproof.optimizer.subject import read_png
+from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
 from patchproof.output import check_folder, make_folder, write_whole
-from patchproof.scene.scene import Scene, build_scene, load_scene
+from patchproof.scene.scene import Scene, build_scene, load_scene, needs_texture
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
 from patchproof.strict import Refused, validated
 
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"
-OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *RESULT_FILES, "evaluate.json", ".*.part")
-
+_RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
+OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *_RESULTS, "evaluate.json", ".*.part")
 
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
@@ -85,7 +87,7 @@ def optimize_scene(
     make_folder(out)
     state = _resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
-    save_result(problem, design, out)
+    problem.subject.save(design, out)
     promise = _promise(problem, design, controls, on_promise)
     details = _details(problem, promise, out, device)
     write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
@@ -105,12 +107,19 @@ def load_run(folder: str | Path) -> Run:
         promise = validated(Promise, details["promise"], str(folder / _RUN))
         base, seed = folder / details["scene_folder"], details["seed"]
         scene = build_scene(settings, base.resolve(), seed, details["sheet_id"])
-        design = read_result(scene, folder)
+        design = _design(scene, folder)
     except (OSError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, Refused):
             raise
         raise Refused("a finished run", f"{folder} that cannot be read ({error})", "optimize again") from error
     return Run(folder, scene, design, promise, details)
+
+
+def _design(scene: Scene, folder: Path) -> np.ndarray:
+    """The design's pixels of a finished run."""
+    if scene.HAS_PIECE:
+        return read_png(folder / DESIGN_FILE)
+    return Texture(needs_texture(scene), torch.device("cpu")).read(folder)
 
 
 def _clear(out: Path) -> None:
@@ -132,8 +141,10 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             log.flush()
             if step.select_loss is not None:
                 write_whole(out / _CHECKPOINT, lambda path, state=state: _save(state, problem, path))
-            if state.number == total:
-                write_whole(out / _VIEWS, lambda path, step=step: _contact_sheet(step.pictures).save(path, "PNG"))
+            if state.number == total and step.pictures is not None:
+                write_whole(
+                    out / _VIEWS, lambda path, pictures=step.pictures: _contact_sheet(pictures).save(path, "PNG")
+                )
             largest = max(step.gradient, largest or 0.0)
             on_step(step, total)
     _doubt(float((state.best - start(problem).design).abs().max()), largest)
@@ -235,7 +246,7 @@ def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict
         "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
         "settings": _settings(scene, out).model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
-        "placement": _placement(scene),
+        "placement": scene.record(),
         "warnings": list(scene.warnings),
         "select_after_views": SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
@@ -249,22 +260,6 @@ def _settings(scene: Scene, out: Path) -> SceneSettings:
         return scene.settings
     write_whole(out / _GIVEN, lambda path: path.write_bytes(glb))
     return scene.settings.changed(object={"mesh": os.path.relpath(out.resolve() / _GIVEN, scene.base.resolve())})
-
-
-def _placement(scene: Scene) -> dict[str, Any] | None:
-    """Where the piece lies and how well it fits; None where there is no piece."""
-    if scene.piece is None:
-        return None
-    piece = {
-        "piece_mm": scene.piece.size_mm,
-        "marker_mm": scene.piece.module_mm * 7,
-        "unreadable_share": scene.unreadable_share,
-    }
-    placement = getattr(scene, "placement", None)
-    if placement is None:
-        return piece
-    names = ("family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
-    return piece | {name: getattr(placement, name) for name in names}
 
 
 def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:

@@ -12,18 +12,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.subject import Grid, read_png, write_png
+from patchproof.output import write_whole
 from patchproof.render.designs import LearnedTextures
-from patchproof.render.photograph import ObjectTextures
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.render.pixels import ObjectTextures
+from patchproof.scene.export import write_glb
+from patchproof.scene.mesh_scene import TextureScene
 from patchproof.sheets.piece import CELLS, control_design
+from patchproof.strict import Refused
+
+OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "object.glb", "texture_*.png", "mask.png"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +42,8 @@ class Texture:
     # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
     # 60 % as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
     STEP_SIZE: ClassVar[float] = 0.015
-    scene: MeshScene
+    LOOK: ClassVar[str] = "textures"
+    scene: TextureScene
     device: torch.device
 
     def start(self) -> Tensor:
@@ -112,6 +122,51 @@ class Texture:
     def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""
         return self.surface.shown(design)
+
+    def printed_by(self, printer: Printer) -> Texture:
+        """The texture itself: nothing is printed."""
+        return self
+
+    def save(self, pixels: np.ndarray, folder: Path) -> None:
+        """Write the object with its new textures, each of them, and below each other the masks, white where a texture
+        was free to change.
+        """
+        textures, masks = self.surface.textures(pixels), self.scene.canvas.mask
+        write_whole(folder / OBJECT_FILE, lambda path: write_glb(self.scene.canvas.mesh, textures, path))
+        for i, texture in enumerate(textures):
+            write_png(folder / TEXTURE_FILES.replace("*", f"{i}"), texture)
+        width = max(mask.shape[1] for mask in masks)
+        wide = [np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks]
+        write_png(folder / MASK_FILE, np.concatenate(wide).astype(np.uint8) * 255)
+
+    def read(self, folder: Path) -> np.ndarray:
+        """The pixels that `save` wrote, to the bit; refused where they are not of this scene."""
+        masks = self.scene.canvas.mask
+        textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(masks))]
+        for texture, mask in zip(textures, masks, strict=True):
+            if texture.shape[:2] != mask.shape:
+                got = f"{texture.shape[1]} × {texture.shape[0]} pixels"
+                raise Refused("the textures of this scene", got, "optimize again")
+        return self.surface.texels(textures)
+
+    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
+        """The object with its new textures as GLB."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / OBJECT_FILE
+            write_glb(self.scene.canvas.mesh, self.surface.textures(pixels), path)
+            return "glb", path.read_bytes()
+
+    @property
+    def grid(self) -> Grid:
+        """How fine the textures are, per millimetre of the surface on average."""
+        mesh, masks = self.scene.mesh, self.scene.canvas.mask
+        sizes = np.array([mask.shape[1::-1] for mask in masks])
+        uv = mesh.corner_uv.astype(float) * sizes[mesh.face_material][:, None]
+        flat = np.abs(np.linalg.det(uv[:, 1:] - uv[:, :1])).sum()
+        a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+        area_mm2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+        texels = int(sum(mask.sum() for mask in masks))
+        return Grid(None, None, None, texels, float(np.sqrt(flat / area_mm2)))
 
     @cached_property
     def surface(self) -> LearnedTextures:

@@ -16,11 +16,12 @@ from torch import Tensor
 
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, expose
+from patchproof.render.photograph import expose
+from patchproof.render.pixels import Shown
 from patchproof.render.raster import rasterize
 from patchproof.render.views import Views, cameras, near_mm, see
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import needs_mesh
 from patchproof.strict import Strict
 
 REPEATS = 5
@@ -84,7 +85,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
     clock.start()
     shown = problem.subject.shown(design)
-    parts["printer" if problem.scene.piece is not None else "textures"] = clock.lap()
+    parts[problem.subject.LOOK] = clock.lap()
     pictures = expose(views, shown)
     parts["light, piece and camera"] = clock.lap()
     leaf = pictures.detach().requires_grad_()
@@ -110,8 +111,8 @@ def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dic
     whole = clock.lap()
     see(problem.stage, None, conditions, size)
     parts = {"see: background": clock.lap()}
-    scene = problem.scene
-    if isinstance(scene, MeshScene):
+    if problem.scene.HAS_OBJECT:
+        scene = needs_mesh(problem.scene)
         poses, surface = scene.camera_from_world(conditions), problem.stage.object_surface
         matrices = np.broadcast_to(scene.matrix_px(size), (len(poses), 3, 3))
         rasterize(surface.vertices, surface.faces, cameras(poses, matrices, size, problem.stage), near_mm(scene))

@@ -22,8 +22,8 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.output import image_bytes, image_pixels
 from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
-from patchproof.render.photograph import Shown, expose, photograph
-from patchproof.render.pixels import PiecePicture
+from patchproof.render.photograph import expose, photograph
+from patchproof.render.pixels import PiecePicture, Shown
 from patchproof.render.views import Views, relit, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.placement import Placement
@@ -245,7 +245,7 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
     both = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
     rendered, inside, edge = both.unflatten(0, (3, -1))
     named = {"": rendered, "footprint filtering": inside}
-    return named if scene.piece is None else named | {"piece's edges": edge}
+    return named | {"piece's edges": edge} if scene.HAS_PIECE else named
 
 
 def _pixels(views: Views) -> tuple[Tensor, Tensor]:

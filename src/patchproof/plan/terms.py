@@ -14,19 +14,16 @@ from functools import partial
 import numpy as np
 from torch import Tensor
 
-from patchproof import geometry
 from patchproof.channel.effect import Effect
 from patchproof.channel.effects import EFFECT, EFFECTS
 from patchproof.channel.printer import identity_printer
-from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown
+from patchproof.render.pixels import Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.scene.conditions import Conditions, without
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.photo_scene import BasePhoto, PhotoScene
+from patchproof.scene.interface import Part
 from patchproof.scene.placement import Placement
-from patchproof.scene.scene import Scene
+from patchproof.scene.scene import Scene, needs_mesh, needs_patch
 
 PRINTER = "printer's colors"
 
@@ -57,24 +54,25 @@ class Term:
 
 def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | None) -> tuple[Term, ...]:
     """The terms that a problem's kind of scene has."""
-    scene, terms = problem.scene, ()
-    if isinstance(scene, MeshScene):
-        terms = tuple(term for term in effect_terms("light") if scene.piece or not EFFECT[term.name].only_paper)
-    if isinstance(scene, PhotoScene):
-        terms = _photograph_terms()
-    if scene.piece is not None:
-        printer = Term(PRINTER, "printer.profile", partial(_without_printer, problem, design))
-        terms = (*terms, printer, *effect_terms("printer"))
-    terms = (*terms, *effect_terms("camera"))
-    if isinstance(scene, MeshScene):
-        samples = Term("object at 2×2 samples", "", lambda setup: replace(setup, supersample=2), modeled=False)
-        terms = (*terms, Term("lens distortion", "camera.file", _without_distortion), samples)
-        placement = scene.placement
-        if other_surface is not None and placement is not None:
-            name = "bent piece" if placement.is_flat else f"{placement.family}, not a card"
-            change = partial(_on_surface, placement=other_surface)
-            terms = (*terms, Term(name, "patch.bend", change, modeled=not placement.is_flat))
+    scene = problem.scene
+    effects = {table: _shown_by(scene, table) for table in ("light", "printer", "camera")}
+    own = {part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.whole) for part in scene.PARTS}
+    terms = (*effects["light"], *(term for term in own.values() if not term.key))
+    if scene.HAS_PIECE:
+        terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
+    terms = (*terms, *effects["printer"], *effects["camera"], *(term for term in own.values() if term.key))
+    if scene.HAS_OBJECT:
+        terms = (*terms, Term("object at 2×2 samples", "", lambda setup: replace(setup, supersample=2), modeled=False))
+    if other_surface is not None:
+        lies = needs_patch(scene).placement
+        name = "bent piece" if lies.is_flat else f"{lies.family}, not a card"
+        change = partial(_on_surface, placement=other_surface)
+        terms = (*terms, Term(name, "patch.bend", change, modeled=not lies.is_flat))
     return terms
+
+
+def _shown_by(scene: Scene, table: str) -> tuple[Term, ...]:
+    return tuple(term for term in effect_terms(table) if scene.models(EFFECT[term.name]))
 
 
 def effect_terms(table: str) -> tuple[Term, ...]:
@@ -86,83 +84,39 @@ def effect_terms(table: str) -> tuple[Term, ...]:
     )
 
 
-def _photograph_terms() -> tuple[Term, ...]:
-    return (
-        Term("uneven light on paper", "", _without_own_light),
-        Term("photographs' own blur", "", _without_own_blur, whole=True),
-        Term("photographs' own noise", "", _without_own_noise, whole=True),
-    )
-
-
 def _without(setup: Setup, effect: Effect) -> Setup | None:
-    conditions = without(setup.conditions, effect, partial(_facing, setup.stage.scene))
+    scene = setup.stage.scene
+    facing = needs_mesh(scene).cosines if scene.HAS_OBJECT else _nowhere
+    conditions = without(setup.conditions, effect, facing)
     return None if conditions is None else replace(setup, conditions=conditions)
 
 
-def _facing(scene: Scene, azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
-    """N cosines between the piece's normal (without one, its side's) and a direction, 0 from behind."""
-    if not isinstance(scene, MeshScene):
-        raise ValueError("pictures face nowhere")
-    normal = scene.frame.normal if scene.placement is None else scene.placement.normal
-    return np.clip(geometry.orbit(azimuth_deg, elevation_deg, scene.frame.normal, scene.frame.up) @ normal, 0, None)
+def _nowhere(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
+    raise ValueError("pictures face nowhere")
 
 
 def _without_printer(problem: Problem, design: Tensor, setup: Setup) -> Setup | None:
-    if problem.printer.name == "identity" or not isinstance(problem.subject, Patch):
+    if problem.printer.name == "identity":
         return None
-    return replace(setup, shown=replace(problem.subject, printer=identity_printer()).shown(design))
+    return replace(setup, shown=problem.subject.printed_by(identity_printer()).shown(design))
 
 
-def _without_distortion(setup: Setup) -> Setup | None:
-    camera = setup.stage.camera
-    if camera is None or not camera.bends:
-        return None
-    straight = camera.changed(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
-    return replace(setup, stage=replace(setup.stage, camera=straight))
+def _without_part(setup: Setup, part: Part) -> Setup | None:
+    scene = setup.stage.scene.without(part)
+    return None if scene is None else replace(setup, stage=replace(setup.stage, scene=scene))
 
 
 def _on_surface(setup: Setup, placement: Placement) -> Setup:
-    scene = replace(setup.stage.scene, placement=placement)
+    scene = replace(needs_patch(setup.stage.scene), placement=placement)
     piece = set_stage(scene, setup.stage.device).piece
     return replace(setup, stage=replace(setup.stage, scene=scene, piece=piece))
-
-
-def _without_own_light(setup: Setup) -> Setup | None:
-    """Photographs that light their paper evenly."""
-    even = np.array([1.0, 0, 0, 0, 0, 0])
-
-    def lit(photo: BasePhoto) -> BasePhoto:
-        return replace(photo, light=replace(photo.light, coefficients=photo.light.coefficients * even))
-
-    return _with_photos(setup, lit)
-
-
-def _without_own_blur(setup: Setup) -> Setup | None:
-    return _with_photos(setup, lambda photo: replace(photo, blur_px=0.0), lambda photo: photo.blur_px)
-
-
-def _without_own_noise(setup: Setup) -> Setup | None:
-    def clean(photo: BasePhoto) -> BasePhoto:
-        return replace(photo, light=replace(photo.light, noise=0.0))
-
-    return _with_photos(setup, clean, lambda photo: photo.light.noise)
-
-
-def _with_photos(
-    setup: Setup, changed: Callable[[BasePhoto], BasePhoto], strength: Callable[[BasePhoto], float] = lambda _: 1.0
-) -> Setup | None:
-    """The setup with its photographs changed; None where what would go has no strength in any."""
-    scene = setup.stage.scene
-    if not isinstance(scene, PhotoScene) or not any(map(strength, scene.photos)):
-        return None
-    scene = replace(scene, photos=tuple(map(changed, scene.photos)))
-    return replace(setup, stage=replace(setup.stage, scene=scene))
 
 
 def without_camera(setup: Setup) -> Setup:
     """The setup before a camera without blur, noise, motion, vignetting and distortion."""
     for name in ("blur", "noise", "motion blur", "vignetting"):
         setup = _without(setup, EFFECT[name]) or setup
-    for change in (_without_own_blur, _without_own_noise, _without_distortion):
-        setup = change(setup) or setup
+    for part in setup.stage.scene.PARTS:
+        if part.camera:
+            setup = _without_part(setup, part) or setup
     return setup

@@ -21,7 +21,7 @@ from patchproof.render.views import see
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import piece_of
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.settings import BackgroundSettings
 from patchproof.sheets.plan_page import Hung
 from patchproof.sheets.template import Template
@@ -32,9 +32,9 @@ PICTURE_PX = 600  # along the longer side
 ROOM = 1.06  # of the object's extent
 
 
-def hang(scene: MeshScene, template: Template) -> Hung:
+def hang(scene: PatchScene, template: Template) -> Hung:
     """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
-    frame, placement = scene.frame, scene.placed
+    frame, placement = scene.frame, scene.placement
     axes = np.stack([frame.right, -frame.up])  # millimetres right and down, from the middle of the object
 
     def flat(points: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ def hang(scene: MeshScene, template: Template) -> Hung:
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
     if template.tiles is not None:
-        for tile in plan_tiles(template.tiles, piece_of(scene)):
+        for tile in plan_tiles(template.tiles, scene.piece):
             corners = flat(placement.world(rect_corners(tile.part_mm)))
             seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
             names.append((tuple(corners.mean(0)), tile.name))

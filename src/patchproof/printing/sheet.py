@@ -18,8 +18,7 @@ from patchproof.optimizer.promise import PROMISE_VIEWS, make_promise
 from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import Scene, piece_of
+from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
 from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.manifest import Manifest, Promise
@@ -63,12 +62,12 @@ def sheet_of_several(
     return write_several(pdf_path, load_template(name), [_design(run, name, control)[0] for run in runs])
 
 
-def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDesign, Scene, Template]:
+def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDesign, PieceScene, Template]:
     """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
-    own, promise = piece_of(run.scene), run.promise
-    scene = run.scene if template is None else run.scene.with_template(template)
-    piece, kind = piece_of(scene), control or "design"
-    if piece.size_mm != own.size_mm and control is None:
+    own, promise = needs_piece(run.scene), run.promise
+    scene = own if template is None else own.with_template(template)
+    piece, kind = scene.piece, control or "design"
+    if piece.size_mm != own.piece.size_mm and control is None:
         promise = make_promise(set_problem(scene), run.design, scene.draw("promise", PROMISE_VIEWS))
     if control is not None:
         piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, scene.sheet_id, kind)
@@ -83,16 +82,16 @@ def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDes
     return one, scene, load_template(scene.settings.sheet.template)
 
 
-def _plan(scene: Scene, template: Template, promise: Promise | None) -> PlanPage | None:
+def _plan(scene: PieceScene, template: Template, promise: Promise | None) -> PlanPage | None:
     """Where the piece goes and, for a promise, how to photograph it; None where neither can be said."""
     hung, sections = None, []
-    if isinstance(scene, MeshScene):
-        hung = hang(scene, template)
+    if scene.HAS_OBJECT:
+        hung = hang(needs_patch(scene), template)
         edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edges_mm(hung).items())
         placed = [
             f"Seen as you face the object's {scene.settings.patch.side} side. From the piece's cut edge to the "
             f"outermost edges of that side: {edges}.",
-            f"The piece is {size_text(piece_of(scene).size_mm)} mm; {scene.placed.reason}.",
+            f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.lies()['reason']}.",
         ]
         if template.tiles is not None:
             placed.append(

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from patchproof.channel.printer import Printer
-from patchproof.render.photograph import ObjectTextures
-from patchproof.render.pixels import PiecePicture
+from patchproof.render.pixels import ObjectTextures, PiecePicture
 from patchproof.scene.texture import Canvas
 from patchproof.sheets.piece import MODULES, FrameImage, Piece, frame_image, lay_out_piece
 

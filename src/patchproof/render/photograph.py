@@ -7,8 +7,6 @@ through which gradients reach what is shown) and the camera (`expose`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -26,29 +24,19 @@ from patchproof.channel.camera import (
 from patchproof.channel.lens import distorted
 from patchproof.channel.printer import misregistered, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.render.pixels import PiecePicture
-from patchproof.render.stage import Stage, light_texels
+from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
+from patchproof.render.stage import Stage
+from patchproof.render.surfaces import light_texels
 from patchproof.render.texture import Footprint, look_up, on_copies, texel_table
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import MeshScene
 
 PAPER_BACK_LINEAR = 0.8  # plain white card seen from behind
 
 
-@dataclass(frozen=True)
-class ObjectTextures:
-    """Textures of the object in place of its own: H×W×3 sRGB in [0, 1], one per material, of the same sizes."""
-
-    srgb: tuple[Tensor, ...]
-
-
-Shown = PiecePicture | ObjectTextures | None
-
-
 def photograph(
     stage: Stage,
-    shown: Shown,
+    shown: Shown | Tensor | np.ndarray,
     conditions: Conditions,
     size_px: tuple[int, int],
     jpeg: bool = True,
@@ -56,9 +44,14 @@ def photograph(
 ) -> Tensor:
     """N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
 
-    A square size shows the photograph's centered square. `jpeg` as in `channel.camera.develop`,
-    `supersample` as in `see`.
+    A design may be shown as it is: a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M for textures), in
+    which the pictures are differentiable, or its uint8 pixels h×w×3. A square size shows the photograph's centered
+    square. `jpeg` as in `channel.camera.develop`, `supersample` as in `see`.
     """
+    if isinstance(shown, np.ndarray):
+        shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
+    if isinstance(shown, Tensor):
+        shown = stage.look.shown(shown)
     piece = shown if isinstance(shown, PiecePicture) else None
     return expose(see(stage, piece, conditions, size_px, supersample), shown, jpeg)
 
@@ -159,10 +152,7 @@ _OTHER_GRAIN = 1 << 40  # the photograph's own grain is not that of the camera t
 
 def _own_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
     """What the scene's photographs have of their own, N at this size; None where neither shows."""
-    scene, scale = views.stage.scene, _scale(views)
-    if isinstance(scene, MeshScene):
-        return None
-    blur_px, noise = scene.piece_blur_px(views.conditions) * scale, scene.piece_noise(views.conditions) * scale
+    blur_px, noise = (own * _scale(views) for own in views.stage.scene.own_blur_and_noise(views.conditions))
     return (blur_px, noise) if blur_px.max() >= SMALLEST_BLUR_PX or noise.max() >= SMALLEST_NOISE else None
 
 

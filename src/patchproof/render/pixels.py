@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from patchproof.render.fragments import Fragments
-from patchproof.render.stage import ObjectSurface, PieceSurface
+from patchproof.render.surfaces import ObjectSurface, PieceSurface
 from patchproof.render.texture import Footprint, footprint, joined, layout
 
 # Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
@@ -32,6 +32,16 @@ class PiecePicture:
     srgb: Tensor
     box_px: tuple[float, float, float, float]
     design_px: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ObjectTextures:
+    """Textures of the object in place of its own: H×W×3 sRGB in [0, 1], one per material, of the same sizes."""
+
+    srgb: tuple[Tensor, ...]
+
+
+Shown = PiecePicture | ObjectTextures | None
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,7 @@
 """A stage: a scene's tensors on one device, set up once and photographed many times.
 
-In: a scene of any kind. Out: `Stage`: the piece as a surface of millimetres and, for scenes with a mesh, the object
-with its textures. Scenes made of pictures have no object; their piece lies in the plane z = 1 of its own millimetres,
-which a view's homography projects. The piece reaches a margin beyond its cut line, so that pixels cut by its edge are
-found and can show their share of it.
+In: a scene of any kind. Out: `Stage`: the piece as a surface of millimetres, for scenes with a mesh the object with its
+textures, and how a design looks there. Scenes made of pictures have no object.
 """
 
 from __future__ import annotations
@@ -11,71 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from patchproof.channel.lens import Camera
-from patchproof.color import linear_from_srgb
-from patchproof.geometry import rect_corners
-from patchproof.render.texture import Layout, layout, texel_table
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.placement import Placement
-from patchproof.scene.scene import Scene
-
-# Of the piece's sides: half a pixel beyond the edge is enough down to a piece of 7 pixels, or 75° of tilt at 25.
-MARGIN_SHARE = 0.1
-
-
-@dataclass(frozen=True)
-class PieceSurface:
-    """The piece in the world: faces over `vertices` V×3, and per face corner F×3 its millimetres and normal."""
-
-    vertices: Tensor
-    faces: Tensor
-    corner_mm: Tensor
-    corner_normal: Tensor
-    size_mm: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class ObjectSurface:
-    """The object: faces over `vertices`, and per face corner F×3×8 what is interpolated on it: uv, color (vertex color
-    times base color, linear) and normal.
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    corners: Tensor
-    material: Tensor
-    textures_srgb: tuple[Tensor, ...]  # H×W×3 in [0, 1], one per material
-    layout: Layout
-
-    @cached_property
-    def corner_uv(self) -> Tensor:
-        """Texture coordinates alone, F×3×2."""
-        return self.corners[..., :2].contiguous()
-
-    def texels(self, reduced: bool) -> Tensor:
-        """The linear light of all textures' mip levels, averaged as light or, `reduced`, as code values."""
-        return self._reduced_texels if reduced else self._texels
-
-    @cached_property
-    def _texels(self) -> Tensor:
-        return light_texels(self.textures_srgb, reduced=False)
-
-    @cached_property
-    def _reduced_texels(self) -> Tensor:
-        return light_texels(self.textures_srgb, reduced=True)
-
-
-def light_texels(textures_srgb: tuple[Tensor, ...], reduced: bool) -> Tensor:
-    """The T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code values;
-    differentiable.
-    """
-    if reduced:
-        return linear_from_srgb(texel_table(list(textures_srgb), wrap=True))
-    return texel_table([linear_from_srgb(texture) for texture in textures_srgb], wrap=True)
+from patchproof.channel.printer import load_printer
+from patchproof.render.designs import LearnedTextures, PrintedPiece
+from patchproof.render.surfaces import ObjectSurface, PieceSurface, object_surface, piece_surface
+from patchproof.scene.scene import Scene, needs_mesh, needs_piece, needs_texture
 
 
 @dataclass(frozen=True)
@@ -86,7 +26,20 @@ class Stage:
     device: torch.device
     object: ObjectSurface | None
     piece: PieceSurface | None
-    camera: Camera | None  # a calibrated one
+
+    @property
+    def camera(self) -> Camera | None:
+        """The scene's calibrated one."""
+        return self.scene.camera
+
+    @cached_property
+    def look(self) -> PrintedPiece | LearnedTextures:
+        """What designs look like here: as the scene's printer prints them, or as textures."""
+        if not self.scene.HAS_PIECE:
+            return LearnedTextures(needs_texture(self.scene).canvas, self.device)
+        scene = needs_piece(self.scene)
+        printer = load_printer(scene.settings.printer.profile, scene.base)
+        return PrintedPiece(scene.piece, scene.sheet_id, printer, self.device)
 
     @property
     def object_surface(self) -> ObjectSurface:
@@ -106,69 +59,5 @@ class Stage:
 def set_stage(scene: Scene, device: torch.device | str = "cpu") -> Stage:
     """Move a scene's mesh, textures and piece to a device."""
     device = torch.device(device)
-    if not isinstance(scene, MeshScene):
-        width, height = scene.piece.size_mm
-        corners = np.concatenate([rect_corners([0, 0, width, height]), np.ones((4, 1))], 1)
-        normals = np.broadcast_to([0.0, 0.0, -1.0], (4, 3))
-        return Stage(scene, device, None, _with_margin(corners[[0, 1, 3, 2]], normals, (width, height), device), None)
-    piece = None if scene.placement is None else _piece_surface(scene.placement, device)
-    return Stage(scene, device, _object_surface(scene, device), piece, scene.camera)
-
-
-def _object_surface(scene: MeshScene, device: torch.device) -> ObjectSurface:
-    mesh = scene.mesh
-    base = np.array([material.base_color_linear for material in mesh.materials], np.float32)
-    textures = tuple(_texture(material.texture_srgb).to(device) for material in mesh.materials)
-
-    def on(array) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array), device=device)
-
-    return ObjectSurface(
-        on(mesh.vertices),
-        on(mesh.faces),
-        on(
-            np.concatenate(
-                [mesh.corner_uv, mesh.corner_color_linear * base[mesh.face_material][:, None], mesh.corner_normal], 2
-            )
-        ),
-        on(mesh.face_material),
-        textures,
-        layout([(t.shape[1], t.shape[0]) for t in textures], wrap=True, device=device),
-    )
-
-
-def _texture(texture_srgb: np.ndarray | None) -> Tensor:
-    return torch.ones(1, 1, 3) if texture_srgb is None else torch.tensor(texture_srgb, dtype=torch.float32) / 255
-
-
-def _piece_surface(placement: Placement, device: torch.device) -> PieceSurface:
-    if placement.is_flat:  # its corners run clockwise
-        corners = placement.vertices_mm[[0, 1, 3, 2]]
-        return _with_margin(corners, np.broadcast_to(placement.normal, (4, 3)), placement.size_mm, device)
-    return _with_margin(placement.vertices_mm, placement.normals, placement.size_mm, device, placement.piece_mm)
-
-
-def _with_margin(
-    vertices: np.ndarray, normals: np.ndarray, size_mm, device: torch.device, piece_mm: np.ndarray | None = None
-) -> PieceSurface:
-    """The surface of a grid of vertices by rows, gone on straight beyond its border on all sides."""
-    piece_mm = rect_corners([0, 0, *size_mm])[[0, 1, 3, 2]] if piece_mm is None else piece_mm
-    columns, rows = (len(np.unique(piece_mm[:, i])) for i in range(2))
-    grid = np.concatenate([vertices, normals, piece_mm], 1).reshape(rows, columns, 8)
-    for axis, (side, count) in enumerate(zip(size_mm[::-1], (rows, columns), strict=True)):
-        grid = _longer(grid, axis, MARGIN_SHARE * side / (side / (count - 1)))
-    rows, columns = grid.shape[:2]
-    corner = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
-    faces = np.concatenate([np.stack(one, -1).reshape(-1, 3) for one in ((a, d, c), (a, c, b))])
-    flat = torch.as_tensor(grid.reshape(-1, 8), device=device)
-    faces = torch.as_tensor(faces, device=device)
-    at_corners = flat.float()[faces]
-    return PieceSurface(flat[:, :3].contiguous(), faces, at_corners[..., 6:], at_corners[..., 3:6], tuple(size_mm))
-
-
-def _longer(grid: np.ndarray, axis: int, steps: float) -> np.ndarray:
-    """The grid with one more row (or column) at either end, `steps` of its spacing away in a straight line."""
-    grid = np.moveaxis(grid, axis, 0)
-    before, after = grid[0] + steps * (grid[0] - grid[1]), grid[-1] + steps * (grid[-1] - grid[-2])
-    return np.moveaxis(np.concatenate([before[None], grid, after[None]]), 0, axis)
+    surface = object_surface(needs_mesh(scene).mesh, device) if scene.HAS_OBJECT else None
+    return Stage(scene, device, surface, piece_surface(needs_piece(scene), device) if scene.HAS_PIECE else None)

@@ -33,12 +33,12 @@ from patchproof.render.pixels import (
     piece_pixels,
 )
 from patchproof.render.raster import rasterize
-from patchproof.render.stage import ObjectSurface, PieceSurface, Stage
+from patchproof.render.stage import Stage
+from patchproof.render.surfaces import ObjectSurface, PieceSurface
 from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions, with_poses_of
-from patchproof.scene.image_scene import ImageScene
 from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.photo_scene import PhotoScene
+from patchproof.scene.scene import needs_mesh, needs_pictures
 
 NEAR_SHARE = 1e-3  # of the object's length
 
@@ -159,9 +159,9 @@ def see(
     """The views of `conditions`, with nothing on the object where `piece` is None. Any picture of the same size as
     `piece` can be shown in them; the object behind it is seen, too.
     """
-    scene = stage.scene
-    if not isinstance(scene, MeshScene):
-        return _see_pictures(stage, scene, piece, conditions, size_px)
+    if not stage.scene.HAS_OBJECT:
+        return _see_pictures(stage, piece, conditions, size_px)
+    scene = needs_mesh(stage.scene)
     frame = Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
     if stage.camera is not None:
         frame = pinhole_frame(stage.camera, size_px)
@@ -177,7 +177,7 @@ def see(
         return rasterize(surface.vertices, surface.faces, placed, near_mm(scene))
 
     fine = drawn(stage.object_surface, poses, supersample)
-    parts, taps = None, OBJECT_TAPS if scene.canvas is None else OBJECT_LEARNED_TAPS
+    parts, taps = None, OBJECT_LEARNED_TAPS if scene.LEARNED else OBJECT_TAPS
     if piece is not None:
         printed = scene.camera_from_print(conditions)
         surface = drawn(stage.piece_surface, printed, 1)
@@ -200,8 +200,9 @@ def see(
 
 def relit(views: Views, conditions: Conditions) -> Views:
     """The same views under other light, with another print and camera; poses and backgrounds stay."""
-    conditions, scene = with_poses_of(conditions, views.conditions), views.stage.scene
-    light = _light(scene, views.stage.device, conditions) if isinstance(scene, MeshScene) else None
+    conditions, light = with_poses_of(conditions, views.conditions), views.light
+    if light is not None:
+        light = _light(needs_mesh(views.stage.scene), views.stage.device, conditions)
     return replace(views, conditions=conditions, light=light)
 
 
@@ -251,15 +252,9 @@ def _hidden_share(piece: Fragments, covering: Fragments, front: Fragments, sampl
     return (sums[0] / sums[1].clamp_min(1)).index_select(0, piece.pixel)
 
 
-def _see_pictures(
-    stage: Stage,
-    scene: PhotoScene | ImageScene,
-    piece: PiecePicture | None,
-    conditions: Conditions,
-    size_px: tuple[int, int],
-) -> Views:
+def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:
     """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
-    parts = None
+    scene, parts = needs_pictures(stage.scene), None
     if piece is not None:
         homographies, surface = scene.piece_homographies(conditions, size_px), stage.piece_surface
         flat = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)

@@ -8,7 +8,7 @@ an error in the page shows here and not at the print shop.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from patchproof import geometry
-from patchproof.channel import lens
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.color import photo_codes_of
 from patchproof.evidence.surface import surface_of
@@ -32,8 +31,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, fields_of
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import Scene
+from patchproof.scene.scene import PieceScene, Scene, needs_piece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import attached_manifest, piece_pixels
 from patchproof.strict import Refused
@@ -78,9 +76,9 @@ class HungSheet:
     how: Hanging = AS_MADE
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> PieceScene:
         """The stage's scene."""
-        return self.stage.scene
+        return needs_piece(self.stage.scene)
 
     @cached_property
     def piece(self) -> PiecePicture | None:
@@ -106,16 +104,15 @@ class HungSheet:
         if self.piece is None:
             return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
         surface, homography, cut = surface_of(self.manifest), self.px_from_page(conditions), self.manifest.cut_mm[:2]
-        bent = isinstance(self.scene, MeshScene) and not self.scene.is_flat
         corners = {
-            str(i): seen_at(self.scene, conditions, page_mm - cut)
-            if bent
-            else geometry.apply_homography(homography, page_mm)
+            str(i): geometry.apply_homography(homography, page_mm)
+            if self.scene.is_flat
+            else self.scene.piece_px(conditions, page_mm - cut)
             for i, page_mm in surface.corners_mm.items()
             if i in surface.piece_ids
         }
         return {
-            "homography_px_from_mm": None if bent else geometry.normalized(homography).tolist(),
+            "homography_px_from_mm": geometry.normalized(homography).tolist() if self.scene.is_flat else None,
             "marker_corners_px": {i: px.tolist() for i, px in corners.items()},
             "conditions": drawn,
         }
@@ -131,7 +128,7 @@ class HungSheet:
 def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:
     """The PDF's sheet on the object of its run; refused where it is not of this run."""
     manifest, scene = sheet_scene(pdf_path, run)
-    sent, stage = sent_pixels(pdf_path, manifest, scene), set_stage(scaled_print(scene, how.print_scale))
+    sent, stage = sent_pixels(pdf_path, manifest, scene), set_stage(needs_piece(scene).printed_at(how.print_scale))
     return HungSheet(stage, manifest, sent, how.printer_for(scene), how)
 
 
@@ -167,34 +164,6 @@ def sent_pixels(
     return torch.tensor(piece_pixels(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
 
 
-def scaled_print(scene: Scene, print_scale: tuple[float, float]) -> Scene:
-    """The scene with a piece printed larger or smaller, hung up at the same middle; piece mm stay the sheet's own."""
-    if print_scale == (1.0, 1.0):
-        return scene
-    if not isinstance(scene, MeshScene):
-        raise Refused("a scene with a mesh for a print of another size", "one of pictures", "leave --print-scale out")
-    placement, scale = scene.placed, np.array(print_scale)
-    middle = np.array(placement.size_mm) / 2
-    about = np.eye(4)
-    about[[0, 1], [0, 1]] = scale
-    about[:2, 3] = middle - scale * middle
-    vertices = placement.world(middle + (placement.piece_mm - middle) * scale)
-    frame = placement.world_from_piece @ about
-    return replace(scene, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
-
-
-def seen_at(scene: Scene, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
-    """Pixels N×2 of points N×2 of the piece in one photograph, through bent paper and a bent picture, too; NaN behind
-    the camera.
-    """
-    photo_px = scene.settings.camera.photo_px
-    if not isinstance(scene, MeshScene):
-        return geometry.apply_homography(scene.piece_homographies(conditions, photo_px)[0], piece_mm)
-    pose, world = scene.camera_from_print(conditions)[0], scene.placed.world(piece_mm)
-    points = geometry.project(scene.matrix_px(photo_px), pose, world)
-    return points if scene.camera is None else lens.distort_points(points, scene.camera, photo_px)
-
-
 def take_photo(stage: Stage, piece: PiecePicture | None, conditions: Conditions) -> bytes:
     """A JPEG file of one view with the piece, or of the bare object, as `HungSheet.photograph` makes them."""
     with torch.no_grad():
@@ -207,10 +176,9 @@ def _stored(picture: Tensor, scene: Scene, conditions: Conditions) -> bytes:
     from PIL import Image
 
     exif, photo_px = Image.Exif(), scene.settings.camera.photo_px
-    if isinstance(scene, MeshScene):  # of pictures nobody knows the focal length
-        focal_px = scene.matrix_px(photo_px)[0, 0]
+    if scene.focal_px is not None:
         details = exif.get_ifd(0x8769)
-        details[0xA405] = round(focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
+        details[0xA405] = round(scene.focal_px * _FULL_FRAME_DIAGONAL_MM / np.hypot(*photo_px))  # FocalLengthIn35mmFilm
     return jpeg_of(picture, conditions, {"exif": exif})
 
 

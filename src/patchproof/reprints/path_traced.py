@@ -35,6 +35,7 @@ from patchproof.render.stage import Stage
 from patchproof.reprints.traced_light import lights
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import needs_mesh, needs_patch, needs_piece
 from patchproof.strict import Refused
 
 # Bare paper: our levels are relative to it, but light that goes back and forth is not.
@@ -122,9 +123,7 @@ def mitsuba() -> ModuleType:
 
 def _traceable(stage: Stage) -> MeshScene:
     """The stage's scene; refused where Mitsuba cannot show it."""
-    scene = stage.scene
-    if not isinstance(scene, MeshScene):
-        raise Refused("a scene with a mesh to trace paths in", "one of pictures", "leave --path-traced out")
+    scene = needs_mesh(stage.scene, "a scene with a mesh to trace paths in", "leave --path-traced out")
     matrix = scene.matrix_px(scene.settings.camera.photo_px)
     if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
         raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
@@ -146,7 +145,7 @@ def _background(scene: MeshScene, conditions: Conditions, frame: Frame) -> np.nd
 
 def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
     """The part of the frame that shows anything but background: left, top, width and height, 1 at least."""
-    points = [scene.mesh.vertices] if scene.placement is None else [scene.mesh.vertices, scene.placement.vertices_mm]
+    points = [scene.mesh.vertices, needs_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
     seen = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
     if not np.isfinite(seen).all():  # some of it lies behind the camera
         return 0, 0, *frame.size_px
@@ -192,7 +191,7 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
 
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
     """The printed piece as large as it came out of the printer, plain paper on its back."""
-    placement = scene.placed
+    placement = needs_patch(scene).placement
     scale = geometry.scaled_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
     printed = _printed(picture, placement.size_mm, conditions.print)

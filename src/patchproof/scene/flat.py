@@ -12,14 +12,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
-from patchproof.geometry import local_scale, scaled_about
-from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
+from patchproof.geometry import rect_corners, scaled_about
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import PieceScene
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import MODULES, Piece
 from patchproof.strict import Refused
@@ -27,23 +27,14 @@ from patchproof.strict import Refused
 VIEWS_TRIED = 256  # for figures over a scene's views
 
 
-class FlatScene(Protocol):
-    """What render, optimize and study ask of a scene without a mesh; N is the number of conditions."""
+@dataclass(frozen=True)
+class FlatScene(PieceScene):
+    """A scene without a mesh; N is the number of conditions."""
 
-    settings: SceneSettings
-    base: Path
-    seed: int
-    sheet_id: str
-    piece: Piece
-    notes: tuple[str, ...]  # warnings of what was read
-
-    @abstractmethod
-    def with_template(self, name: str) -> FlatScene:
-        """The scene for a page of another template."""
-
-    @abstractmethod
-    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimetres to pixels."""
+    OMITTED = (
+        "other viewpoints, backgrounds and lamps than the pictures show; what stands in front of the piece;",
+        "curl: the piece is a plane",
+    )
 
     @abstractmethod
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
@@ -55,22 +46,15 @@ class FlatScene(Protocol):
         piece, right and down.
         """
 
-    @abstractmethod
-    def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
-        """N Gaussian sigmas of the base pictures' own blur, in pixels of the whole photograph."""
+    def lies(self) -> dict[str, Any]:
+        """As in `Scene.lies`: in a plane."""
+        reason = "pictures say nothing of a surface: the piece is a plane that their homographies carry"
+        return {"family": "plane", "size_mm": self.piece.size_mm, "reason": reason}
 
-    @abstractmethod
-    def piece_noise(self, conditions: Conditions) -> np.ndarray:
-        """N standard deviations of the base pictures' own noise, at white, in linear light of the whole photograph."""
-
-    @property
-    def photo_px(self) -> tuple[int, int]:
-        """Size of the photographs that the scene makes."""
-        return self.settings.camera.photo_px
-
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
-        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
-        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+    def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As in `PieceScene.paper`: in the plane z = 1 of its own millimetres, which a view's homography projects."""
+        corners = rect_corners((0, 0, *self.piece.size_mm))[[0, 1, 3, 2]]
+        return np.concatenate([corners, np.ones((4, 1))], 1), np.broadcast_to([0.0, 0.0, -1.0], (4, 3)), corners
 
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
         """N NaN: a picture without a known camera does not say from where it was taken."""
@@ -82,24 +66,19 @@ class FlatScene(Protocol):
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
         """Pixels per millimetre of the piece in the closest view."""
-        homographies = self.piece_homographies(self.draw("select", VIEWS_TRIED, 0), size_px)
-        middle = np.array(self.piece.size_mm) / 2
-        return max(float(local_scale(homography, middle)[0]) for homography in homographies)
+        return float(self.piece_scales(self.draw("select", VIEWS_TRIED, 0), size_px).max())
 
-    def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
-
-    @cached_property
+    @property
     def unreadable_share(self) -> float:
         """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE` along its
         foreshortened side.
         """
-        small = []
-        for homography in self.piece_homographies(self.draw("select", VIEWS_TRIED, 0), self.photo_px):
-            mean, tilt_deg = local_scale(homography, np.array(self.piece.size_mm) / 2)
-            small.append(mean * np.sqrt(np.cos(np.radians(tilt_deg))) * self.piece.module_mm)
-        return float((np.array(small) < PX_PER_MODULE * 0.999).mean())
+        return self._unreadable
+
+    @cached_property
+    def _unreadable(self) -> float:
+        scales = self.piece_scales(self.draw("select", VIEWS_TRIED, 0), self.photo_px, shorter=True)
+        return float((scales * self.piece.module_mm < PX_PER_MODULE * 0.999).mean())
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -18,9 +18,9 @@ import csv
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
+from typing_extensions import Self
 
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
@@ -51,24 +51,16 @@ _ERASED_CELLS = 224  # random values per side of the centered square: one a pixe
 
 @dataclass(frozen=True)
 class ImageScene(flat.FlatScene):
-    """A `FlatScene` whose base pictures are images of the target's class, in an order that their names decide."""
+    """A scene whose base pictures are images of the target's class, in an order that their names decide."""
 
-    settings: SceneSettings
-    base: Path
-    seed: int
-    sheet_id: str
-    piece: Piece
     images: tuple[flat.Picture, ...]
-    notes: tuple[str, ...]
-    given_glb: ClassVar[bytes | None] = None
 
-    def with_template(self, name: str) -> ImageScene:
-        """The scene for a page of another template: its sheet id and the piece's frame anew."""
-        if name == self.settings.sheet.template:
-            return self
-        settings = self.settings.changed(sheet={"template": name})
-        identity = sheet_id(identifying(settings), self.seed)
-        return replace(self, settings=settings, sheet_id=identity, piece=_piece(settings, identity))
+    def description(self) -> str:
+        """How many images there are."""
+        return f"{len(self.images)} images"
+
+    def _laid_out(self) -> Self:
+        return replace(self, piece=_piece(self.settings, self.sheet_id))
 
     def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
         """Draws of one of the scene's streams: `background[:, 0]` stays in that stream's half of the images, and
@@ -116,14 +108,6 @@ class ImageScene(flat.FlatScene):
         light[..., 0] = 1
         return light
 
-    def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
-        """No blur: N zeros."""
-        return np.zeros(len(conditions))
-
-    def piece_noise(self, conditions: Conditions) -> np.ndarray:
-        """No noise: N zeros."""
-        return np.zeros(len(conditions))
-
 
 def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> ImageScene:
     """The scene of a folder of images and their labels; images that cannot be read are warned about.
@@ -139,7 +123,7 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
     if len(images) < SPLIT_FROM:
         warnings.append(f"the promise is made on the same {len(images)} images that the patch is optimized on")
-    return ImageScene(settings, base, seed, identity, piece, images, tuple(warnings))
+    return ImageScene(settings, base, seed, identity, piece, images, notes=tuple(warnings))
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
@@ -190,7 +174,7 @@ def _erased_box(rng: np.random.Generator) -> tuple[float, float, float, float]:
 
 def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
     """The files whose label is the target's, in an order that depends on nothing but their names."""
-    folder, table = (Path(expand(text, base)) for text in (settings.object.images, settings.object.labels))
+    folder, table = (Path(expand(text, base)) for text in (settings.object.images or "", settings.object.labels or ""))
     rows = label_rows(table)
     target = settings.target
     wanted = {str(label).strip().casefold() for label in (target.label, *target.accept)}
@@ -246,7 +230,7 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
     patch, (low, high) = settings.patch, settings.view.patch_share
     if low <= 0:
         raise Refused("view.patch_share above 0", f"{low:g}", "give a share that can be seen")
-    design_mm = (patch.width_mm, patch.height_mm)
+    design_mm = patch.design_mm
     # a square of this side fits into the picture at every drawn size and angle
     fits_mm = max(design_mm) / high / _widest(settings.view.roll_deg)
     least_mm = _least_mm(design_mm)
@@ -259,7 +243,8 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
     smallest = low * (high / low) ** (1 - READABLE_SHARE)
     needed_mm = MODULES * PX_PER_MODULE * max(design_mm) / (smallest * min(settings.camera.photo_px))
     needed_mm = min(needed_mm, _LARGEST_MARKER * max(design_mm))
-    largest_mm = tuple(min(side, fits_mm) for side in largest_piece_mm(load_template(settings.sheet.template)))
+    width_mm, height_mm = largest_piece_mm(load_template(settings.sheet.template))
+    largest_mm = min(width_mm, fits_mm), min(height_mm, fits_mm)
     return lay_out_piece(design_mm, marker_size_mm(needed_mm, design_mm, largest_mm), identity, "design")
 
 

@@ -1,83 +1,63 @@
-"""A scene with a mesh: the object, the piece that hangs on it, and what is behind it, ready to be photographed.
+"""An object with a mesh and what is behind it, ready to be photographed: the camera of every drawn view.
 
-In: settings. Out: `MeshScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
-layout of the printed piece (the design with its frame of markers; the marker size follows from the views), where the
-piece lies, and the camera of every drawn view. Where the object's own texture is what changes, there is no piece.
+By itself a `MeshScene` is the bare object. In a `TextureScene` the object's own texture is what changes; a piece hangs
+on it in a `PatchScene` (see `patch_scene`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+from typing_extensions import Self
 
 from patchproof import geometry
 from patchproof.channel import lens
+from patchproof.channel.effect import Effect
 from patchproof.channel.effects import Pose
-from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
-from patchproof.scene.bend import place_bent
-from patchproof.scene.conditions import Conditions, draw
-from patchproof.scene.placement import Frame, Placement, patch_frame, place_card
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE, design_grid
-from patchproof.scene.texture import Canvas, texture_canvas
-from patchproof.settings import SceneSettings, identifying
-from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
-from patchproof.sheets.template import load_template
-from patchproof.sheets.tiles import plan_tiles
-from patchproof.strict import Refused, expand
+from patchproof.scene.backgrounds import Backgrounds
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
+from patchproof.scene.placement import Frame, patch_frame
+from patchproof.scene.texture import Canvas
+from patchproof.settings import SceneSettings
+from patchproof.strict import Refused
 
-_VIEWS_TRIED = 1024
 CLEARANCE = 5e-3  # of the object's length between it and a camera: what is nearer than the near plane would vanish
 
 
 @dataclass(frozen=True)
-class MeshScene:
-    """Everything a photograph depends on but what is optimized and the conditions."""
+class MeshScene(Scene):
+    """An object with a mesh before its backgrounds; by itself, with nothing on it."""
 
-    settings: SceneSettings
-    base: Path
-    seed: int
     mesh: Mesh
     frame: Frame
-    placement: Placement | None  # None, like `piece`, where there is only the object
-    piece: Piece | None
     backgrounds: Backgrounds
-    sheet_id: str
-    unreadable_share: float  # of the views in which a marker's module is under PX_PER_MODULE
-    warnings: tuple[str, ...]
-    canvas: Canvas | None = None  # what of the object's own texture may change
-    camera: lens.Camera | None = None  # a calibrated one
-    given_glb: bytes | None = None  # the mesh, where it was given in Python
 
-    def with_template(self, name: str) -> MeshScene:
-        """The scene for a page of another template: its sheet id, the piece's frame and where the piece lies anew."""
-        if name == self.settings.sheet.template:
-            return self
-        settings = self.settings.changed(sheet={"template": name})
-        scene = replace(self, settings=settings, sheet_id=sheet_id(_identity(settings, self.given_glb), self.seed))
-        return scene if scene.canvas is not None else _with_piece(scene)
+    HAS_OBJECT = True
+    LEARNED: ClassVar[bool] = False  # whether the object's own texture is what changes
+    PARTS = (Part("lens distortion", "camera.file"),)
+    OMITTED = (
+        "cast shadows: a 10 mm ledge along the top of a 110 mm patch takes 4 % of its light, 9 % at the 95 % point",
+        "(computed for the default ranges, see channel/light); interreflection; "
+        "curl: paper is as flat or bent as stated",
+    )
+    EFFECT_TABLES = ("light", "camera")
 
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
-        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
-        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+    def description(self) -> str:
+        """How many faces the mesh has."""
+        return f"a mesh of {len(self.mesh.faces)} faces"
 
-    @property
-    def placed(self) -> Placement:
-        """Where the piece lies; refused where there is only the object."""
-        if self.placement is None:
-            raise Refused("a scene with a patch", "one of the object's own texture", 'leave patch.kind out, or "patch"')
-        return self.placement
-
-    @property
-    def is_flat(self) -> bool:
-        """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
-        return self.placed.is_flat and not (self.camera is not None and self.camera.bends)
+    def lies(self) -> dict[str, Any]:
+        """As in `Scene.lies`: all over the object."""
+        return {
+            "family": "texture",
+            "size_mm": self.frame.extent_mm,
+            "reason": "the object's own texture is the design",
+        }
 
     @property
     def length_mm(self) -> float:
@@ -89,11 +69,31 @@ class MeshScene:
     @property
     def middle_mm(self) -> np.ndarray:
         """The middle of the piece in the world; without one, of the side it would face."""
-        return self.frame.origin_mm if self.placement is None else self.placement.center_mm
+        return self.frame.origin_mm
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Where that faces."""
+        return self.frame.normal
+
+    @property
+    def focal_px(self) -> float:
+        """The focal length of whole photographs."""
+        return float(self.matrix_px(self.photo_px)[0, 0])
+
+    def models(self, effect: Effect) -> bool:
+        """As in `Scene.models`: nothing shows here that only paper shows."""
+        return super().models(effect) and not effect.only_paper
+
+    def without(self, part: Part) -> Self | None:
+        """The scene without its lens's distortion; None where there is none."""
+        if self.camera is None or not self.camera.bends:
+            return None
+        return replace(self, camera=self.camera.changed(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0))
 
     def camera_from_world(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 poses of the drawn cameras."""
-        return camera_poses(self.settings, self.mesh, self.frame, self.middle_mm, conditions.pose)
+        return camera_poses(self, self.middle_mm, conditions.pose)
 
     def camera_from_print(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as large as it was
@@ -108,22 +108,10 @@ class MeshScene:
             return lens.matrix_px(self.camera, size_px)
         return geometry.intrinsics(self.settings.view.fov_deg, size_px)
 
-    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimetres to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
-        matrix, plane = self.matrix_px(size_px), self.placement.world_from_piece
-        return np.stack([geometry.plane_homography(matrix, pose, plane) for pose in self.camera_from_print(conditions)])
-
-    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
-        """N angles of the camera to the right of the piece's middle, beyond 90 where its face is turned away."""
-        middle = np.array(self.placement.size_mm) / 2
-        poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
-        return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
-
-    def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle, without lamps."""
-        frame, light = self.frame, conditions.light
-        toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)
-        return light.ambient + light.directional * np.clip(toward @ self.placement.normal, 0, None)
+    def cosines(self, azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
+        """N cosines between the normal and directions, 0 from behind."""
+        toward = geometry.orbit(azimuth_deg, elevation_deg, self.frame.normal, self.frame.up)
+        return np.clip(toward @ self.normal, 0, None)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
         """Pixels per millimetre of the piece in the closest view."""
@@ -131,101 +119,33 @@ class MeshScene:
         closest_mm = max(nearest - float(np.linalg.norm(self.middle_mm)), nearest / 4)
         return float(self.matrix_px(size_px)[0, 0]) / closest_mm
 
-    def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
+    def px_per_mm(self, size_px: tuple[int, int], shorter: bool = False) -> np.ndarray:
+        """As in `Scene.px_per_mm`, at the object's middle."""
+        return self.matrix_px(size_px)[0, 0] / self.draw("select", SCALE_VIEWS, 0).pose.distance_mm
 
 
-def load_mesh_scene(
-    settings: SceneSettings, base: Path, seed: int, identity: str | None = None, given_glb: bytes | None = None
-) -> MeshScene:
-    """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
-    settings_object, camera = settings.object, settings.camera
-    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
-    frame, identity = patch_frame(mesh, settings.patch), identity or sheet_id(_identity(settings, given_glb), seed)
-    backgrounds = load_backgrounds(settings.background, base)
-    calibrated = None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px)
-    canvas, warnings = None, mesh.warnings
-    if settings.patch.kind != "patch":
-        canvas = texture_canvas(mesh, settings.patch, base)
-        mesh, warnings = canvas.mesh, (*warnings, *canvas.warnings)
-    scene = MeshScene(
-        settings,
-        base,
-        seed,
-        mesh,
-        frame,
-        None,
-        None,
-        backgrounds,
-        identity,
-        0.0,
-        warnings,
-        canvas,
-        calibrated,
-        given_glb,
-    )
-    return scene if canvas is not None else _with_piece(scene)
+@dataclass(frozen=True)
+class TextureScene(MeshScene):
+    """An object some of whose own texels may change."""
 
-
-def _identity(settings: SceneSettings, given_glb: bytes | None) -> dict:
-    """What the sheet id is made of: the settings, and the mesh where it is in no file."""
-    own = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
-    return identifying(settings) | own
-
-
-def _with_piece(scene: MeshScene) -> MeshScene:
-    """The scene with its piece, whose markers are as large as the views need, and where it lies."""
-    settings, mesh, frame = scene.settings, scene.mesh, scene.frame
-    patch, place = settings.patch, place_bent if settings.patch.bend else place_card
-    design_mm = (patch.width_mm, patch.height_mm)
-    scales = _smallest_scales(scene, place(mesh, frame, design_mm, patch.spin_deg))
-    if not len(scales):
-        raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
-    needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
-    template = load_template(settings.sheet.template)
-    page_mm = largest_piece_mm(template)
-    largest_mm = page_mm if patch.bend else tuple(min(a, b) for a, b in zip(frame.extent_mm, page_mm, strict=True))
-    marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
-    piece = lay_out_piece(design_mm, marker_mm, scene.sheet_id, "design")
-    if template.tiles is not None:
-        plan_tiles(template.tiles, piece)  # refuses what no sheet could be made of, before hours of optimizing
-    unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
-    warnings = (*mesh.warnings, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
-    return replace(scene, placement=placement, piece=piece, unreadable_share=unreadable, warnings=warnings)
+    canvas: Canvas
+    LEARNED = True
 
 
 def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) -> MeshScene:
     """An object with no piece on it, to be photographed as it is."""
-    frame = patch_frame(mesh, settings.patch)
-    seed = settings.optimize.seed
-    return MeshScene(settings, Path(), seed, mesh, frame, None, None, backgrounds, "", 0.0, mesh.warnings)
+    frame, seed = patch_frame(mesh, settings.patch), settings.optimize.seed
+    return MeshScene(settings, Path(), seed, "", mesh, frame, backgrounds, notes=mesh.warnings)
 
 
-def camera_poses(settings: SceneSettings, mesh: Mesh, frame: Frame, patch_mm, pose: Pose) -> np.ndarray:
+def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarray:
     """`camera_from_world` N×4×4: on an orbit about what the camera looks at, azimuth 0 facing the patch's side."""
-    center = np.zeros(3) if settings.view.look_at == "object" else np.asarray(patch_mm)
-    targets = center + pose.look_at_offset * settings.object.length_mm
+    center, frame = np.zeros(3) if scene.settings.view.look_at == "object" else patch_mm, scene.frame
+    targets = center + pose.look_at_offset * scene.length_mm
     directions = geometry.orbit(pose.azimuth_deg, pose.elevation_deg, frame.normal, frame.up)
     eyes = targets + pose.distance_mm[:, None] * directions
-    _refuse_inside(mesh, eyes)
+    _refuse_inside(scene.mesh, eyes)
     return geometry.look_at(eyes, targets, pose.roll_deg, frame.up)
-
-
-def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
-    """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
-    conditions = scene.draw("select", _VIEWS_TRIED, 0)
-    poses = camera_poses(scene.settings, scene.mesh, scene.frame, card.center_mm, conditions.pose)
-    matrix, scales = scene.matrix_px(scene.settings.camera.photo_px), []
-    for pose in poses:
-        eye = -pose[:3, :3].T @ pose[:3, 3]
-        if (eye - card.center_mm) @ card.normal <= 0:
-            continue
-        homography = geometry.plane_homography(matrix, pose, card.world_from_piece)
-        mean, tilt = geometry.local_scale(homography, np.array(card.size_mm) / 2)
-        scales.append(mean * math.sqrt(math.cos(math.radians(tilt))))
-    return np.array(scales)
 
 
 def _refuse_inside(mesh: Mesh, eyes: np.ndarray) -> None:
@@ -238,9 +158,3 @@ def _refuse_inside(mesh: Mesh, eyes: np.ndarray) -> None:
             f"{inside.sum()} of {len(eyes)} views inside its bounding box or within {near:.2g} mm of it",
             "raise view.distance_mm",
         )
-
-
-def _unreadable_warning(share: float, marker_mm: float) -> tuple[str, ...]:
-    if share <= 1 - READABLE_SHARE:
-        return ()
-    return (f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views",)

@@ -18,7 +18,7 @@ from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import CLIPPED_CODE
-from patchproof.sheets.piece import Piece
+from patchproof.sheets.piece import Piece, marker_rect
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
 _MOST_CLIPPED = 0.5  # share of the white paper
@@ -75,7 +75,7 @@ def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
     clear_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
     white = _inside(mm, whole, -clear_mm - _CUT_SLACK_MM)
-    for rect in [*(_marker_rect(m.corners_mm) for m in piece.markers), *(rect for rect, _ in piece.swatches)]:
+    for rect in [*(marker_rect(marker) for marker in piece.markers), *(rect for rect, _ in piece.swatches)]:
         white &= ~_inside(mm, rect, clear_mm)
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
 
@@ -83,17 +83,16 @@ def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np
 def _inside(mm: np.ndarray, rect, grown_mm: float) -> np.ndarray:
     x, y, w, h = rect
     low, high = np.array([x, y]) - grown_mm, np.array([x + w, y + h]) + grown_mm
-    return ((mm > low) & (mm < high)).all(1)
-
-
-def _marker_rect(corners_mm):
-    (x, y), (x1, _) = corners_mm[:2]
-    return x, y, x1 - x, x1 - x
+    return np.asarray(((mm > low) & (mm < high)).all(1))
 
 
 def _robust_fit(terms: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients 3×6 and the pixels' weights, which all channels share."""
-    error = np.abs(light.mean(1) - terms @ _start(terms, light.mean(1)))
+    error, coefficients, weight = (
+        np.abs(light.mean(1) - terms @ _start(terms, light.mean(1))),
+        np.zeros((3, 6)),
+        np.ones(len(terms)),
+    )
     for _ in range(20):
         spread = max(1.4826 * float(np.median(error)), 1e-3)
         weight = np.maximum(1 - (error / (4.685 * spread)) ** 2, 0) ** 2

@@ -93,10 +93,10 @@ def _clouds(rng: np.random.Generator, px: int) -> np.ndarray:
 
 def _cells(rng: np.random.Generator, px: int) -> np.ndarray:
     """Gravel, leaves, a crowd: each pixel has the shade of its nearest of some points."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     points = rng.random((int(np.exp(rng.uniform(np.log(8), np.log(800)))), 2)) * px
-    away, index = cKDTree(points).query(np.stack(np.mgrid[:px, :px], 2))
+    away, index = KDTree(points).query(np.moveaxis(np.mgrid[:px, :px], 0, 2))
     return rng.random(len(points))[index] * np.clip(1.2 - away / max(away.max(), 1e-9) * rng.uniform(0, 1), 0, 1)
 
 

@@ -19,9 +19,9 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
+from typing_extensions import Self
 
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
@@ -31,6 +31,7 @@ from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import Part
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_piece_mm
@@ -58,28 +59,39 @@ class BasePhoto:
     blur_px: float
 
 
+EVEN_LIGHT = Part("uneven light on paper", camera=False)
+OWN_BLUR = Part("photographs' own blur", whole=True)
+OWN_NOISE = Part("photographs' own noise", whole=True)
+
+
 @dataclass(frozen=True)
 class PhotoScene(flat.FlatScene):
-    """A `FlatScene` whose base pictures are photographs of the object with a blank sheet on it."""
+    """A scene whose base pictures are photographs of the object with a blank sheet on it."""
 
-    settings: SceneSettings
-    base: Path
-    seed: int
-    sheet_id: str
-    piece: Piece
     photos: tuple[BasePhoto, ...]
-    notes: tuple[str, ...]
-    given_glb: ClassVar[bytes | None] = None
-    known: dict[str, str]  # which blank and which photographs: a part of the sheet id
+    PARTS = (EVEN_LIGHT, OWN_BLUR, OWN_NOISE)
 
-    def with_template(self, name: str) -> PhotoScene:
-        """The scene for a page of another template: its sheet id and the markers' own anew, nothing moved."""
-        if name == self.settings.sheet.template:
-            return self
-        settings = self.settings.changed(sheet={"template": name})
-        _refuse_larger_than_page(settings, self.piece)
-        identity = sheet_id(identifying(settings) | self.known, self.seed)
-        return replace(self, settings=settings, sheet_id=identity, piece=with_ids(self.piece, identity, "design"))
+    def description(self) -> str:
+        """How many photographs there are."""
+        return f"{len(self.photos)} photographs"
+
+    def _laid_out(self) -> Self:
+        _refuse_larger_than_page(self.settings, self.piece)
+        return replace(self, piece=with_ids(self.piece, self.sheet_id, "design"))
+
+    def without(self, part: Part) -> Self | None:
+        """The scene with photographs that light their paper evenly, or without their own blur or noise."""
+        even, photos = np.array([1.0, 0, 0, 0, 0, 0]), self.photos
+        if part == EVEN_LIGHT:
+            coefficients = (photo.light.coefficients * even for photo in photos)
+            lights = [replace(photo.light, coefficients=each) for photo, each in zip(photos, coefficients, strict=True)]
+        elif part == OWN_NOISE and any(photo.light.noise for photo in photos):
+            lights = [replace(photo.light, noise=0.0) for photo in photos]
+        elif part == OWN_BLUR and any(photo.blur_px for photo in photos):
+            return replace(self, photos=tuple(replace(photo, blur_px=0.0) for photo in photos))
+        else:
+            return None
+        return replace(self, photos=tuple(replace(p, light=light) for p, light in zip(photos, lights, strict=True)))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimetres to pixels."""
@@ -98,13 +110,11 @@ class PhotoScene(flat.FlatScene):
         """N×3×6 coefficients as in `FlatScene.piece_light`, in light of the photograph: 1 is its full white."""
         return np.stack([photo.light.coefficients for photo in self._chosen(conditions)])
 
-    def piece_blur_px(self, conditions: Conditions) -> np.ndarray:
-        """N sigmas in pixels of the whole photograph; zoom enlarges the blur with the picture."""
-        return np.array([photo.blur_px for photo in self._chosen(conditions)]) * self._zoom(conditions)
-
-    def piece_noise(self, conditions: Conditions) -> np.ndarray:
-        """N standard deviations at white, in linear light of the whole photograph."""
-        return np.array([photo.light.noise for photo in self._chosen(conditions)])
+    def own_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+        """As in `Scene.own_blur_and_noise`; zoom enlarges the blur with the picture."""
+        chosen = self._chosen(conditions)
+        blur_px = np.array([photo.blur_px for photo in chosen]) * self._zoom(conditions)
+        return blur_px, np.array([photo.light.noise for photo in chosen])
 
     def _chosen(self, conditions: Conditions) -> list[BasePhoto]:
         return [self.photos[i] for i in flat.pick(conditions.pose.background[:, 0], len(self.photos))]
@@ -126,22 +136,25 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     The scene's settings have the blank's `width_mm` and `height_mm`, also where the file gave none.
     """
     flat.refuse_bending(settings)
-    manifest = load_manifest(expand(settings.object.sheet, base))
+    photos, sheet = settings.object.photos, settings.object.sheet
+    if photos is None or sheet is None:
+        raise ValueError("a scene of photographs names them and their sheet")
+    manifest = load_manifest(expand(sheet, base))
     design_mm, marker_mm = blank_piece_mm(manifest)
     settings = _with_size(settings, design_mm)
-    folder = Path(expand(settings.object.photos, base))
+    folder = Path(expand(photos, base))
     known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
     identity = identity or sheet_id(identifying(settings) | known, seed)
     piece = lay_out_piece(design_mm, marker_mm, identity, "design")
     _refuse_larger_than_page(settings, piece)
-    photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)
+    base_photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)
     warnings = [f"{name} is left out: {reason}" for name, reason in skipped.items()]
-    for photo in photos:
+    for photo in base_photos:
         if photo.light.unevenness > _UNEVEN:
             warnings.append(
                 f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
             )
-    return PhotoScene(settings, base, seed, identity, piece, photos, tuple(warnings), known)
+    return PhotoScene(settings, base, seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
 
 
 def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
@@ -219,11 +232,10 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
 
 def _with_size(settings: SceneSettings, design_mm: tuple[float, float]) -> SceneSettings:
     patch = settings.patch
-    given = (patch.width_mm, patch.height_mm)
-    if given != (None, None) and not np.allclose(given, design_mm, atol=0.01):
+    if patch.width_mm is not None and not np.allclose(patch.design_mm, design_mm, atol=0.01):
         raise Refused(
             f"a patch as large as the blank sheet's ({design_mm[0]:g} × {design_mm[1]:g} mm)",
-            f"{given[0]:g} × {given[1]:g} mm",
+            f"{patch.design_mm[0]:g} × {patch.design_mm[1]:g} mm",
             "leave out width_mm and height_mm, or print a blank of that size",
         )
     return settings.changed(patch={"width_mm": design_mm[0], "height_mm": design_mm[1]})

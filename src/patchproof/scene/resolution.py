@@ -17,4 +17,5 @@ def design_grid(closest_px_per_mm: float, design_mm: tuple[float, float]) -> tup
     """
     low, high = _DESIGN_PX
     scale = np.clip(closest_px_per_mm, low / min(design_mm), high / max(design_mm))
-    return tuple(max(8, round(side * scale / 8) * 8) for side in design_mm)
+    width, height = (max(8, round(side * scale / 8) * 8) for side in design_mm)
+    return width, height

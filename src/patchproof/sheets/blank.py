@@ -14,7 +14,7 @@ from pathlib import Path
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.page import lay_out_parts
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import frame_mm, lay_out_piece, marker_ids, sheet_id
+from patchproof.sheets.piece import frame_mm, lay_out_piece, marker_ids, page_id
 from patchproof.sheets.template import Template, load_template, template_names
 from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets, write_sheet
 from patchproof.strict import Refused
@@ -28,7 +28,7 @@ def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     if page.blank is None:
         do = f"use one of: {', '.join(template_names(BLANK))}, or name the run whose design belongs on the page"
         raise Refused("a template with a [blank] table for a page without a design", f"{template}", do)
-    identity = sheet_id({"template": page.model_dump(mode="json")}, 0)
+    identity = page_id(page)
     return write_sheet(
         pdf_path,
         template=page,
@@ -44,7 +44,7 @@ def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
 def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
     """Write the chart's page and its manifest beside it."""
     pdf_path = pdf_name(pdf_path)
-    identity = sheet_id({"template": template.model_dump(mode="json")}, 0)
+    identity = page_id(template)
     ids = marker_ids(identity, BLANK, len(template.marker.corners_mm))  # a chart has an id of its own, so no kind
     grid = template.chart
     words = {"sheet_id": identity, "kind": CHART, "swatches": str(grid.columns * grid.rows)}

@@ -17,7 +17,7 @@ from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.page import furnished
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import DICTIONARY, MODULES, marker_at, sheet_id
+from patchproof.sheets.piece import DICTIONARY, MODULES, marker_at, page_id
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardGrid, BoardTemplate, template_data, template_names
 from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets
@@ -75,7 +75,7 @@ def _load(template: str | Path) -> tuple[BoardTemplate, str]:
         do = f"use one of: {', '.join(template_names(KIND))}"
         raise Refused("a template with a [board] table", f"{template}", do)
     page = validated(BoardTemplate, data, str(path))
-    return page, sheet_id({"template": page.model_dump(mode="json")}, 0)
+    return page, page_id(page)
 
 
 def _board(grid: BoardGrid, identity: str, ruler_mm: tuple[float, float]) -> Board:

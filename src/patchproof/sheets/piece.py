@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.settings import identifying
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
 from patchproof.sheets.swatches import frame_swatches
-from patchproof.strict import Refused, nearest
+from patchproof.strict import Refused, Strict, nearest
 
 DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
@@ -72,6 +73,11 @@ def sheet_id(settings: dict[str, Any], seed: int) -> str:
     text = json.dumps({"settings": settings, "seed": seed}, sort_keys=True, separators=(",", ":"), allow_nan=False)
     number = int.from_bytes(hashlib.sha256(text.encode()).digest(), "big")
     return "".join("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"[number // 36**i % 36] for i in range(10))
+
+
+def page_id(template: Strict) -> str:
+    """The sheet id of a page that shows nothing but its template: equal templates give equal pages."""
+    return sheet_id({"template": identifying(template)}, 0)
 
 
 def marker_ids(sheet_id: str, kind: str, count: int) -> list[int]:
@@ -139,7 +145,7 @@ def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
     return replace(piece, markers=tuple(replace(one, id=id_) for id_, one in zip(ids, piece.markers, strict=True)))
 
 
-def marker_at(id_: int, corner_mm: tuple[float, float], size_mm: float) -> PieceMarker:
+def marker_at(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:
     """A marker with its top-left corner there."""
     (x, y), side = map(float, corner_mm), float(size_mm)
     return PieceMarker(id_, ((x, y), (x + side, y), (x + side, y + side), (x, y + side)))

@@ -1,13 +1,11 @@
-"""Pictures that a study's cells leave behind, as bytes of files: photographs side by side, designs large, objects.
+"""Pictures that a study's cells leave behind, as bytes of files: photographs side by side, designs large.
 
-In: a problem and what shows, or pixels. Out: tensors N×3×S×S in [0, 1], and PNG or GLB bytes.
+In: a problem and what shows, or pixels. Out: tensors N×3×S×S in [0, 1], and PNG bytes.
 """
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,11 +14,9 @@ from torch import Tensor
 
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.texture import Texture
 from patchproof.render.photograph import Shown, expose
 from patchproof.report.images import png
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.export import write_glb
 
 
 def photographs(problem: Problem, shown: Shown, conditions: Conditions, side_px: int) -> Tensor:
@@ -43,14 +39,3 @@ def enlarged(pixels: np.ndarray, side_px: int) -> Tensor:
     large = Image.fromarray(pixels).resize(size, Image.Resampling.NEAREST)
     tile.paste(large, ((side_px - size[0]) // 2, (side_px - size[1]) // 2))
     return from_pixels(np.asarray(tile))
-
-
-def object_file(problem: Problem, design: np.ndarray) -> tuple[str, bytes]:
-    """(suffix, bytes): the object with its new textures as GLB, or the patch as PNG."""
-    canvas = getattr(problem.scene, "canvas", None)
-    if canvas is None or not isinstance(problem.subject, Texture):
-        return "png", png(design)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "object.glb"
-        write_glb(canvas.mesh, problem.subject.surface.textures(design), path)
-        return "glb", path.read_bytes()

@@ -24,7 +24,6 @@ from pydantic import Field
 from patchproof.channel.printer import identity_printer
 from patchproof.claims import Estimate, mean
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import ask, joined, responses
@@ -99,9 +98,7 @@ def without(problem: Problem, effect: str) -> Problem:
         raise Refused(f"a scene with {effect} in it", "one where it is off", f"give {terms[names[0]].key} a range")
     subject = problem.subject
     if PRINTER in on:
-        if not isinstance(subject, Patch):
-            raise Refused("a printed patch", "a texture", f'leave "{PRINTER}" out')
-        subject = replace(subject, printer=identity_printer())
+        subject = subject.printed_by(identity_printer())
     changes = tuple(terms[name].change for name in on if name != PRINTER)
     return Without(**vars(replace(problem, subject=subject)), changes=changes)
 

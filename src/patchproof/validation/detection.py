@@ -34,8 +34,8 @@ from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
 from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pixels
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import load_scene, piece_of
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.scene import load_scene, needs_patch
 from patchproof.sheets.piece import control_design
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
@@ -93,7 +93,7 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     px_per_mm, tilt_deg = local_scale(truth, surface.center_mm)
     found = {
         "tilt_deg": tilt_deg,
-        "module_px": px_per_mm * piece_of(scene).module_mm,
+        "module_px": px_per_mm * scene.piece.module_mm,
         "blur_px": float(conditions.sensor.blur_px[0]),
         "noise": float(conditions.sensor.noise[0]),
         "jpeg": int(conditions.sensor.jpeg[0]),
@@ -131,10 +131,10 @@ def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bo
 
 
 @lru_cache(maxsize=1)
-def _hung(scene_path: str, seed: int) -> tuple[HungSheet, MeshScene]:
+def _hung(scene_path: str, seed: int) -> tuple[HungSheet, PatchScene]:
     """The scene's sheet with noise on it, hung up in the scene."""
-    scene = load_scene(scene_path, seed)
-    if not isinstance(scene, MeshScene) or scene.piece is None or not scene.is_flat:
+    scene = needs_patch(load_scene(scene_path, seed), "a scene of an object with a flat patch")
+    if not scene.is_flat:
         raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
     piece = scene.piece
     blank = np.zeros((240, round(240 * piece.design_rect_mm[2] / piece.design_rect_mm[3]), 3), np.uint8)

@@ -30,6 +30,7 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
+from patchproof.scene.scene import needs_piece
 from patchproof.strict import shipped
 from patchproof.study.figures import whiskers
 from patchproof.study.grid import GridSettings, Seeds, cell_of, grouped, of_values, problem_of, teams
@@ -103,7 +104,7 @@ def reprinted(problem: Problem, printers: Sequence[Printer], ways: Sequence[Way]
         missed[way.name] = float((distance > IN_GAMUT).double().mean())
         with torch.no_grad():
             for printer in printers:
-                shown[_thing(way.name, printer.name)] = replace(problem.subject, printer=printer).shown(design)
+                shown[_thing(way.name, printer.name)] = problem.subject.printed_by(printer).shown(design)
     answers = responses(problem, shown, problem.scene.draw("evaluate", n), problem.training_px)
     return recorded(answers) | {"missed": missed, "printers": [printer.name for printer in printers]}
 
@@ -129,7 +130,7 @@ def way_problem(problem: Problem, way: Way) -> Problem:
     settings = problem.scene.settings.changed(optimize={"gamut": way.gamut, "in_gamut": way.in_gamut})
     scene = replace(problem.scene, settings=settings)
     printer = problem.printer if way.printed else identity_printer()
-    subject = replace(problem.subject, scene=scene, printer=printer)
+    subject = replace(problem.patch, scene=needs_piece(scene), printer=printer)
     return replace(problem, scene=scene, printer=printer, subject=subject)
 
 

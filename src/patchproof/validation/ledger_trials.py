@@ -32,7 +32,6 @@ from patchproof.evidence.classify import target_indices
 from patchproof.evidence.ledger import LEAST_PHOTOS, usable
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options
-from patchproof.geometry import local_scale
 from patchproof.optimizer.run import load_run
 from patchproof.output import image_pixels
 from patchproof.render.photograph import expose
@@ -41,7 +40,7 @@ from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.reprints.inkjets import draw_inkjet
 from patchproof.scene.conditions import Conditions, with_values
-from patchproof.scene.scene import Scene, piece_of
+from patchproof.scene.scene import PieceScene
 from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.strict import Strict
 from patchproof.study.study import Cell, Result, Study
@@ -103,14 +102,13 @@ class _Hall:
     photo_px: tuple[int, int]
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> PieceScene:
         return self.sheet.scene
 
     def module_px(self, conditions: Conditions) -> float:
         """A marker's module in the middle one of the views, in pixels of a photograph of the scene's own size."""
-        piece, photo_px = piece_of(self.scene), self.scene.settings.camera.photo_px
-        views, middle = self.scene.piece_homographies(conditions, photo_px), np.array(piece.size_mm) / 2
-        return piece.module_mm * float(np.median([local_scale(view, middle)[0] for view in views]))
+        scales = self.scene.piece_scales(conditions, self.scene.photo_px)
+        return self.scene.piece.module_mm * float(np.median(scales))
 
     def views(self, conditions: Conditions) -> list[Views]:
         """What is rasterized once for all that is done to print, light and camera."""

@@ -12,14 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.reprints.hung_sheet import scaled_print
 from patchproof.scene.bend import curled
 from patchproof.scene.conditions import Conditions, with_values
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.placement import Placement
-from patchproof.scene.scene import Scene
-from patchproof.sheets.piece import Piece
-from patchproof.strict import Refused
+from patchproof.scene.scene import Scene, needs_patch
 
 Point = Mapping[str, float]
 """Values by axis; what is not named is as drawn, or as the run has it."""
@@ -48,22 +43,13 @@ class Axis:
 
 def _distances(scene: Scene) -> tuple[float, float]:
     """From the scene's closest to where a marker's module is two thirds of a pixel."""
-    scene, piece, _ = hung(scene)
-    photo_px = scene.settings.camera.photo_px
-    nearest = scene.settings.view.distance_mm[0]
-    far = 1.5 * float(scene.matrix_px(photo_px)[0, 0]) * piece.module_mm
+    patch, nearest = needs_patch(scene), scene.settings.view.distance_mm[0]
+    far = 1.5 * patch.focal_px * patch.piece.module_mm
     return nearest, max(far, 2 * nearest)
 
 
-def hung(scene: Scene) -> tuple[MeshScene, Piece, Placement]:
-    """The scene, its piece, and where that lies on the object."""
-    if not isinstance(scene, MeshScene) or scene.piece is None or scene.placement is None:
-        raise Refused("a patch on an object with a mesh", "another scene", "leave this axis out")
-    return scene, scene.piece, scene.placement
-
-
 def _radii(scene: Scene) -> tuple[float, float]:
-    width, _ = hung(scene)[2].size_mm
+    width, _ = needs_patch(scene).placement.size_mm
     return 8 * width, 0.35 * width
 
 
@@ -104,9 +90,9 @@ MAPS = (
 
 def possible(scene: Scene, name: str) -> bool:
     """Whether this scene can be photographed at other values of the axis."""
-    if not isinstance(scene, MeshScene):
+    if not scene.HAS_OBJECT:
         return not AXES[name].needs_mesh
-    return name != "curl" or hung(scene)[2].is_flat
+    return name != "curl" or needs_patch(scene).placement.is_flat
 
 
 def conditions_at(scene: Scene, conditions: Conditions, point: Point) -> Conditions:
@@ -126,11 +112,11 @@ _FIELDS = {"distance": "distance_mm", "blur": "blur_px", "noise": "noise", "jpeg
 
 def placed_at(scene: Scene, point: Point) -> Scene:
     """The scene with its piece printed smaller, standing off, or curled."""
-    if "size" in point:
-        scene = scaled_print(scene, (point["size"], point["size"]))
-    if not {"curl", "gap"} & point.keys():
+    if not {"size", "curl", "gap"} & point.keys():
         return scene
-    scene, _, placement = hung(scene)
+    size = point.get("size", 1.0)
+    scene = needs_patch(scene).printed_at((size, size))
+    placement = scene.placement
     if "curl" in point:
         placement = curled(placement, point["curl"])
     if "gap" in point:

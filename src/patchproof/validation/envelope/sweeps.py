@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.optimizer.run import load_run
+from patchproof.scene.scene import needs_piece
 from patchproof.strict import Finite, Refused, Strict, nearest
 from patchproof.study.study import Cell, Study
 from patchproof.validation.envelope.axes import AXES, MAPS, possible
@@ -68,9 +69,7 @@ class EnvelopeSettings(Strict):
 
 def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
     """A cell per sweep and per map; refused where the scene has no such axis."""
-    scene = load_run(base / settings.run).scene
-    if scene.piece is None:
-        raise Refused("a run of a patch", "one of the object's own texture", "name the run of a printed patch")
+    scene = needs_piece(load_run(base / settings.run).scene, "name the run of a printed patch")
     able = [name for name in AXES if possible(scene, name)]
     sweeps = settings.sweeps
     if sweeps is None:

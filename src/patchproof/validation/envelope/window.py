@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from patchproof.render.stage import Stage
-from patchproof.reprints.hung_sheet import seen_at
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.scene import needs_patch
 
 _MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
 
@@ -30,13 +30,14 @@ class Frame:
 
 def window(stage: Stage, conditions: Conditions) -> Frame:
     """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
-    scene, whole_px = stage.scene, stage.scene.settings.camera.photo_px
+    whole_px = stage.scene.photo_px
     everything = Frame(stage, whole_px)
-    if not isinstance(scene, MeshScene) or stage.camera is not None or conditions.sensor.vignetting.any():
+    if not stage.scene.HAS_OBJECT or stage.camera is not None or conditions.sensor.vignetting.any():
         return everything
+    scene = needs_patch(stage.scene)
     edge = np.linspace(0, 1, 9)
-    grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placed.size_mm
-    points = seen_at(scene, conditions, grid)
+    grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.piece.size_mm
+    points = scene.piece_px(conditions, grid)
     if not np.isfinite(points).all():
         return everything
     margin = _MARGIN_SHARE * np.ptp(points, axis=0).max() + _MARGIN_PX
@@ -56,7 +57,7 @@ def on_plain_ground(part: np.ndarray, origin_px, whole_px: tuple[int, int]) -> n
 
 
 @dataclass(frozen=True)
-class _WindowScene(MeshScene):
+class _WindowScene(PatchScene):
     """A scene whose camera sees a part of the picture, at the same scale; its `photo_px` is the part's size."""
 
     whole_px: tuple[int, int] = (0, 0)
@@ -82,10 +83,10 @@ class _WindowBackgrounds:
         return self.whole.picture(choice, self.whole_px, self.whole_px)[y : y + size_px[1], x : x + size_px[0]]
 
 
-def _seen_through(stage: Stage, scene: MeshScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
+def _seen_through(stage: Stage, scene: PatchScene, origin_px: tuple[int, int], size_px: tuple[int, int]) -> Stage:
     """The stage as a camera sees it that shows a window of the photograph only."""
     whole_px = scene.settings.camera.photo_px
-    parts = {field.name: getattr(scene, field.name) for field in fields(MeshScene)}
+    parts = {field.name: getattr(scene, field.name) for field in fields(PatchScene)}
     parts["settings"] = scene.settings.changed(camera={"photo_px": size_px})
     parts["backgrounds"] = _WindowBackgrounds(scene.backgrounds, whole_px, origin_px)
     return replace(stage, scene=_WindowScene(**parts, whole_px=whole_px, origin_px=origin_px))

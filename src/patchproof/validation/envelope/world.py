@@ -33,11 +33,9 @@ from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, relit, see
-from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of, seen_at
+from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.scene.conditions import Conditions, fields_of
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import Scene
-from patchproof.strict import Refused
+from patchproof.scene.scene import Scene, needs_mesh, needs_piece
 from patchproof.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
 from patchproof.validation.envelope.window import Frame, on_plain_ground, window
 
@@ -73,8 +71,7 @@ class Measurement:
 def open_world(folder: Path, other_printer: str | None) -> World:
     """A run's world; `other_printer` None stands for uncoated paper, or coated where the run has uncoated."""
     run = load_run(folder)
-    if run.scene.piece is None:
-        raise Refused("a run of a patch", "one of the object's own texture", "name the run of a printed patch")
+    needs_piece(run.scene, "name the run of a printed patch")
     profile = run.scene.settings.printer.profile
     other = other_printer or ("coated" if profile == "uncoated" else "uncoated")
     sheet = hang_own(run)
@@ -192,8 +189,8 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     """What the tool says of a part of a photograph whose corner lies at `origin_px`."""
     whole_px = world.scene.settings.camera.photo_px
     matrix_px = None
-    if isinstance(scene, MeshScene):  # of pictures nobody knows the focal length
-        matrix_px = scene.matrix_px(whole_px).copy()
+    if scene.HAS_OBJECT:  # of pictures nobody knows the focal length
+        matrix_px = needs_mesh(scene).matrix_px(whole_px).copy()
         matrix_px[:2, 2] -= origin_px
     photo = Photo(srgb, None if matrix_px is None else float(matrix_px[0, 0]), Path("photo"))
     view = View(photo, matrix_px, calibrated=False)
@@ -201,7 +198,7 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     error_mm = None
     if entry.status == "measured" and entry.geometry and entry.geometry.homography_px_from_mm is not None:
         corners = geometry.rect_corners(world.surface.rect_mm)
-        true_px = seen_at(scene, conditions, corners - world.sheet.manifest.cut_mm[:2]) - origin_px
+        true_px = needs_piece(scene).piece_px(conditions, corners - world.sheet.manifest.cut_mm[:2]) - origin_px
         back = geometry.apply_homography(np.linalg.inv(np.array(entry.geometry.homography_px_from_mm)), true_px)
         error_mm = float(np.linalg.norm(back - corners, axis=1).max())
     return Measurement(entry.status, entry.code, error_mm)

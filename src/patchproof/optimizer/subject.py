@@ -1,0 +1,101 @@
+"""What may be optimized: a design, of a printed piece or of the object's own texture.
+
+In: a scene. Out: a `Subject`, which says where a design starts, what may become of it, what it costs, how it looks and
+what files a run keeps of it. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Protocol
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+from typing_extensions import Self
+
+from patchproof.channel.printer import Printer
+from patchproof.output import write_whole
+from patchproof.render.pixels import Shown
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How fine a design is: its pixels, as optimized and as printed (None of textures, which keep their own sizes and
+    are not printed), and how many there are, in all and per millimetre of a side.
+    """
+
+    design_px: tuple[int, int] | None
+    printed_px: tuple[int, int] | None
+    printed_px_per_mm: float | None
+    texels: int
+    texels_per_mm: float
+
+
+class Subject(Protocol):
+    """What the loop, the promise and studies ask of what is optimized."""
+
+    STEP_SIZE: ClassVar[float]
+    LOOK: ClassVar[str]  # what turns a design into what is shown
+
+    def start(self) -> Tensor:
+        """The design before the first step."""
+        ...
+
+    def clipped(self, design: Tensor) -> Tensor:
+        """The nearest design that is allowed."""
+        ...
+
+    def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:
+        """The gradient's pyramid."""
+        ...
+
+    def joined(self, updates: Sequence[Tensor]) -> Tensor:
+        """The update of a design that the pyramid's own add up to."""
+        ...
+
+    def penalty(self, design: Tensor) -> Tensor | float:
+        """What the scene's settings charge a design for."""
+        ...
+
+    def pixels(self, design: Tensor) -> np.ndarray:
+        """What is printed or stored of a design."""
+        ...
+
+    def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
+        """What the control of this kind has in place of the design's pixels."""
+        ...
+
+    def shown(self, design: Tensor, kind: str = "design") -> Shown:
+        """What photographs show of a design, or of a control in the frame of its own sheet; differentiable."""
+        ...
+
+    def printed_by(self, printer: Printer) -> Self:
+        """The same subject as another printer prints it."""
+        ...
+
+    @property
+    def grid(self) -> Grid:
+        """How fine designs are."""
+        ...
+
+    def save(self, pixels: np.ndarray, folder: Path) -> None:
+        """Write the files that a run keeps of its design; earlier ones are replaced only by complete ones."""
+        ...
+
+    def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
+        """A file name's suffix, and the one file that shows the design to others."""
+        ...
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Replace a picture by uint8 pixels."""
+    write_whole(path, lambda part: Image.fromarray(pixels).save(part, "PNG"))
+
+
+def read_png(path: Path) -> np.ndarray:
+    """uint8 H×W×3 of a picture file."""
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))

@@ -1,0 +1,124 @@
+"""The surfaces that views show: the piece in millimetres, and the object with its textures.
+
+In: a mesh, or a scene with a piece. Out: tensors on a device. The piece reaches a margin beyond its cut line, so that
+pixels cut by its edge are found and can show their share of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.color import linear_from_srgb
+from patchproof.mesh.mesh import Mesh
+from patchproof.render.texture import Layout, layout, texel_table
+from patchproof.scene.interface import PieceScene
+
+# Of the piece's sides: half a pixel beyond the edge is enough down to a piece of 7 pixels, or 75° of tilt at 25.
+MARGIN_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class PieceSurface:
+    """The piece in the world: faces over `vertices` V×3, and per face corner F×3 its millimetres and normal."""
+
+    vertices: Tensor
+    faces: Tensor
+    corner_mm: Tensor
+    corner_normal: Tensor
+    size_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ObjectSurface:
+    """The object: faces over `vertices`, and per face corner F×3×8 what is interpolated on it: uv, color (vertex color
+    times base color, linear) and normal.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    corners: Tensor
+    material: Tensor
+    textures_srgb: tuple[Tensor, ...]  # H×W×3 in [0, 1], one per material
+    layout: Layout
+
+    @cached_property
+    def corner_uv(self) -> Tensor:
+        """Texture coordinates alone, F×3×2."""
+        return self.corners[..., :2].contiguous()
+
+    def texels(self, reduced: bool) -> Tensor:
+        """The linear light of all textures' mip levels, averaged as light or, `reduced`, as code values."""
+        return self._reduced_texels if reduced else self._texels
+
+    @cached_property
+    def _texels(self) -> Tensor:
+        return light_texels(self.textures_srgb, reduced=False)
+
+    @cached_property
+    def _reduced_texels(self) -> Tensor:
+        return light_texels(self.textures_srgb, reduced=True)
+
+
+def light_texels(textures_srgb: tuple[Tensor, ...], reduced: bool) -> Tensor:
+    """The T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code values;
+    differentiable.
+    """
+    if reduced:
+        return linear_from_srgb(texel_table(list(textures_srgb), wrap=True))
+    return texel_table([linear_from_srgb(texture) for texture in textures_srgb], wrap=True)
+
+
+def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
+    """The mesh with its textures."""
+    base = np.array([material.base_color_linear for material in mesh.materials], np.float32)
+    textures = tuple(_texture(material.texture_srgb).to(device) for material in mesh.materials)
+
+    def on(array) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array), device=device)
+
+    return ObjectSurface(
+        on(mesh.vertices),
+        on(mesh.faces),
+        on(
+            np.concatenate(
+                [mesh.corner_uv, mesh.corner_color_linear * base[mesh.face_material][:, None], mesh.corner_normal], 2
+            )
+        ),
+        on(mesh.face_material),
+        textures,
+        layout([(t.shape[1], t.shape[0]) for t in textures], wrap=True, device=device),
+    )
+
+
+def _texture(texture_srgb: np.ndarray | None) -> Tensor:
+    return torch.ones(1, 1, 3) if texture_srgb is None else torch.tensor(texture_srgb, dtype=torch.float32) / 255
+
+
+def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:
+    """A scene's piece, gone on straight beyond its border on all sides."""
+    vertices, normals, piece_mm = scene.paper()
+    size_mm = scene.piece.size_mm
+    columns, rows = (len(np.unique(piece_mm[:, i])) for i in range(2))
+    grid = np.concatenate([vertices, normals, piece_mm], 1).reshape(rows, columns, 8)
+    for axis, (side, count) in enumerate(zip(size_mm[::-1], (rows, columns), strict=True)):
+        grid = _longer(grid, axis, MARGIN_SHARE * side / (side / (count - 1)))
+    rows, columns = grid.shape[:2]
+    corner = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
+    faces = np.concatenate([np.stack(one, -1).reshape(-1, 3) for one in ((a, d, c), (a, c, b))])
+    flat = torch.as_tensor(grid.reshape(-1, 8), device=device)
+    faces = torch.as_tensor(faces, device=device)
+    at_corners = flat.float()[faces]
+    return PieceSurface(flat[:, :3].contiguous(), faces, at_corners[..., 6:], at_corners[..., 3:6], size_mm)
+
+
+def _longer(grid: np.ndarray, axis: int, steps: float) -> np.ndarray:
+    """The grid with one more row (or column) at either end, `steps` of its spacing away in a straight line."""
+    grid = np.moveaxis(grid, axis, 0)
+    before, after = grid[0] + steps * (grid[0] - grid[1]), grid[-1] + steps * (grid[-1] - grid[-2])
+    return np.moveaxis(np.concatenate([before[None], grid, after[None]]), 0, axis)

@@ -1,0 +1,219 @@
+"""What every scene answers, whatever it is made of, and what those with a printed piece answer beside that.
+
+A scene is a mesh with a piece on it (`PatchScene`) or with a texture of its own that may change (`TextureScene`), or
+pictures: photographs of the object (`PhotoScene`) or a folder of images (`ImageScene`). Who needs a piece or a mesh
+asks `scene.needs_piece` or `scene.needs_mesh`, which refuse where there is none. N is the number of conditions.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from typing_extensions import Self
+
+from patchproof.channel.effect import Effect
+from patchproof.channel.lens import Camera
+from patchproof.geometry import apply_homography, local_scale
+from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.placement import Placement
+from patchproof.scene.resolution import design_grid
+from patchproof.settings import SceneSettings, identifying
+from patchproof.sheets.piece import MODULES, Piece, sheet_id
+from patchproof.strict import Refused
+
+SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a scene itself models and a simpler one would not: its name, the settings key that governs it, if any,
+    whether it needs whole photographs to be seen as it is, and whether the camera brings it about.
+    """
+
+    name: str
+    key: str = ""
+    whole: bool = False
+    camera: bool = True
+
+
+@dataclass(frozen=True)
+class Scene(ABC):
+    """Everything a photograph depends on but what is optimized and the conditions."""
+
+    settings: SceneSettings
+    base: Path
+    seed: int
+    sheet_id: str
+    notes: tuple[str, ...] = field(default=(), kw_only=True)  # warnings of what was read
+    known: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # beside settings, what the sheet id tells
+    camera: Camera | None = field(default=None, kw_only=True)  # a calibrated one
+    given_glb: bytes | None = field(default=None, kw_only=True)  # the mesh, where it was given in Python
+
+    HAS_OBJECT: ClassVar[bool] = False  # a surface of its own before what is behind it
+    HAS_PIECE: ClassVar[bool] = False
+    EFFECT_TABLES: ClassVar[tuple[str, ...]] = ("printer", "camera")  # of the settings, whose effects show in it
+    PARTS: ClassVar[tuple[Part, ...]] = ()
+    OMITTED: ClassVar[tuple[str, ...]] = ()  # what is not modeled
+
+    @abstractmethod
+    def description(self) -> str:
+        """What the scene is made of, in a few words."""
+
+    @abstractmethod
+    def lies(self) -> dict[str, Any]:
+        """How what is optimized lies on the object: `family`, `size_mm`, `reason` and, of a mesh, how well it fits."""
+
+    @abstractmethod
+    def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
+        """Pixels per millimetre of what is optimized in the closest view."""
+
+    @abstractmethod
+    def px_per_mm(self, size_px: tuple[int, int], shorter: bool = False) -> np.ndarray:
+        """The same at its middle in each of `SCALE_VIEWS` views that face it: the mean of all directions, or along the
+        `shorter`, foreshortened one.
+        """
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader should know."""
+        return self.notes
+
+    @property
+    def photo_px(self) -> tuple[int, int]:
+        """Size of the whole photographs that the scene makes."""
+        return self.settings.camera.photo_px
+
+    @property
+    def focal_px(self) -> float | None:
+        """The focal length of those; None of pictures, of which nobody knows it."""
+        return None
+
+    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
+        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
+        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+
+    def with_template(self, name: str) -> Self:
+        """The scene for a page of another template: its sheet id and, where there is one, its piece anew."""
+        if name == self.settings.sheet.template:
+            return self
+        settings = self.settings.changed(sheet={"template": name})
+        identity = sheet_id(identifying(settings) | dict(self.known), self.seed)
+        return replace(self, settings=settings, sheet_id=identity)._laid_out()
+
+    def _laid_out(self) -> Self:
+        """The scene with its piece laid out for its page and sheet id."""
+        return self
+
+    def models(self, effect: Effect) -> bool:
+        """Whether an effect shows in the scene's photographs where its settings turn it on."""
+        return effect.keys[0].partition(".")[0] in self.EFFECT_TABLES
+
+    def without(self, part: Part) -> Self | None:
+        """The scene without one of its `PARTS`; None where it has nothing of it."""
+        raise ValueError(f"{self.description()} without {part.name}")
+
+    def own_blur_and_noise(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+        """N Gaussian sigmas of the base pictures' own blur, in pixels of the whole photograph, and N standard
+        deviations of their noise at white, in its linear light.
+        """
+        return np.zeros(len(conditions)), np.zeros(len(conditions))
+
+    def other_surface(self) -> tuple[Placement | None, str | None]:
+        """(where the piece would lie with `patch.bend` the other way round, what that would be like in a sentence).
+
+        No placement where it is refused or would be the same card; no sentence where there is no surface to lie on.
+        """
+        return None, None
+
+    def record(self) -> dict[str, Any] | None:
+        """What run.json says of the piece and how well it fits; None where there is none."""
+        return None
+
+    def facing(self, conditions: Conditions) -> np.ndarray:
+        """N bool: the views that do not show what is optimized from behind."""
+        return np.ones(len(conditions), bool)
+
+
+@dataclass(frozen=True)
+class PieceScene(Scene):
+    """A scene in which a printed piece hangs."""
+
+    piece: Piece
+    HAS_PIECE = True
+
+    @abstractmethod
+    def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The piece as a grid by rows of vertices V×3 in the world, their normals V×3 out of the printed face, and
+        their millimetres V×2 on the flat piece.
+        """
+
+    @property
+    @abstractmethod
+    def unreadable_share(self) -> float:
+        """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE`."""
+
+    @abstractmethod
+    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×3×3 from piece millimetres to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
+
+    @abstractmethod
+    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
+        """N angles of the camera to the right of the piece's middle, beyond 90 where its face is turned away; NaN of
+        pictures, which do not say from where they were taken.
+        """
+
+    @abstractmethod
+    def white_light(self, conditions: Conditions) -> np.ndarray:
+        """N: the light on white paper at the piece's middle, mean of the channels, without lamps."""
+
+    def piece_px(self, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
+        """Pixels M×2 of points M×2 of the piece in the whole photograph of the first condition, through bent paper and
+        a bent picture, too; NaN behind the camera.
+        """
+        return apply_homography(self.piece_homographies(conditions, self.photo_px)[0], piece_mm)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
+        return True
+
+    def printed_at(self, scale: tuple[float, float]) -> PieceScene:
+        """The scene with a piece printed larger or smaller along x and y, hung up at the same middle; piece millimetres
+        stay the sheet's own.
+        """
+        if scale == (1.0, 1.0):
+            return self
+        raise Refused("a scene with a mesh for a print of another size", "one of pictures", "leave --print-scale out")
+
+    def facing(self, conditions: Conditions) -> np.ndarray:
+        """N bool: the views that do not show the piece from behind; unknown angles are of pictures that show it."""
+        return ~(np.abs(self.piece_azimuth_deg(conditions)) >= 90)
+
+    def px_per_mm(self, size_px: tuple[int, int], shorter: bool = False) -> np.ndarray:
+        """As in `Scene.px_per_mm`, at the piece's middle."""
+        conditions = self.draw("select", SCALE_VIEWS, 0)
+        return self.piece_scales(conditions[self.facing(conditions)], size_px, shorter)
+
+    def piece_scales(self, conditions: Conditions, size_px: tuple[int, int], shorter: bool = False) -> np.ndarray:
+        """N pixels per millimetre at the piece's middle, along the `shorter` side or the mean of all directions."""
+        scales = self.scales_and_tilts(conditions, size_px)
+        return np.array([mean * np.sqrt(np.cos(np.radians(tilt))) if shorter else mean for mean, tilt in scales])
+
+    def scales_and_tilts(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×2: pixels per millimetre at the piece's middle, and its tilt in degrees."""
+        middle = np.array(self.piece.size_mm) / 2
+        return np.array([local_scale(each, middle) for each in self.piece_homographies(conditions, size_px)])
+
+    def design_px(self, network_px: int) -> tuple[int, int]:
+        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
+        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
+
+    def record(self) -> dict[str, Any]:
+        """What run.json says of the piece."""
+        marker_mm = self.piece.module_mm * MODULES
+        return {"piece_mm": self.piece.size_mm, "marker_mm": marker_mm, "unreadable_share": self.unreadable_share}

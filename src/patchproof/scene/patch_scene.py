@@ -1,0 +1,214 @@
+"""A mesh with a piece on it, and the door to all scenes with a mesh.
+
+In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
+layout of the printed piece (the design with its frame of markers; the marker size follows from the views) and where
+the piece lies; or a `TextureScene`, where the object's own texture is what changes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from typing_extensions import Self
+
+from patchproof import geometry
+from patchproof.channel import lens
+from patchproof.channel.effect import Effect
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.scene.backgrounds import load_backgrounds
+from patchproof.scene.bend import place_bent
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene
+from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
+from patchproof.scene.placement import Placement, patch_frame, place_card
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.texture import texture_canvas
+from patchproof.settings import SceneSettings, identifying
+from patchproof.sheets.page import largest_piece_mm
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
+from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import plan_tiles
+from patchproof.strict import Refused, expand
+
+
+@dataclass(frozen=True)
+class PatchScene(PieceScene, MeshScene):
+    """An object with a piece on it."""
+
+    placement: Placement
+    unreadable: float
+    EFFECT_TABLES = ("light", "printer", "camera")
+
+    def lies(self) -> dict[str, Any]:
+        """As in `Scene.lies`."""
+        names = ("family", "size_mm", "gap_mm", "gap_mean_mm", "overhang_share", "stretch", "reason")
+        return {name: getattr(self.placement, name) for name in names}
+
+    def record(self) -> dict[str, Any]:
+        """What run.json says of the piece and how well it fits."""
+        names = ("family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
+        return super().record() | {name: getattr(self.placement, name) for name in names}
+
+    @property
+    def unreadable_share(self) -> float:
+        """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE`."""
+        return self.unreadable
+
+    @property
+    def middle_mm(self) -> np.ndarray:
+        """The middle of the piece in the world."""
+        return self.placement.center_mm
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Where the piece's middle faces."""
+        return self.placement.normal
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
+        return self.placement.is_flat and not (self.camera is not None and self.camera.bends)
+
+    def models(self, effect: Effect) -> bool:
+        """Whether an effect shows where its settings turn it on: all do."""
+        return Scene.models(self, effect)
+
+    def _laid_out(self) -> Self:
+        piece, placement, unreadable, notes = _hang(self)
+        return replace(self, piece=piece, placement=placement, unreadable=unreadable, notes=notes)
+
+    def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×3×3 from piece millimetres to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
+        matrix, plane = self.matrix_px(size_px), self.placement.world_from_piece
+        return np.stack([geometry.plane_homography(matrix, pose, plane) for pose in self.camera_from_print(conditions)])
+
+    def piece_px(self, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
+        """As in `PieceScene.piece_px`."""
+        pose, world = self.camera_from_print(conditions)[0], self.placement.world(piece_mm)
+        points = geometry.project(self.matrix_px(self.photo_px), pose, world)
+        return points if self.camera is None else lens.distort_points(points, self.camera, self.photo_px)
+
+    def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As in `PieceScene.paper`."""
+        laid, by_rows = self.placement, [0, 1, 3, 2]
+        if not laid.is_flat:
+            return laid.vertices_mm, laid.normals, laid.piece_mm
+        corners_mm = geometry.rect_corners((0, 0, *laid.size_mm))[by_rows]  # a card's run clockwise
+        return laid.vertices_mm[by_rows], np.broadcast_to(laid.normal, (4, 3)), corners_mm
+
+    def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
+        """N angles of the camera to the right of the piece's middle, beyond 90 where its face is turned away."""
+        middle = np.array(self.placement.size_mm) / 2
+        poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
+        return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
+
+    def white_light(self, conditions: Conditions) -> np.ndarray:
+        """N: the light on white paper at the piece's middle, without lamps."""
+        light = conditions.light
+        return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
+
+    def printed_at(self, scale: tuple[float, float]) -> Self:
+        """As in `PieceScene.printed_at`."""
+        if scale == (1.0, 1.0):
+            return self
+        placement, by = self.placement, np.array(scale)
+        middle, about = np.array(placement.size_mm) / 2, np.eye(4)
+        about[[0, 1], [0, 1]] = by
+        about[:2, 3] = middle - by * middle
+        vertices = placement.world(middle + (placement.piece_mm - middle) * by)
+        frame = placement.world_from_piece @ about
+        return replace(self, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
+
+    def other_surface(self) -> tuple[Placement | None, str | None]:
+        """As in `Scene.other_surface`."""
+        patch, placement = self.settings.patch, self.placement
+        place, flag = (place_card, "false") if patch.bend else (place_bent, "true")
+        try:
+            other = place(self.mesh, self.frame, self.piece.size_mm, patch.spin_deg)
+        except Refused as refused:
+            return None, f"bend = {flag} is refused. {refused}"
+        if other.family == placement.family:
+            return None, f"bend = {flag} would be a card, too: leave bend out"
+        gaps = f"{other.gap_mean_mm:.2f} mm off the surface on average, here {placement.gap_mean_mm:.2f} mm"
+        return other, f"bend = {flag} would be a {other.family} (stretch {other.stretch:.2%}), {gaps}"
+
+
+def load_mesh_scene(
+    settings: SceneSettings, base: Path, seed: int, identity: str | None = None, given_glb: bytes | None = None
+) -> TextureScene | PatchScene:
+    """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
+    settings_object, camera = settings.object, settings.camera
+    if settings_object.mesh is None or settings_object.length_mm is None:
+        raise ValueError("a scene with a mesh names it")
+    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
+    known = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
+    bare = MeshScene(
+        settings,
+        base,
+        seed,
+        identity or sheet_id(identifying(settings) | known, seed),
+        mesh,
+        patch_frame(mesh, settings.patch),
+        load_backgrounds(settings.background, base),
+        known=known,
+        camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
+        given_glb=given_glb,
+    )
+    if settings.patch.kind != "patch":
+        canvas = texture_canvas(mesh, settings.patch, base)
+        own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*mesh.warnings, *canvas.warnings)}
+        return TextureScene(**vars(bare) | own)
+    piece, placement, unreadable, notes = _hang(bare)
+    own = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
+    return PatchScene(**vars(bare) | own)
+
+
+def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
+    """The piece with markers as large as the views need, where it lies, the share of views in which they are too small,
+    and what a reader should know.
+    """
+    settings, mesh, frame = scene.settings, scene.mesh, scene.frame
+    patch, place = settings.patch, place_bent if settings.patch.bend else place_card
+    design_mm = patch.design_mm
+    scales = _smallest_scales(scene, place(mesh, frame, design_mm, patch.spin_deg))
+    if not len(scales):
+        raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
+    needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
+    template = load_template(settings.sheet.template)
+    largest_mm = width_mm, height_mm = largest_piece_mm(template)
+    if not patch.bend:
+        largest_mm = min(width_mm, frame.extent_mm[0]), min(height_mm, frame.extent_mm[1])
+    marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
+    piece = lay_out_piece(design_mm, marker_mm, scene.sheet_id, "design")
+    if template.tiles is not None:
+        plan_tiles(template.tiles, piece)  # refuses what no sheet could be made of, before hours of optimizing
+    unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
+    placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
+    notes = (*mesh.warnings, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
+    return piece, placement, unreadable, notes
+
+
+def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
+    """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
+    conditions = scene.draw("select", SCALE_VIEWS, 0)
+    poses = camera_poses(scene, card.center_mm, conditions.pose)
+    matrix, scales = scene.matrix_px(scene.photo_px), []
+    for pose in poses:
+        eye = -pose[:3, :3].T @ pose[:3, 3]
+        if (eye - card.center_mm) @ card.normal <= 0:
+            continue
+        homography = geometry.plane_homography(matrix, pose, card.world_from_piece)
+        mean, tilt = geometry.local_scale(homography, np.array(card.size_mm) / 2)
+        scales.append(mean * math.sqrt(math.cos(math.radians(tilt))))
+    return np.array(scales)
+
+
+def _unreadable_warning(share: float, marker_mm: float) -> tuple[str, ...]:
+    if share <= 1 - READABLE_SHARE:
+        return ()
+    return (f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views",)
