@@ -150,7 +150,7 @@ def test_the_marker_rule_by_hand(tmp_path):
     assert markers.needed_mm == pytest.approx(max(8, 7 * 2.5 * away_mm / 600), rel=0.03)
     assert markers.printed_mm == pytest.approx(markers.needed_mm, rel=0.03) and markers.unreadable_share == 0
     distant = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[9000, 9000])
-    far = marker_plan(distant, distant.piece)
+    far = marker_plan(distant)
     assert far.printed_mm < far.needed_mm / 2 and far.unreadable_share == 1
 
 
