@@ -140,6 +140,13 @@ def _compact(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(used), (np.cumsum(used) - 1)[faces]
 
 
+def normal_transform(rotation: np.ndarray) -> np.ndarray:
+    """What carries normals: the inverse transpose up to a positive factor, as cofactors, so that flattening works."""
+    a, b, c = rotation
+    cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+    return -cofactors if np.linalg.det(rotation) < 0 else cofactors
+
+
 def topology_warnings(parts: Sequence[Part]) -> list[str]:
     """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
     loose = crowded = edges = 0

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import linear_from_srgb
-from patchproof.mesh.mesh import Material, Part, topology_warnings
+from patchproof.mesh.mesh import Material, Part, normal_transform, topology_warnings
 from patchproof.strict import Refused
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
@@ -100,11 +100,9 @@ class _Reader:
         from trimesh.scene.transforms import SceneGraph
 
         geometry = self.loaded.get("geometry", {"": self.loaded})
+        primitives = [p for m in self.header.get("meshes", ()) for p in m["primitives"]]
         # trimesh keeps the primitives' order and leaves out fans and loops (modes 2, 3, 6)
-        primitives = [
-            p for m in self.header.get("meshes", ()) for p in m["primitives"] if p.get("mode", 4) in (0, 1, 4, 5)
-        ]
-        recipes = dict(zip(geometry, primitives, strict=False))
+        recipes = dict(zip(geometry, (p for p in primitives if p.get("mode", 4) in (0, 1, 4, 5)), strict=False))
         places = [(np.eye(4), name) for name in geometry]
         if self.is_gltf:
             graph = SceneGraph(base_frame=self.loaded.get("base_frame", "world"))
@@ -128,7 +126,7 @@ class _Reader:
             placed = vertices @ rotation.T + transform[:, 3]
             normals = raw.get("vertex_normals")
             usable = normals is not None and np.shape(normals) == vertices.shape
-            normals = np.asarray(normals, float) @ _normal_transform(rotation).T if usable else None
+            normals = np.asarray(normals, float) @ normal_transform(rotation).T if usable else None
         uv = self._uv(raw.get("visual"), len(vertices))
         colors = self._corner_colors(raw, len(vertices), len(faces))
         material = self._material(raw.get("visual"), primitive, uv is not None, colors is not None)
@@ -296,10 +294,3 @@ def _check_obj(path: Path):
     if relative and re.search(rb"^v[tn]?[ \t]", text[relative.end() :], re.MULTILINE):
         got = f"some in {path.name} that stand before further vertices"
         raise Refused("relative indices after the last vertex", got, "export with absolute indices")
-
-
-def _normal_transform(rotation: np.ndarray) -> np.ndarray:
-    """What carries normals: the inverse transpose up to a positive factor, as cofactors, so that flattening works."""
-    a, b, c = rotation
-    cofactors = np.array([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
-    return -cofactors if np.linalg.det(rotation) < 0 else cofactors
