@@ -21,7 +21,7 @@ from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Subject
 from patchproof.optimizer.texture import Texture
-from patchproof.render.pixels import PiecePicture, Shown
+from patchproof.render.pixels import Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
@@ -57,8 +57,7 @@ class Problem:
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
-        piece = shown if isinstance(shown, PiecePicture) else None
-        return see(self.stage, piece, conditions, (side_px, side_px))
+        return see(self.stage, shown, conditions, (side_px, side_px))
 
     def before(self, chosen: Sequence[int]) -> Problem:
         """The same before some of its networks, by number."""

@@ -23,7 +23,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.output import image_bytes, image_pixels
 from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
 from patchproof.render.photograph import expose, photograph
-from patchproof.render.pixels import PiecePicture, Shown
+from patchproof.render.pixels import Shown
 from patchproof.render.views import Views, relit, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.placement import Placement
@@ -201,8 +201,7 @@ class Album:
         return torch.cat(stack, 1)
 
     def _views(self, setup: Setup, conditions: Conditions) -> Views:
-        piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
-        return see(setup.stage, piece, conditions, (self.side_px, self.side_px), setup.supersample)
+        return see(setup.stage, setup.shown, conditions, (self.side_px, self.side_px), setup.supersample)
 
     def _pictures(self, views: Views, shown: Shown) -> Tensor:
         """A whole photograph goes through a real JPEG, a training view as training exposes it."""
@@ -233,8 +232,7 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
     scene, parts = setup.stage.scene, []
     for rows in _chunks(len(base.conditions), _FINE * side):
         conditions = setup.conditions[rows]
-        piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
-        views = see(setup.stage, piece, conditions, (side, side))
+        views = see(setup.stage, setup.shown, conditions, (side, side))
         fine = photograph(setup.stage, setup.shown, conditions, (_FINE * side, _FINE * side), jpeg=False)
         points = fine[..., _FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
         rendered = expose(views, setup.shown, jpeg=False)

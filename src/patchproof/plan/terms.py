@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 from torch import Tensor
 
 from patchproof.channel.effect import Effect
@@ -85,14 +84,9 @@ def effect_terms(table: str) -> tuple[Term, ...]:
 
 
 def _without(setup: Setup, effect: Effect) -> Setup | None:
-    scene = setup.stage.scene
-    facing = needs_mesh(scene).cosines if scene.HAS_OBJECT else _nowhere
+    facing = lambda *angles: needs_mesh(setup.stage.scene).cosines(*angles)  # noqa: E731
     conditions = without(setup.conditions, effect, facing)
     return None if conditions is None else replace(setup, conditions=conditions)
-
-
-def _nowhere(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
-    raise ValueError("pictures face nowhere")
 
 
 def _without_printer(problem: Problem, design: Tensor, setup: Setup) -> Setup | None:

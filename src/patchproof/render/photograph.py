@@ -52,8 +52,7 @@ def photograph(
         shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
     if isinstance(shown, Tensor):
         shown = stage.look.shown(shown)
-    piece = shown if isinstance(shown, PiecePicture) else None
-    return expose(see(stage, piece, conditions, size_px, supersample), shown, jpeg)
+    return expose(see(stage, shown, conditions, size_px, supersample), shown, jpeg)
 
 
 def shade(views: Views, shown: Shown) -> Tensor:

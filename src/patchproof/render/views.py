@@ -29,6 +29,7 @@ from patchproof.render.pixels import (
     ObjectPixels,
     PiecePicture,
     PiecePixels,
+    Shown,
     object_pixels,
     piece_pixels,
 )
@@ -153,12 +154,11 @@ class Views:
         return None if shine is None else shine[:, None]
 
 
-def see(
-    stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int], supersample: int = 1
-) -> Views:
-    """The views of `conditions`, with nothing on the object where `piece` is None. Any picture of the same size as
-    `piece` can be shown in them; the object behind it is seen, too.
+def see(stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], supersample: int = 1) -> Views:
+    """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
+    be shown in them; the object behind it is seen, too.
     """
+    piece = shown if isinstance(shown, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
         return _see_pictures(stage, piece, conditions, size_px)
     scene = needs_mesh(stage.scene)

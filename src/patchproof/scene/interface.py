@@ -111,7 +111,8 @@ class Scene(ABC):
 
     def models(self, effect: Effect) -> bool:
         """Whether an effect shows in the scene's photographs where its settings turn it on."""
-        return effect.keys[0].partition(".")[0] in self.EFFECT_TABLES
+        table = effect.keys[0].partition(".")[0]
+        return table in self.EFFECT_TABLES and (self.HAS_PIECE or not effect.only_paper)
 
     def without(self, part: Part) -> Self | None:
         """The scene without one of its `PARTS`; None where it has nothing of it."""

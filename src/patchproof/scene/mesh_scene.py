@@ -15,7 +15,6 @@ from typing_extensions import Self
 
 from patchproof import geometry
 from patchproof.channel import lens
-from patchproof.channel.effect import Effect
 from patchproof.channel.effects import Pose
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds
@@ -80,10 +79,6 @@ class MeshScene(Scene):
     def focal_px(self) -> float:
         """The focal length of whole photographs."""
         return float(self.matrix_px(self.photo_px)[0, 0])
-
-    def models(self, effect: Effect) -> bool:
-        """As in `Scene.models`: nothing shows here that only paper shows."""
-        return super().models(effect) and not effect.only_paper
 
     def without(self, part: Part) -> Self | None:
         """The scene without its lens's distortion; None where there is none."""

@@ -18,12 +18,11 @@ from typing_extensions import Self
 
 from patchproof import geometry
 from patchproof.channel import lens
-from patchproof.channel.effect import Effect
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene
+from patchproof.scene.interface import SCALE_VIEWS, PieceScene
 from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
 from patchproof.scene.placement import Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
@@ -46,13 +45,14 @@ class PatchScene(PieceScene, MeshScene):
 
     def lies(self) -> dict[str, Any]:
         """As in `Scene.lies`."""
-        names = ("family", "size_mm", "gap_mm", "gap_mean_mm", "overhang_share", "stretch", "reason")
+        names = ("size_mm", "family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
         return {name: getattr(self.placement, name) for name in names}
 
     def record(self) -> dict[str, Any]:
         """What run.json says of the piece and how well it fits."""
-        names = ("family", "reason", "gap_mm", "gap_mean_mm", "overhang_share", "stretch")
-        return super().record() | {name: getattr(self.placement, name) for name in names}
+        fits = self.lies()
+        del fits["size_mm"]  # it is there as piece_mm
+        return super().record() | fits
 
     @property
     def unreadable_share(self) -> float:
@@ -73,10 +73,6 @@ class PatchScene(PieceScene, MeshScene):
     def is_flat(self) -> bool:
         """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
         return self.placement.is_flat and not (self.camera is not None and self.camera.bends)
-
-    def models(self, effect: Effect) -> bool:
-        """Whether an effect shows where its settings turn it on: all do."""
-        return Scene.models(self, effect)
 
     def _laid_out(self) -> Self:
         piece, placement, unreadable, notes = _hang(self)

@@ -81,8 +81,7 @@ class Without(Problem):
         setup = Setup(self.stage, shown, conditions)
         for change in self.changes:
             setup = change(setup) or setup
-        piece = shown if isinstance(shown, PiecePicture) else None
-        return see(setup.stage, piece, setup.conditions, (side_px, side_px))
+        return see(setup.stage, shown, setup.conditions, (side_px, side_px))
 
 
 def without(problem: Problem, effect: str) -> Problem:
