@@ -1,9 +1,9 @@
 """Each photograph of a folder, on its own: measured (over processes), classified, kept in the journal and let go.
 
-In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `KeptPhoto` for
-each, in order, however they finished. A file that cannot be read, cannot be measured or ends its process each time
-becomes a rejected entry; the others go on. Of a control's photographs only what the networks see counts, since a bare
-object carries no marker.
+In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `MeasuredPhoto`
+for each, in order, however they finished, without its pictures and squares. A file that cannot be read, cannot be
+measured or ends its process each time becomes a rejected entry; the others go on. Of a control's photographs only what
+the networks see counts, since a bare object carries no marker.
 """
 
 from __future__ import annotations
@@ -49,28 +49,6 @@ class Item:
         return self.path.name if self.control is None else f"{self.control}/{self.path.name}"
 
 
-@dataclass(frozen=True)
-class KeptPhoto:
-    """What is kept of one photograph: its entry with predictions, whether it counts, the light on its frame."""
-
-    entry: PhotoEntry
-    counted: bool
-    light: FrameLight | None
-
-    def serialize(self) -> dict[str, Any]:
-        """JSON values."""
-        light = None if self.light is None else {k: np.asarray(v).tolist() for k, v in vars(self.light).items()}
-        return {"entry": self.entry.model_dump(mode="json"), "counted": self.counted, "light": light}
-
-    @classmethod
-    def parse(cls, values: Mapping[str, Any]) -> KeptPhoto:
-        """What `serialize` made JSON of."""
-        light = values["light"]
-        if light is not None:
-            light = FrameLight(**light | {"paper": np.array(light["paper"]), "ink": np.array(light["ink"])})
-        return cls(PhotoEntry.model_validate(values["entry"]), values["counted"], light)
-
-
 def measure_all(
     task: Task,
     items: Sequence[Item],
@@ -79,13 +57,13 @@ def measure_all(
     journal: Journal | None,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None],
     step: Callable[[int, int], None],
-) -> list[KeptPhoto]:
+) -> list[MeasuredPhoto]:
     """Every photograph in order; those in the journal are not opened again. `step` gets how many are done, and all."""
-    photos: dict[int, KeptPhoto] = {}
+    photos: dict[int, MeasuredPhoto] = {}
     for number, item in enumerate(items):
         kept = journal.find(item.name, item.path) if journal is not None else None
         if kept is not None and (kept["pictures"] or not item.with_pictures):
-            photos[number] = KeptPhoto.parse(kept)
+            photos[number] = _parsed(kept)
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
     for at, future in workers.completed(partial(_measured, task), [items[number] for number in todo]):
@@ -99,12 +77,24 @@ def measure_all(
         entry = measured.entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.path.name, measured.pictures)
-        kept = KeptPhoto(entry, measured.counted, measured.light).serialize()
+        kept = _serialized(replace(measured, entry=entry))
         if journal is not None:
             journal.add(item.name, sha256, kept | {"pictures": item.with_pictures})
-        photos[number] = KeptPhoto.parse(kept)  # as a later run will find it: what is kept and new must not differ
+        photos[number] = _parsed(kept)  # as a later run will find it: what is kept and new must not differ
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
+
+
+def _serialized(measured: MeasuredPhoto) -> dict[str, Any]:
+    light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
+    return {"entry": measured.entry.model_dump(mode="json"), "counted": measured.counted, "light": light}
+
+
+def _parsed(kept: Mapping[str, Any]) -> MeasuredPhoto:
+    light = kept["light"]
+    if light is not None:
+        light = FrameLight(**light | {"paper": np.array(light["paper"]), "ink": np.array(light["ink"])})
+    return MeasuredPhoto(PhotoEntry.model_validate(kept["entry"]), kept["counted"], light=light)
 
 
 def _measured(task: Task, item: Item) -> MeasuredPhoto:
@@ -112,7 +102,7 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         photo = read_photo(item.path)
         squares = squares_of(photo.srgb, task.sizes_px)
         if item.control is not None:
-            return MeasuredPhoto(PhotoEntry(file=item.path.name, status="judged"), True, {}, squares=squares)
+            return MeasuredPhoto(PhotoEntry(file=item.path.name, status="judged"), True, squares=squares)
         view = view_of(photo, task.camera)
         measured = measure(view, item.path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
         if not item.with_pictures:
@@ -129,22 +119,22 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
 
 
 def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:
-    return MeasuredPhoto(PhotoEntry(file=item.path.name, status="rejected", remark=remark), False, {})
+    return MeasuredPhoto(PhotoEntry(file=item.path.name, status="rejected", remark=remark), False)
 
 
-def shot_again(task: Task, size_px: int, item: tuple[Path, KeptPhoto]) -> Shot | None:
+def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Shot | None:
     """What the ledger needs of a photograph, which is read again for it: only few are, and none then waits.
 
     None where the ledger cannot work with it: it does not count, or its sheet is not flat or not to be believed.
     """
-    path, kept = item
-    geometry, light = kept.entry.geometry, kept.light
-    believed = kept.counted and usable(kept.entry.status, kept.entry.code)
+    path, measured = item
+    entry, geometry, light = measured.entry, measured.entry.geometry, measured.light
+    believed = measured.counted and usable(entry.status, entry.code)
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     try:
         srgb = view_of(read_photo(path), task.camera).photo.srgb
-        mm, blur_px = geometry.homography_px_from_mm, geometry.blur_px
-        return shot_of(kept.entry.file, srgb, mm, blur_px, light, task.surface, size_px)
+        px_from_mm = np.array(geometry.homography_px_from_mm)
+        return shot_of(entry.file, srgb, px_from_mm, geometry.blur_px, light, task.surface, size_px)
     except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
         return None  # read before, so this is a file that went away: the ledger does without

@@ -144,8 +144,7 @@ def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, in
             picture[y0:y1, x0:x1] = cv2.resize(pixels.astype(np.float32), size, interpolation=how)
 
     ids = sorted(surface.piece_ids)
-    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, surface.dictionary))
-    for i, cells in zip(ids, cells_of(printed, ids) if ids else (), strict=True):
+    for i, cells in zip(ids, cells_of(surface.dictionary, ids), strict=True):
         low, high = surface.corners_mm[i].min(0), surface.corners_mm[i].max(0)
         paste((*low, *(high - low)), ink + cells[..., None] * (1 - ink), cv2.INTER_NEAREST)
     for rect, color in zip(surface.swatch_rects_mm, swatches, strict=True):

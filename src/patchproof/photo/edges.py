@@ -19,6 +19,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
+# 49 points of a rectangle, its rim included, as shares of its width and height
+GRID = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7)), -1).reshape(-1, 2)
 ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
 REACH = 0.87  # of a border's half-length: nearer to its ends the next border's blur mixes in
 # in modules: inwards the printed cells are known, outwards only one module of paper is

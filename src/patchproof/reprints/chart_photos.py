@@ -70,8 +70,7 @@ def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
     """The page as light H×W×3 at `PX_PER_MM`, with some writing beside the chart, as sheets have."""
     width, height = (round(side * PX_PER_MM) for side in manifest.page_mm)
     page = np.full((height, width, 3), 255, np.uint8)
-    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
-    for marker, code in zip(manifest.markers, cells_of(printed, [m.id for m in manifest.markers]), strict=True):
+    for marker, code in zip(manifest.markers, cells_of(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
         side = round(MARKER_MM * PX_PER_MM)
         _fill(
             page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
