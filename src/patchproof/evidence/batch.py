@@ -16,22 +16,26 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.classify import Judges, squares_of
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.ledger import usable
 from patchproof.evidence.measure import MeasuredPhoto, measure
-from patchproof.evidence.pictures import thumbnail
 from patchproof.evidence.reproject import Shot, shot_of
 from patchproof.evidence.results import PhotoEntry, Remark
+from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
+from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.read import read_photo
 from patchproof.workers import WorkerDied, Workers, result_of
 
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
+_THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
+_DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
 
 
@@ -108,7 +112,7 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         if not item.with_pictures:
             return replace(measured, pictures={}, squares=squares)
         geometry = measured.entry.geometry
-        small = thumbnail(view.photo.srgb, geometry and geometry.homography_px_from_mm, task.surface)
+        small = _thumbnail(view.photo.srgb, geometry and geometry.homography_px_from_mm, task.surface)
         return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
     except CannotJudge as cannot:
         return _rejected(item, Remark.of(cannot))
@@ -116,6 +120,23 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         # no photograph is known that does this; one that does must not cost the others
         advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
         return _rejected(item, Remark(code="unreadable", advice=advice))
+
+
+def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
+    """The photograph reduced, with the outline of the design and of the piece's markers where they are known to lie."""
+    shrink = min(1.0, _THUMBNAIL_PX / max(srgb.shape[:2]))
+    size = max(1, round(srgb.shape[1] * shrink)), max(1, round(srgb.shape[0] * shrink))
+    sparse = max(1, int(0.5 / shrink))  # all of 12 megapixels took a tenth of the whole measurement's time
+    small = cv2.resize(srgb[::sparse, ::sparse], size, interpolation=cv2.INTER_AREA)
+    if px_from_mm is None:
+        return small
+    small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.asarray(px_from_mm)
+    markers = [(surface.corners_mm[marker_id], _MARKER_COLOR, 1) for marker_id in sorted(surface.piece_ids)]
+    for corners_mm, color, width in (*markers, (rect_corners(surface.rect_mm), _DESIGN_COLOR, 2)):
+        # OpenCV counts from pixel centers and takes sixteenths of pixels here
+        points = np.clip((apply_homography(small_from_mm, corners_mm) - 0.5) * 16, -1e6, 1e6)
+        cv2.polylines(small, [points.round().astype(np.int32)], True, color, width, cv2.LINE_AA, 4)
+    return small
 
 
 def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:

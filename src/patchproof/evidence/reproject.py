@@ -29,6 +29,7 @@ from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.rectify import part_around, rectify
 
+Switches = tuple[bool, ...]  # which effects are on
 FINER = 3  # times the network's input size
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
 _CELLS = 16  # of the design, along its shorter side, where its own colors stand in for swatches
@@ -136,16 +137,16 @@ def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:
 
 def squares_with(
     shot: Shot,
-    looks: Mapping[tuple[bool, bool], np.ndarray],
+    looks: Mapping[Switches, np.ndarray],
     rect_mm: tuple[float, float, float, float],
     undo: ColorFit,
     print_light: ColorFit,
     reference: Reference,
-) -> dict[tuple[bool, bool, bool, bool], np.ndarray]:
-    """Float32 sRGB squares W×W×3 by (gamut, print, light, blur).
+) -> dict[Switches, np.ndarray]:
+    """Float32 sRGB squares W×W×3 by the switches of a look, light and blur.
 
-    `looks` are the media-relative linear light of the piece at `rect_mm` by (gamut, print). `undo` takes photographed
-    light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
+    `looks` are the media-relative linear light of the piece at `rect_mm` by switches of their own. `undo` takes
+    photographed light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
     """
     corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
     box = part_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)  # and what blur carries over
@@ -158,7 +159,7 @@ def squares_with(
     grain = np.random.default_rng(0).standard_normal(photo[box].shape, np.float32)
     lit = {True: inverse(print_light.matrix), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
     out = {}
-    for (gamut, printed), look in looks.items():
+    for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
         for blur, sigma in ((True, shot.blur_px), (False, reference.blur_px)):
             layer = _blurred(sharp, sigma)
@@ -172,7 +173,7 @@ def squares_with(
                 mixed = mixed + share * noise * grain
                 picture = coded[light, blur].copy()
                 picture[box] = srgb_from_linear(np.clip(mixed, 0, 1))
-                out[gamut, printed, light, blur] = picture
+                out[(*switches, light, blur)] = picture
     return out
 
 
