@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -54,9 +53,7 @@ def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
     manifest = manifest or make_manifest()
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(
-        view_of(Photo(srgb, focal_px, Path("a")), None), "a", surface, promised, promised_ranges(conditions), scan_dpi
-    )
+    return measure(view_of(Photo(srgb, focal_px), None), "a", surface, promised, promised_ranges(conditions), scan_dpi)
 
 
 def test_a_good_photo_is_measured_and_its_pose_is_right():

@@ -112,7 +112,7 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         if not item.with_pictures:
             return replace(measured, pictures={}, squares=squares)
         geometry = measured.entry.geometry
-        small = _thumbnail(view.photo.srgb, geometry and geometry.homography_px_from_mm, task.surface)
+        small = _thumbnail(view.srgb, geometry and geometry.homography_px_from_mm, task.surface)
         return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
     except CannotJudge as cannot:
         return _rejected(item, Remark.of(cannot))
@@ -154,7 +154,7 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     try:
-        srgb = view_of(read_photo(path), task.camera).photo.srgb
+        srgb = view_of(read_photo(path), task.camera).srgb
         px_from_mm = np.array(geometry.homography_px_from_mm)
         return shot_of(entry.file, srgb, px_from_mm, geometry.blur_px, light, task.surface, size_px)
     except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):

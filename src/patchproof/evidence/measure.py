@@ -1,6 +1,6 @@
 """One photograph against the printed surface: where it was taken from, how sharp, how far its colors are off.
 
-In: a `Photo`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
+In: a `View`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
 the report. Every figure that can be had is filled in even where a later step fails. A photograph is `rejected` only
 for reasons that do not depend on the view (plus: outside of the promised ranges); where the sheet is identified but
 geometry or color cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
@@ -27,7 +27,6 @@ from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
-from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
 from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 
@@ -69,21 +68,20 @@ def measure(
     scan_dpi: float | None = None,
 ) -> MeasuredPhoto:
     """Everything that one readable photograph says; `promised` None leaves color unmeasured."""
-    photo = view.photo
     try:
-        detected, surface = identify(photo.srgb, surface)
+        detected, surface = identify(view.srgb, surface)
     except CannotJudge as cannot:
         return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(cannot)), False)
-    size_px = photo.srgb.shape[1], photo.srgb.shape[0]
+    size_px = view.srgb.shape[1], view.srgb.shape[0]
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
     fit = _fit(detected, surface)
     if fit is None:
         advice = "the marker in view is distorted: show the whole patch"
         few = CannotJudge("too_few_markers", len(detected.markers), 1, advice)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True)
-    light = frame_light(photo.srgb, detected.markers.values())
-    unrolled = _unrolled(photo, detected, surface)
-    srgb, fit = (photo.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
+    light = frame_light(view.srgb, detected.markers.values())
+    unrolled = _unrolled(view, detected, surface)
+    srgb, fit = (view.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
     geometry = _geometry(fit, unrolled, detected, light, surface)
     pose = _pose(view, fit, unrolled is None, surface)
     entry = partial(entry, geometry=geometry, pose=pose)
@@ -93,7 +91,7 @@ def measure(
     trouble = _trouble(geometry, fit, detected, surface)
     try:
         if page_check and surface.page_mm is not None:
-            refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
+            refuse_other_page(view.srgb, fit.px_from_mm, surface.page_mm, surface.label)
         if counted and (outside := ranges.violated(entry(status="judged"), trust_angles=trouble is None)) is not None:
             raise outside
     except CannotJudge as cannot:
@@ -168,11 +166,12 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
 
 
-def _unrolled(photo: Photo, detected: MarkersInView, surface: Surface) -> Unrolled | None:
+def _unrolled(view: View, detected: MarkersInView, surface: Surface) -> Unrolled | None:
     """The piece made flat where its markers do not lie in one plane and a cylinder or a lens says why."""
     corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
+    focal_px = None if view.matrix_px is None else float(view.matrix_px[0, 0])
     try:
-        return unroll(photo.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, photo.focal_px)
+        return unroll(view.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, focal_px)
     except (np.linalg.LinAlgError, ValueError):
         return None  # a shape that no camera sees is no explanation; the plane's residual decides
 

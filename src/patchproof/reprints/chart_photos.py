@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -116,7 +115,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     codes = codes_of_light(linear_from_srgb(picture), camera)
     file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return Shot(Photo(image_pixels(file), None, Path("page.jpg")), at_middle * exposure * white_balance)
+    return Shot(Photo(image_pixels(file), None), at_middle * exposure * white_balance)
 
 
 def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
