@@ -34,7 +34,8 @@ from patchproof.evidence.classify import Judges
 from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.reproject import Reference, Shot, Switches, design_fit, light_fit, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
-from patchproof.evidence.surface import Promised, Surface, piece_picture, reduced
+from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture
+from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest
 
 Values = Mapping[Switches, float]  # confidence by what is switched on
@@ -130,7 +131,7 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
 
 def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[Switches, np.ndarray]:
     """The piece's light by (gamut, print), or by (gamut,) alone where the print is not known."""
-    design = reduced(linear_from_srgb(sent_srgb / 255.0))
+    design = reduced(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
     sent = piece_picture(surface, design, linear_from_srgb(surface.swatches_srgb), np.zeros(3))
     looks = {False: sent, True: piece_picture(surface, promised.design, promised.swatches, promised.ink)}
     if printed is None:

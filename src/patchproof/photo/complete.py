@@ -71,7 +71,7 @@ def _still_wanted(srgb, wanted: Set[int], view: MarkersInView, corners_mm, scale
     """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
     quads = None
     if sum(b.fitted for b in view.markers.values()) >= 2:  # one marker says too little about where the others are
-        quads = _predicted(srgb, view, {i: corners_mm[i] for i in wanted}, corners_mm)
+        quads = _predicted(srgb, view, wanted, corners_mm)
     if quads is not None:
         wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
     if quads is None or not wanted:
@@ -94,8 +94,8 @@ def complete(
 
 def _round(srgb, view: MarkersInView, corners_mm, dictionary: str) -> dict[int, Borders]:
     """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
-    sure = {i for i, b in view.markers.items() if b.fitted}
-    predicted = _predicted(srgb, view, {i: mm for i, mm in corners_mm.items() if i not in sure}, corners_mm)
+    unsure = {i for i in corners_mm if i not in view.markers or not view.markers[i].fitted}
+    predicted = _predicted(srgb, view, unsure, corners_mm)
     if not predicted:
         return {}
     ids = sorted(predicted)
@@ -108,13 +108,13 @@ def _round(srgb, view: MarkersInView, corners_mm, dictionary: str) -> dict[int, 
     }
 
 
-def _predicted(srgb, view: MarkersInView, missing_mm, corners_mm) -> dict[int, np.ndarray] | None:
+def _predicted(srgb, view: MarkersInView, missing: Set[int], corners_mm) -> dict[int, np.ndarray] | None:
     """Where the fitted markers say that missing ones lie in the picture, by id; None where they cannot tell."""
     try:
         px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
     except (CannotJudge, np.linalg.LinAlgError):
         return None
-    quads = {i: apply_homography(px_from_mm, np.asarray(mm)) for i, mm in missing_mm.items()}
+    quads = {i: apply_homography(px_from_mm, corners_mm[i]) for i in missing}
     return {i: quad for i, quad in quads.items() if possible(quad) and _inside(quad, srgb)}
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from patchproof.color import LUMINANCE, linear_from_srgb
 from patchproof.photo.edges import Borders, fit_borders
-from patchproof.photo.rectify import part_around
+from patchproof.photo.rectify import part_around, reduced
 
 DICTIONARY = "DICT_5X5_1000"
 LIGHT = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # linear, by code value
@@ -93,10 +93,8 @@ def printed_markers(dictionary: str):
 
 def is_mirrored(srgb: np.ndarray, expected: Set[int], dictionary: str = DICTIONARY) -> bool:
     """Whether the sheet shows up when the picture is flipped: selfie cameras and scans through the back do that."""
-    shrink = MIRROR_PX / max(srgb.shape)
-    if shrink < 1:
-        srgb = cv2.resize(srgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return bool(find_markers(np.ascontiguousarray(srgb[:, ::-1]), expected, frozenset(), dictionary).markers)
+    mirrored = np.ascontiguousarray(reduced(srgb, MIRROR_PX)[:, ::-1])
+    return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
 
 
 def possible(corners: np.ndarray) -> bool:

@@ -128,6 +128,15 @@ def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: floa
     return warped if fine == 1 else cv2.resize(warped, size, interpolation=cv2.INTER_AREA)
 
 
+def reduced(pixels: np.ndarray, longest_px: int) -> np.ndarray:
+    """A picture averaged down until its longer side has no more pixels than that."""
+    shrink = longest_px / max(pixels.shape[:2])
+    if shrink >= 1:
+        return pixels
+    size = max(1, round(pixels.shape[1] * shrink)), max(1, round(pixels.shape[0] * shrink))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
 def crop(pixels: np.ndarray, px_from_mm: np.ndarray, points_mm, margin_px: int) -> tuple[np.ndarray, np.ndarray]:
     """The part of a photo that shows the page's points N×2 and a margin about them, and the homography to it."""
     rows, columns = part_around(apply_homography(px_from_mm, points_mm), margin_px, pixels.shape[:2])
