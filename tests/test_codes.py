@@ -23,7 +23,7 @@ GOOD = dict(tilt_deg=10.0, blur_px=1.0, contrast=0.5, px_per_mm=2.0, residual_mm
 
 def trouble(markers=8, module_px=4.0, **figures):
     """What `measure` says of these figures, of a 100 mm design."""
-    borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, module_px, True)
+    borders = Borders(np.zeros((4, 2)), 1.0, module_px, True)
     found = MarkersInView({i: borders for i in PIECE_IDS[:markers]}, (), ())
     fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[:markers])
     return measure._trouble(Geometry(**(GOOD | figures)), fit, found, SURFACE)
@@ -67,7 +67,7 @@ def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
 
 
 def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
-    borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, 4.0, True)
+    borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
     for foreign, doubled, code in (
         ((7,), (), None),
         ((7, 8), (), "several"),

@@ -1,7 +1,7 @@
 """Find the printed markers in a photograph, coarse to fine.
 
 In: uint8 sRGB pixels and the ids that the sheet carries. Out: `MarkersInView`: corners in photo pixels (centers at .5,
-clockwise from the code's top-left) with what their borders show of blur and light, the ids of the same dictionary
+clockwise from the code's top-left) with what their borders show of blur, the ids of the same dictionary
 that are not the sheet's, and ids seen at two places. The detector looks at linear light: in code values blurred paper
 grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linear light read 45. The pyramid starts
 below 1000 px and stops at the level where every expected id has been found; only if some are missing are code values
