@@ -18,9 +18,8 @@ from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Pose, Remark, Scale
-from patchproof.evidence.scan import scan_scale
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import local_scale, plane_pose, view_angles
+from patchproof.geometry import MM_PER_INCH, apply_homography, local_scale, plane_pose, rect_corners, view_angles
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
@@ -37,6 +36,8 @@ MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter s
 MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
 MOST_SCALE_ERROR = 0.01
+_MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
+_SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
@@ -86,7 +87,7 @@ def measure(
     pose = _pose(view, fit, unrolled is None, surface)
     entry = partial(entry, geometry=geometry, pose=pose)
     page_check = _is_uncut(fit, detected, surface)
-    scale = None if scan_dpi is None else scan_scale(fit.px_from_mm, surface, scan_dpi)
+    scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
     trouble = _trouble(geometry, fit, detected, surface)
     try:
@@ -238,6 +239,23 @@ def _trouble(geometry: Geometry, fit: PageFit, detected: MarkersInView, surface:
     ):
         if wrong:
             return CannotJudge(code, figure, limit, advice)
+    return None
+
+
+def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Scale | None:
+    """The print's scale through the middle of the design, by the DPI that the user states (never the file's own claim);
+    None where the picture is no scan: it has perspective or another resolution. Stretched prints are scans, too.
+    """
+    corners = apply_homography(px_from_mm, rect_corners(surface.rect_mm))
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    perspective = max(abs(sides[0] / sides[2] - 1), abs(sides[1] / sides[3] - 1))
+    x, y, w, h = surface.rect_mm
+    ends = np.array([[x, y + h / 2], [x + w, y + h / 2], [x + w / 2, y], [x + w / 2, y + h]])
+    left, right, top, bottom = apply_homography(px_from_mm, ends)
+    px_per_mm = scan_dpi / MM_PER_INCH
+    scale_x, scale_y = (float(np.linalg.norm(px) / mm / px_per_mm) for px, mm in ((right - left, w), (bottom - top, h)))
+    if perspective < _MOST_PERSPECTIVE and all(_SIZES[0] < scale < _SIZES[1] for scale in (scale_x, scale_y)):
+        return Scale(scale_x=scale_x, scale_y=scale_y)
     return None
 
 
