@@ -219,7 +219,7 @@ def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots):
     _, manifest, (shot, _) = shots
     falling = np.linspace(1, 0.6, shot.photo.srgb.shape[1])[:, None]
     darker = (srgb_from_linear(linear_from_srgb(shot.photo.srgb / 255) * falling) * 255 + 0.5).astype(np.uint8)
-    before, after = read_chart(shot.photo, manifest), read_chart(Photo(darker, None, Path("x")), manifest)
+    before, after = read_chart(shot.photo, manifest), read_chart(Photo(darker, None), manifest)
     error = difference(srgb_from_linear(after.light), srgb_from_linear(before.light))
     assert error.mean() < 0.5 and after.paper[1] < 0.9 * before.paper[1]
 
@@ -228,11 +228,11 @@ def test_photographs_that_show_no_chart(shots):
     _, manifest, (shot, _) = shots
     photo = shot.photo
     with pytest.raises(CannotJudge, match="too_few_markers"):
-        read_chart(Photo(np.full_like(photo.srgb, 90), None, Path("x")), manifest)
+        read_chart(Photo(np.full_like(photo.srgb, 90), None), manifest)
     with pytest.raises(CannotJudge, match="mirrored"):
-        read_chart(Photo(np.ascontiguousarray(photo.srgb[:, ::-1]), None, Path("x")), manifest)
+        read_chart(Photo(np.ascontiguousarray(photo.srgb[:, ::-1]), None), manifest)
     light = linear_from_srgb(photo.srgb / 255) * 8
-    white = Photo((srgb_from_linear(light.clip(0, 1)) * 255).astype(np.uint8), None, Path("x"))
+    white = Photo((srgb_from_linear(light.clip(0, 1)) * 255).astype(np.uint8), None)
     with pytest.raises(CannotJudge, match=r"clipped|too_few"):
         read_chart(white, manifest)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,6 @@ from patchproof.evidence.surface import surface_of
 from patchproof.geometry import intrinsics
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.edges import Borders
-from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, fit_page
 from test_photo_rectify import marker_corners, noisy_corners
 from test_photo_synthetic import PIECE_IDS, make_manifest, view
@@ -26,7 +23,7 @@ GOOD = dict(tilt_deg=10.0, blur_px=1.0, contrast=0.5, px_per_mm=2.0, residual_mm
 
 def trouble(markers=8, module_px=4.0, **figures):
     """What `measure` says of these figures, of a 100 mm design."""
-    borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, module_px, True)
+    borders = Borders(np.zeros((4, 2)), 1.0, module_px, True)
     found = MarkersInView({i: borders for i in PIECE_IDS[:markers]}, (), ())
     fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[:markers])
     return measure._trouble(Geometry(**(GOOD | figures)), fit, found, SURFACE)
@@ -60,7 +57,7 @@ def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
 def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     """The same sheet from 10° to the right: at 1.5 m the corners know it to 1°, at 8 m neither it nor how far it is."""
     matrix = intrinsics(40, (1200, 900))
-    seen = View(Photo(np.zeros((900, 1200, 3), np.uint8), None, Path("a")), matrix, False)
+    seen = View(np.zeros((900, 1200, 3), np.uint8), matrix, False)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
         pose = measure._pose(seen, fit_page(corners, marker_corners()), True, SURFACE)
@@ -70,7 +67,7 @@ def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
 
 
 def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
-    borders = Borders(np.zeros((4, 2)), 1.0, 0.0, 1.0, 4.0, True)
+    borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
     for foreign, doubled, code in (
         ((7,), (), None),
         ((7, 8), (), "several"),

@@ -155,7 +155,7 @@ def evidence(folder, faded=False, light=0.75, **look):
 )
 def test_known_culprits_are_named(tmp_path, change, culprit):
     found = evidence(tmp_path, **change)
-    summary = found.report.summary
+    summary = found.summary
     assert summary.culprit == culprit, summary.ledger
     whole = found.ledger.ideal - found.ledger.photo
     assert sum(share.share for share in summary.ledger.values()) == pytest.approx(whole, abs=1e-9)
@@ -171,14 +171,14 @@ def test_without_swatches_print_and_light_are_one_step(tmp_path):
     save(photograph(raster(True), homography, SIZE, blur_px=0.3, fine=2, light=0.75), tmp_path / "a.png")
     manifest = sheet().model_copy(update={"chart": ()})
     found = gather_evidence(tmp_path, manifest, Options([NET], identity_printer()))
-    assert list(found.report.summary.ledger) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
-    assert found.report.summary.ledger["print_light_and_camera"].share > 0.1
+    assert list(found.summary.ledger) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
+    assert found.summary.ledger["print_light_and_camera"].share > 0.1
 
 
 def test_no_ledger_where_none_was_asked_for(tmp_path):
     save(photograph(raster(False), view(size_px=SIZE, distance_mm=280), SIZE, fine=2), tmp_path / "a.png")
     found = gather_evidence(tmp_path, sheet(), Options([NET], identity_printer(), ledger_photos=0))
-    assert found.report.summary.ledger is None and found.ledger is None
+    assert found.summary.ledger is None and found.ledger is None
 
 
 @pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.01), (3.0, 0.03)])
@@ -201,8 +201,9 @@ def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_le
     photo = measured(srgb, manifest=sheet())
     geometry = photo.entry.geometry
     rest = geometry.blur_px, photo.light, surface, 96
-    assert shot_of("a", srgb, geometry.homography_px_from_mm, *rest) is not None
-    turned = np.array(geometry.homography_px_from_mm) @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
+    homography = np.array(geometry.homography_px_from_mm)
+    assert shot_of("a", srgb, homography, *rest) is not None
+    turned = homography @ np.array([[1, 0.2, 0], [0, 1.3, -20], [0, 0, 1.0]])
     assert shot_of("a", srgb, turned, *rest) is None
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -50,7 +48,7 @@ def pages(tmp_path_factory):
 def verified(manifest, srgb, scan_dpi=None):
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(view_of(Photo(srgb, None, Path("a")), None), "a", surface, promised, promised_ranges(()), scan_dpi)
+    return measure(view_of(Photo(srgb, None), None), "a", surface, promised, promised_ranges(()), scan_dpi)
 
 
 def oblique(page):

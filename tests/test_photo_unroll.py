@@ -82,7 +82,7 @@ def test_a_photograph_of_rolled_paper_is_measured_as_if_it_were_flat():
     page = page_raster(make_manifest(), only_piece=True) * np.float32(0.97) + np.float32(0.02)
     photo = curled_photograph(page, pose(), MATRIX, 1 / 150)
     surface = surface_of(make_manifest())
-    seen = measure(view_of(Photo(photo, None, None), None), "a.jpg", surface, None, promised_ranges(()))
+    seen = measure(view_of(Photo(photo, None), None), "a.jpg", surface, None, promised_ranges(()))
     entry = seen.entry
     assert entry.status == "measured" and entry.geometry.homography_px_from_mm is None
     assert entry.geometry.curl_radius_mm == pytest.approx(150, rel=0.05)

@@ -175,7 +175,7 @@ def test_what_trains_and_what_is_photographed_agree_in_rate(tmp_path):
     """The network's square with adapted effects against full photographs reduced to it, on the same conditions: 0.005
     in the mean.
     """
-    from patchproof.classifier.view import center_square
+    from patchproof.classifier.network import center_square
 
     scene = scene_of(tmp_path, SCENE)
     stage, conditions, piece = set_stage(scene), scene.draw("evaluate", 12), piece_of(scene)

@@ -160,7 +160,7 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimetr
     assert len(manifest.tiles) >= 12 and len(surface.piece_ids) == 8
     for tile in manifest.tiles:
         scan, truth = scanned(page_pixels(path, tile.page, DPI), tile.page)
-        measured = measure(view_of(Photo(scan, None, None), None), "scan", surface, None, promised_ranges(()), DPI)
+        measured = measure(view_of(Photo(scan, None), None), "scan", surface, None, promised_ranges(()), DPI)
         entry = measured.entry
         assert entry.status == "measured" and not measured.counted
         assert (entry.scale.scale_x, entry.scale.scale_y) == pytest.approx((1, 1), abs=0.002)
@@ -184,14 +184,14 @@ def test_assembled_tiles_are_the_design_and_its_whole_frame(tiled):
     columns = ((x - manifest.cut_mm[0] + at * w) * scale).astype(int)
     rows = ((y - manifest.cut_mm[1] + at * h) * scale).astype(int)
     assert np.abs(pixels[np.ix_(rows, columns)].astype(int) - DESIGN).mean() < 4
-    measured = measure(view_of(Photo(pixels, None, None), None), "p", surface, None, promised_ranges(()))
+    measured = measure(view_of(Photo(pixels, None), None), "p", surface, None, promised_ranges(()))
     assert measured.counted and measured.entry.markers_found == 8  # glued together it is no page check
 
 
 def test_a_scan_of_the_first_page_is_a_page_check(tiled):
     path, manifest = tiled
     page = page_pixels(path, 1, 75)
-    measured = measure(view_of(Photo(page, None, None), None), "p", surface_of(manifest), None, promised_ranges(()))
+    measured = measure(view_of(Photo(page, None), None), "p", surface_of(manifest), None, promised_ranges(()))
     assert measured.entry.code is None and not measured.counted
 
 

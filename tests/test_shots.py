@@ -32,8 +32,8 @@ def test_power_is_what_the_judge_finds_in_simulation(rates, n):
     for _ in range(trials):
         a, b = (rng.random(n) < rate for rate in rates)
         left = {str(i): bool(x) for i, x in enumerate(a)}
-        paired += compare(left, {str(i): bool(x) for i, x in enumerate(b)}, Goal.assist).shown
-        unpaired += compare(left, {f"c{i}": bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+        paired += compare(left, "bare", {str(i): bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+        unpaired += compare(left, "bare", {f"c{i}": bool(x) for i, x in enumerate(b)}, Goal.assist).shown
     # three standard errors of 1500 trials
     assert paired_power(*rates, n) == pytest.approx(paired / trials, abs=0.04)
     assert unpaired_power(*rates, n) == pytest.approx(unpaired / trials, abs=0.04)

@@ -92,7 +92,7 @@ def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeyp
         opened.clear()
         options = Options([NET], identity_printer(), ledger_photos=0, **options)
         kept = dict(journal=tmp_path / "photos.jsonl", resume=resume, progress=progress)
-        return gather_evidence(photos, make_manifest(promise()), options, **kept).report
+        return gather_evidence(photos, make_manifest(promise()), options, **kept)
 
     first = judged()
     assert len(opened) == 6
@@ -164,7 +164,7 @@ def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
     blur_px = measure.blur_px
     monkeypatch.setattr(batch, "measure", wrong)
     monkeypatch.setattr(measure, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
-    found = gather_evidence(folder, make_manifest(promise()), Options([NET], identity_printer())).report.photos
+    found = gather_evidence(folder, make_manifest(promise()), Options([NET], identity_printer())).photos
     assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]
 
 

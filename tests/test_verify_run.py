@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -54,9 +53,7 @@ def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
     manifest = manifest or make_manifest()
     surface = surface_of(manifest)
     promised = promised_of(manifest, surface, identity_printer())
-    return measure(
-        view_of(Photo(srgb, focal_px, Path("a")), None), "a", surface, promised, promised_ranges(conditions), scan_dpi
-    )
+    return measure(view_of(Photo(srgb, focal_px), None), "a", surface, promised, promised_ranges(conditions), scan_dpi)
 
 
 def test_a_good_photo_is_measured_and_its_pose_is_right():
@@ -194,7 +191,7 @@ def verified(folder, jobs=1, progress=lambda done, total: None, **options):
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
     calls = []
-    report = verified(folder, progress=lambda done, total: calls.append((done, total))).report
+    report = verified(folder, progress=lambda done, total: calls.append((done, total)))
     assert [p.file for p in report.photos] == ["a.JPG", *(f"b{i}.jpg" for i in range(6)), "c.png"]
     assert [p.code for p in report.photos] == ["unreadable", *[None] * 6, "too_few_markers"]
     summary = report.summary
@@ -209,22 +206,22 @@ def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
 
 
 def test_two_processes_give_the_same_bytes_as_one(folder):
-    assert verified(folder, jobs=2).report.model_dump_json() == verified(folder).report.model_dump_json()
+    assert verified(folder, jobs=2).model_dump_json() == verified(folder).model_dump_json()
 
 
 def test_controls_decide_the_effect(folder, tmp_path):
     for i in range(6):
         save(np.full((100, 100, 3), 20, np.uint8), tmp_path / f"b{i}.jpg")
     evidence = verified(folder, controls=tmp_path)
-    assert evidence.report.summary.effect == "shown"
-    (control,) = evidence.report.controls
+    assert evidence.summary.effect == "shown"
+    (control,) = evidence.controls
     assert (control.recognized, control.n, control.pairs) == (0, 6, 6)
 
 
 def test_only_scans_have_no_rate(tmp_path):
     homography = np.diag([4.0, 4.0, 1.0])
     save(photograph(raster(False), homography, (860, 1200), light=0.9, fine=3), tmp_path / "scan.png")
-    summary = verified(tmp_path, scan_dpi=101.6).report.summary
+    summary = verified(tmp_path, scan_dpi=101.6).summary
     assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 1, None, "cannot_tell")
 
 

@@ -46,28 +46,31 @@ def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
 def test_pairs_by_file_name_go_to_mcnemar():
     patch = {f"{i}.jpg": True for i in range(10)}
     control = {f"{i}.jpg": i < 4 for i in range(10)}
-    compared = compare(patch, control, Goal.assist)
+    compared = compare(patch, "bare", control, Goal.assist)
     # six discordant pairs, all one way: 2 · (1/2)⁶ = 0.03125
     assert (compared.pairs, compared.p_value, compared.shown) == (10, pytest.approx(0.03125), True)
-    assert not compare(patch, control, Goal.deceive).shown
-    assert compare(control, patch, Goal.deceive).shown
+    assert not compare(patch, "bare", control, Goal.deceive).shown
+    assert compare(control, "bare", patch, Goal.deceive).shown
     control["4.jpg"] = True  # five pairs: 0.0625
-    assert not compare(patch, control, Goal.assist).shown
+    assert not compare(patch, "bare", control, Goal.assist).shown
 
 
 def test_different_names_go_to_newcombe():
     patch, control = {f"a{i}": True for i in range(20)}, {f"b{i}": i < 5 for i in range(20)}
-    compared = compare(patch, control, Goal.assist)
+    compared = compare(patch, "bare", control, Goal.assist)
     assert compared.pairs == 0 and compared.p_value is None and compared.shown
     assert compared.difference == pytest.approx(0.75) and compared.difference_interval[0] > 0
 
 
 def test_every_control_must_be_beaten_and_none_is_no_test():
     patch = {f"{i}": True for i in range(10)}
-    good, bad = compare(patch, {f"{i}": False for i in range(10)}, Goal.assist), compare(patch, patch, Goal.assist)
+    good, bad = (
+        compare(patch, "bare", {f"{i}": False for i in range(10)}, Goal.assist),
+        compare(patch, "bare", patch, Goal.assist),
+    )
     assert effect_of([good]) == "shown" and effect_of([good, bad]) == "not_shown"
-    assert effect_of([]) == effect_of([None]) == "not_tested"
-    assert compare(patch, {}, Goal.assist) is None
+    assert effect_of([]) == effect_of([compare(patch, "bare", {}, Goal.assist)]) == "not_tested"
+    assert compare(patch, "bare", {}, Goal.assist).shown is None
 
 
 def conditions(scales, recognized):

@@ -25,8 +25,7 @@ from patchproof.bench.world import demo_problem
 from patchproof.claims import student_mean
 from patchproof.classifier.batches import MAX_BATCH, InBatches, few_on_cpu
 from patchproof.classifier.load import load_classifier
-from patchproof.classifier.network import Classifier
-from patchproof.classifier.view import center_square
+from patchproof.classifier.network import Classifier, center_square
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.report.tables import Table

@@ -55,7 +55,7 @@ def folded(trained: SmallNetwork) -> SmallNetwork:
     return plain.eval()
 
 
-def load_builtin(device: torch.device | str = "cpu", folder: Path = HERE) -> Classifier:
+def load_builtin(folder: Path = HERE) -> Classifier:
     """The network from `builtin.safetensors` with the classes of `builtin.json`."""
     from safetensors.torch import load
 
@@ -66,8 +66,7 @@ def load_builtin(device: torch.device | str = "cpu", folder: Path = HERE) -> Cla
     labels = tuple(json.loads(card.read_text(encoding="utf-8"))["classes"])
     network = SmallNetwork(len(labels))
     network.load_state_dict({key: tensor.float() for key, tensor in load(stored).items()})
-    network = network.eval().to(device)
-    return Classifier("builtin", hashlib.sha256(stored).hexdigest(), INPUT_PX, labels, network)
+    return Classifier("builtin", hashlib.sha256(stored).hexdigest(), INPUT_PX, labels, network.eval())
 
 
 def _conv(before: int, after: int, stride: int, batch_norm: bool) -> nn.Module:

@@ -36,7 +36,8 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
     except Refused:
         raise
     except Exception as error:  # it is the user's program: whatever it raises is about it
-        got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({_first_line(error)})"
+        reason = f"{type(error).__name__}: {first_line(error)}"
+        got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({reason})"
         raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
     _check_outputs(logits, len(classifier.labels), name)
     spread = float(logits.max() - logits.min())
@@ -95,6 +96,6 @@ def smooth_pictures(size_px: int) -> Tensor:
     return torch.nn.functional.interpolate(coarse, (size_px, size_px), mode="bilinear", align_corners=False)
 
 
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
+def first_line(error: Exception) -> str:
+    """The first line of its message, shortened."""
+    return (str(error).strip().splitlines() or [""])[0][:200]

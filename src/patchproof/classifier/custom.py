@@ -18,8 +18,8 @@ from patchproof.classifier.network import Classifier, weights_sha256
 from patchproof.strict import Refused
 
 
-def load_custom(dotted: str, base: Path, device: torch.device | str = "cpu") -> Classifier:
-    """What `package.factory()` returns, as a Classifier on `device`."""
+def load_custom(dotted: str, base: Path) -> Classifier:
+    """What `package.factory()` returns, as a Classifier."""
     name, factory = f"module:{dotted}", _factory(dotted, base)
     try:
         made = factory()
@@ -31,7 +31,7 @@ def load_custom(dotted: str, base: Path, device: torch.device | str = "cpu") -> 
     if not isinstance(made, torch.nn.Module) or not isinstance(input_px, int) or not labels or isinstance(labels, str):
         do = "return a torch.nn.Module with input_px (an int) and labels (a list of names), or a Classifier"
         raise Refused(f"a network from {name}", f"a {type(made).__name__} without them", do)
-    return classifier_of(made.to(device), input_px, labels, name)
+    return classifier_of(made, input_px, labels, name)
 
 
 def classifier_of(

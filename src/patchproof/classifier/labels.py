@@ -37,9 +37,13 @@ def _folded(text: str) -> str:
 
 
 def _nearest(labels: Sequence[str], label: str) -> str:
-    names = {_folded(name): name.strip() for entry in labels for name in entry.split(",")}
-    near = difflib.get_close_matches(_folded(label), names, 3, 0.6)
-    if near:
-        return "did you mean " + " or ".join(f'"{names[word]}"' for word in near)
-    shown = ", ".join(list(names.values())[:5]) + (", ..." if len(names) > 5 else "")
-    return f"use an index below {len(labels)} or one of its {len(labels)} labels ({shown})"
+    names = list(dict.fromkeys(name.strip() for entry in labels for name in entry.split(",")))
+    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return nearest_names(label, names, f"use an index below {len(labels)} or one of its {len(labels)} labels ({shown})")
+
+
+def nearest_names(word: str, names: Sequence[str], otherwise: str) -> str:
+    """What to do about a name that is not there: up to three near ones, or else `otherwise`."""
+    by_folded = {_folded(name): name for name in names}
+    near = difflib.get_close_matches(_folded(word), by_folded, 3, 0.6)
+    return "did you mean " + " or ".join(f'"{by_folded[name]}"' for name in near) if near else otherwise

@@ -13,7 +13,6 @@ gradients. Several names are simply several classifiers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     if name == "builtin":
         from patchproof.classifier.builtin import load_builtin
 
-        classifier = load_builtin(device)
+        classifier = load_builtin()
     elif kind == "file":
         from patchproof.classifier.program import load_program
 
@@ -43,12 +42,11 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     elif kind in ("torchvision", "timm"):
         from patchproof.classifier.zoo import load_timm, load_torchvision
 
-        loader: Callable = load_torchvision if kind == "torchvision" else load_timm
-        classifier = loader(rest, device)
+        classifier = load_torchvision(rest) if kind == "torchvision" else load_timm(rest)
     elif kind == "module":
         from patchproof.classifier.custom import load_custom
 
-        classifier = load_custom(rest, Path(base), device)
+        classifier = load_custom(rest, Path(base))
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
@@ -59,9 +57,9 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
 
 
 def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
-    """The classifier frozen, doubted, and as fast as it can be called."""
+    """The classifier on the device, frozen, doubted, and as fast as it can be called."""
     if isinstance(classifier.network, torch.nn.Module):
-        classifier.network.requires_grad_(False)
+        classifier.network.requires_grad_(False).to(device)
     check_network(classifier, device)
     pictures = smooth_pictures(classifier.input_px).to(device)
     return replace(classifier, network=fastest(classifier.network, pictures))

@@ -1,7 +1,8 @@
 """The classifier as the rest of the project sees it: photographs in, logits out, and what counts as recognized.
 
 In: N×3×H×W sRGB in [0, 1] of any size. Out: N×K logits. Normalization belongs to the network, cropping and resizing to
-the centered square belongs here. Recognized means that the top-1 label is among the target's indices.
+the centered square belongs here: one function for training, promise, reprint and verification, so that none of them
+sees anything else. Recognized means that the top-1 label is among the target's indices.
 Left out on purpose: labels' meaning (labels.py), loading (load.py), ensembles (a tuple of classifiers is one).
 """
 
@@ -14,7 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from patchproof.classifier.view import center_square
 from patchproof.strict import Refused
 
 
@@ -50,6 +50,22 @@ class Classifier:
             do = "check its weights and its number format"
             raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
         return logits
+
+
+def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:
+    """N×3×H×W in any range → N×3×S×S, unchanged where it has that size; an odd pixel is lost on the right or below.
+
+    Antialiased bilinear resampling, as Pillow does it: each output pixel averages its whole footprint, so a large
+    photograph does not alias; differentiable, so that gradients reach the patch.
+    """
+    height, width = photos_srgb.shape[-2:]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    square = photos_srgb[..., top : top + side, left : left + side]
+    if side == size_px:
+        return square
+    size = (size_px, size_px)
+    return torch.nn.functional.interpolate(square, size, mode="bilinear", align_corners=False, antialias=True)
 
 
 def weights_sha256(network: torch.nn.Module) -> str | None:

@@ -8,7 +8,6 @@ Their resize-then-crop is left out on purpose: here every network sees the whole
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,7 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from patchproof.classifier.network import Classifier, weights_sha256
+from patchproof.classifier.check import first_line
+from patchproof.classifier.custom import classifier_of
+from patchproof.classifier.labels import nearest_names
+from patchproof.classifier.network import Classifier
 from patchproof.strict import Refused
 
 
@@ -34,24 +36,26 @@ class Normalized(nn.Module):
         return self.network((photos_srgb - self.mean) / self.std)
 
 
-def load_torchvision(name: str, device: torch.device | str = "cpu") -> Classifier:
+def load_torchvision(name: str) -> Classifier:
     """A torchvision classification model with its default weights."""
     models = _library("torchvision").models
     known = models.list_models(module=models)  # segmentation, detection and video have modules of their own
     if name not in known:
-        raise Refused("a torchvision classifier", f'"{name}"', _near(name, known, "torchvision.models.list_models()"))
+        do = nearest_names(name, known, "choose one of torchvision.models.list_models()")
+        raise Refused("a torchvision classifier", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
     network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
     view = weights.transforms()
     normalized = Normalized(network, view.mean, view.std)
-    return _classifier(f"torchvision:{name}", normalized, view.crop_size[0], weights.meta["categories"], device)
+    return classifier_of(normalized, int(view.crop_size[0]), weights.meta["categories"], f"torchvision:{name}")
 
 
-def load_timm(name: str, device: torch.device | str = "cpu") -> Classifier:
+def load_timm(name: str) -> Classifier:
     """A timm model with its pretrained weights, for the ImageNet subsets that timm has the labels of."""
     timm = _library("timm")
     if not timm.is_model(name):
-        raise Refused("a timm model", f'"{name}"', _near(name, timm.list_models(), "timm.list_models()"))
+        do = nearest_names(name, timm.list_models(), "choose one of timm.list_models()")
+        raise Refused("a timm model", f'"{name}"', do)
     network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
     subset = timm.data.infer_imagenet_subset(network)
     if not subset:
@@ -60,25 +64,15 @@ def load_timm(name: str, device: torch.device | str = "cpu") -> Classifier:
     info, view = timm.data.ImageNetInfo(subset), timm.data.resolve_model_data_config(network)
     labels = [info.index_to_description(index) for index in range(network.num_classes)]
     normalized = Normalized(network, view["mean"], view["std"])
-    return _classifier(f"timm:{name}", normalized, view["input_size"][-1], labels, device)
-
-
-def _classifier(name: str, network: nn.Module, input_px: int, labels: Sequence[str], device) -> Classifier:
-    network = network.eval().to(device)
-    return Classifier(name, weights_sha256(network), int(input_px), tuple(labels), network)
+    return classifier_of(normalized, int(view["input_size"][-1]), labels, f"timm:{name}")
 
 
 def _downloaded(name: str, load: Callable[[], Any]) -> Any:
     try:
         return load()
     except Exception as error:  # each library raises its own for no network, no weights and no space
-        got = f"{type(error).__name__} ({(str(error).strip().splitlines() or [''])[0][:200]})"
+        got = f"{type(error).__name__} ({first_line(error)})"
         raise Refused(f"the published weights of {name}", got, "check the name and the way to the internet") from error
-
-
-def _near(name: str, known: Sequence[str], where: str) -> str:
-    near = difflib.get_close_matches(name, known, 3, 0.6)
-    return "did you mean " + " or ".join(f'"{word}"' for word in near) if near else f"choose one of {where}"
 
 
 def _library(name: str):

@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb, photo_codes_of, srgb_from_linear
+from patchproof.color import ciede2000, lab_from_linear, photo_codes_of, srgb_from_linear
 from patchproof.evidence.results import Color, Geometry, SwatchSeen
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
-from patchproof.photo.edges import sample
+from patchproof.photo.detect import LIGHT
+from patchproof.photo.edges import GRID, sample
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import rectify
+from patchproof.photo.rectify import crop, rectify
 
-LINEAR = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # light by code value
 _CELLS = (6, 48)  # least and most along the design's shorter side
 MOST_CLIPPED = 0.5  # share of the design at full white, where color is unknown
 _MOST_CLIPPED_PAPER = 0.2
@@ -33,7 +33,7 @@ _PICTURE_PX = 192
 # much more of a margin up to 5 and mostly under 1
 _CHROMA_PX = 1.0
 _GLOSS = 0.15  # linear light, paper = 1
-_POINTS = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7)), -1).reshape(-1, 2)
+_UNREAD = np.full(3, np.nan)
 
 
 def appearance(
@@ -48,16 +48,16 @@ def appearance(
     `delta_e00` float cells).
     """
     part, px_from_mm = piece_only(srgb, px_from_mm, surface)
-    linear = LINEAR[part]
+    linear = LIGHT[part]
     swatches = seen_swatches(part, linear, px_from_mm, surface, geometry.blur_px, light.paper)
     fit = color_fit(swatches, promised, light)
     flat = partial(rectify, px_from_mm=px_from_mm, rect_mm=surface.rect_mm, px_per_mm=_cells_per_mm(surface, geometry))
-    seen = fit.apply(flat(linear).astype(float))
-    clipped = flat((part.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)).reshape(seen.shape[:2]) > 0.05
+    cells = fit.apply(flat(linear).astype(float))
+    clipped = flat((part.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)).reshape(cells.shape[:2]) > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
-    expected = _coarse(promised.design, seen.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
-    delta = ciede2000(lab_from_linear(expected), lab_from_linear(seen))
-    glossy = _glossy(seen, expected) & ~clipped
+    expected = _coarse(promised.design, cells.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
+    delta = ciede2000(lab_from_linear(expected), lab_from_linear(cells))
+    glossy = _glossy(cells, expected) & ~clipped
     usable = ~(clipped | glossy)
     usable[[0, -1]] = usable[:, [0, -1]] = False
     inner = np.s_[1:-1, 1:-1]
@@ -77,8 +77,8 @@ def appearance(
     fitted = fit.apply(flat(linear))
     pictures = {
         "seen": flat(part),
-        "fitted": _eight_bit(fitted),
-        "promised": _eight_bit(_coarse(promised.design, fitted.shape[:2], 0.0)),
+        "fitted": photo_codes_of(srgb_from_linear(fitted)),
+        "promised": photo_codes_of(srgb_from_linear(_coarse(promised.design, fitted.shape[:2], 0.0))),
         "delta_e00": np.where(usable, delta, np.nan).astype(np.float32),
     }
     return color, pictures
@@ -91,10 +91,10 @@ def color_fit(swatches: np.ndarray, promised: Promised, light: FrameLight) -> Co
     return fit or white_black(light.paper, light.ink, promised.ink)
 
 
-def _compared(fit: ColorFit, seen: np.ndarray, promised: np.ndarray, sent: np.ndarray) -> tuple[SwatchSeen, ...]:
+def _compared(fit: ColorFit, swatches: np.ndarray, promised: np.ndarray, sent: np.ndarray) -> tuple[SwatchSeen, ...]:
     """Each readable swatch after the color fit beside its promise."""
     compared = []
-    for color, light, wanted in zip(sent, seen, promised, strict=True):
+    for color, light, wanted in zip(sent, swatches, promised, strict=True):
         if np.isfinite(light).all():
             fitted = np.clip(fit.apply(light), 0, 1)
             delta = ciede2000(lab_from_linear(wanted), lab_from_linear(fitted))
@@ -103,12 +103,12 @@ def _compared(fit: ColorFit, seen: np.ndarray, promised: np.ndarray, sent: np.nd
     return tuple(compared)
 
 
-def _glossy(seen: np.ndarray, expected: np.ndarray) -> np.ndarray:
+def _glossy(cells: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Cells H×W to which light was added in all channels: no ink that is missing or wrong lifts all three.
 
     More than the design as a whole, which a print on other paper may lift; a lone cell is an edge that lies off.
     """
-    added = (seen - expected).min(-1)
+    added = (cells - expected).min(-1)
     mask = added - np.median(added) > _GLOSS
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
 
@@ -122,37 +122,37 @@ def seen_swatches(
     over from the `paper` around is taken out.
     """
     values = [_swatch(part, linear, px_from_mm, rect, blur_px, paper) for rect in surface.swatch_rects_mm]
-    return np.array([np.full(3, np.nan) if value is None else value for value in values]).reshape(-1, 3)
+    return np.array(values).reshape(-1, 3)
 
 
-def _swatch(part, linear, px_from_mm, rect, blur_px: float, paper) -> np.ndarray | None:
-    """Linear light of a swatch's core; None where it has none, is clipped, or lies out of the picture."""
+def _swatch(part, linear, px_from_mm, rect, blur_px: float, paper) -> np.ndarray:
+    """Linear light of a swatch's core; NaN where it has none, is clipped, or lies out of the picture."""
     x, y, w, h = rect
     quad = apply_homography(px_from_mm, rect_corners(rect))
     sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).reshape(2, 2).min(0)  # width, height
     if ((0.75 + _CHROMA_PX + 1.5 * blur_px) / sides > 0.4).any():
-        return None
+        return _UNREAD
     edge = np.minimum((0.75 + _CHROMA_PX + 2.5 * blur_px) / sides, 0.4)  # shares of width, height
-    shares = edge + _POINTS * (1 - 2 * edge)
+    shares = edge + GRID * (1 - 2 * edge)
     points = apply_homography(px_from_mm, [x, y] + [w, h] * shares)
     if (points < 0).any() or (points > [part.shape[1], part.shape[0]]).any():
-        return None
+        return _UNREAD
     if float((sample(part, points) >= CLIPPED_CODE).mean()) > 0.05:
-        return None
+        return _UNREAD
     sigma = max(blur_px, 0.1) / sides
     own = (ndtr(shares / sigma) - ndtr((shares - 1) / sigma)).prod(1)[:, None]  # of the light, under a Gaussian
     return np.median((sample(linear, points) - (1 - own) * paper) / own, axis=0)
 
 
 def _cells_per_mm(surface: Surface, geometry: Geometry) -> float:
-    cell_mm = max(2.0, 2 * geometry.blur_px) / geometry.px_per_mm
     foreshortened = np.sqrt(max(np.cos(np.radians(geometry.tilt_deg)), 0.05))
-    cell_mm = max(cell_mm / foreshortened, 4 * geometry.corner_uncertainty_mm)
+    cell_mm = max(2.0, 2 * geometry.blur_px) / geometry.px_per_mm / foreshortened
+    cell_mm = max(cell_mm, 4 * geometry.corner_uncertainty_mm)
     side_mm = min(surface.rect_mm[2:])
     return float(np.clip(side_mm / cell_mm, *_CELLS)) / side_mm
 
 
-def _coarse(design: np.ndarray, shape: tuple[int, int], blur_design_px: float) -> np.ndarray:
+def _coarse(design: np.ndarray, shape: tuple[int, ...], blur_design_px: float) -> np.ndarray:
     """The promised light blurred and averaged to `shape` cells."""
     if blur_design_px > 0.3:
         design = cv2.GaussianBlur(design, (0, 0), float(blur_design_px), borderType=cv2.BORDER_REPLICATE)
@@ -163,18 +163,4 @@ def _coarse(design: np.ndarray, shape: tuple[int, int], blur_design_px: float) -
 def piece_only(srgb: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     """The part of the photo that holds the design and all swatches, and the homography to it."""
     corners = np.concatenate([rect_corners(r) for r in (surface.rect_mm, *surface.swatch_rects_mm)])
-    inside = part_around(apply_homography(px_from_mm, corners), 4, srgb.shape[:2])
-    shift = np.array([[1, 0, -inside[1].start], [0, 1, -inside[0].start], [0, 0, 1.0]])
-    return np.ascontiguousarray(srgb[inside]), shift @ px_from_mm
-
-
-def part_around(points_px: np.ndarray, margin_px: int, shape: tuple[int, int]) -> tuple[slice, slice]:
-    """Rows and columns of a picture H×W that hold points N×2 (x, y) and a margin about them; at least a pixel."""
-    limit = np.array(shape[::-1])
-    low = np.clip(np.floor(points_px.min(0)).astype(int) - margin_px, 0, limit - 1)
-    high = np.clip(np.ceil(points_px.max(0)).astype(int) + margin_px, low + 1, limit)
-    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
-
-
-def _eight_bit(linear: np.ndarray) -> np.ndarray:
-    return photo_codes_of(srgb_from_linear(np.clip(linear, 0, 1)))
+    return crop(srgb, px_from_mm, corners, 4)

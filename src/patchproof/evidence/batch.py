@@ -1,9 +1,9 @@
 """Each photograph of a folder, on its own: measured (over processes), classified, kept in the journal and let go.
 
-In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `KeptPhoto` for
-each, in order, however they finished. A file that cannot be read, cannot be measured or ends its process each time
-becomes a rejected entry; the others go on. Of a control's photographs only what the networks see counts, since a bare
-object carries no marker.
+In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `MeasuredPhoto`
+for each, in order, however they finished, without its pictures and squares. A file that cannot be read, cannot be
+measured or ends its process each time becomes a rejected entry; the others go on. Of a control's photographs only what
+the networks see counts, since a bare object carries no marker.
 """
 
 from __future__ import annotations
@@ -16,22 +16,26 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.classify import Judges, squares_of
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.ledger import usable
 from patchproof.evidence.measure import MeasuredPhoto, measure
-from patchproof.evidence.pictures import thumbnail
 from patchproof.evidence.reproject import Shot, shot_of
 from patchproof.evidence.results import PhotoEntry, Remark
+from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
+from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.read import read_photo
 from patchproof.workers import WorkerDied, Workers, result_of
 
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
+_THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
+_DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
 
 
@@ -49,28 +53,6 @@ class Item:
         return self.path.name if self.control is None else f"{self.control}/{self.path.name}"
 
 
-@dataclass(frozen=True)
-class KeptPhoto:
-    """What is kept of one photograph: its entry with predictions, whether it counts, the light on its frame."""
-
-    entry: PhotoEntry
-    counted: bool
-    light: FrameLight | None
-
-    def serialize(self) -> dict[str, Any]:
-        """JSON values."""
-        light = None if self.light is None else {k: np.asarray(v).tolist() for k, v in vars(self.light).items()}
-        return {"entry": self.entry.model_dump(mode="json"), "counted": self.counted, "light": light}
-
-    @classmethod
-    def parse(cls, values: Mapping[str, Any]) -> KeptPhoto:
-        """What `serialize` made JSON of."""
-        light = values["light"]
-        if light is not None:
-            light = FrameLight(**light | {"paper": np.array(light["paper"]), "ink": np.array(light["ink"])})
-        return cls(PhotoEntry.model_validate(values["entry"]), values["counted"], light)
-
-
 def measure_all(
     task: Task,
     items: Sequence[Item],
@@ -79,13 +61,13 @@ def measure_all(
     journal: Journal | None,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None],
     step: Callable[[int, int], None],
-) -> list[KeptPhoto]:
+) -> list[MeasuredPhoto]:
     """Every photograph in order; those in the journal are not opened again. `step` gets how many are done, and all."""
-    photos: dict[int, KeptPhoto] = {}
+    photos: dict[int, MeasuredPhoto] = {}
     for number, item in enumerate(items):
         kept = journal.find(item.name, item.path) if journal is not None else None
         if kept is not None and (kept["pictures"] or not item.with_pictures):
-            photos[number] = KeptPhoto.parse(kept)
+            photos[number] = _parsed(kept)
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
     for at, future in workers.completed(partial(_measured, task), [items[number] for number in todo]):
@@ -99,12 +81,24 @@ def measure_all(
         entry = measured.entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.path.name, measured.pictures)
-        kept = KeptPhoto(entry, measured.counted, measured.light).serialize()
+        kept = _serialized(replace(measured, entry=entry))
         if journal is not None:
             journal.add(item.name, sha256, kept | {"pictures": item.with_pictures})
-        photos[number] = KeptPhoto.parse(kept)  # as a later run will find it: what is kept and new must not differ
+        photos[number] = _parsed(kept)  # as a later run will find it: what is kept and new must not differ
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
+
+
+def _serialized(measured: MeasuredPhoto) -> dict[str, Any]:
+    light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
+    return {"entry": measured.entry.model_dump(mode="json"), "counted": measured.counted, "light": light}
+
+
+def _parsed(kept: Mapping[str, Any]) -> MeasuredPhoto:
+    light = kept["light"]
+    if light is not None:
+        light = FrameLight(**light | {"paper": np.array(light["paper"]), "ink": np.array(light["ink"])})
+    return MeasuredPhoto(PhotoEntry.model_validate(kept["entry"]), kept["counted"], light=light)
 
 
 def _measured(task: Task, item: Item) -> MeasuredPhoto:
@@ -112,13 +106,13 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         photo = read_photo(item.path)
         squares = squares_of(photo.srgb, task.sizes_px)
         if item.control is not None:
-            return MeasuredPhoto(PhotoEntry(file=item.path.name, status="judged"), True, {}, squares=squares)
+            return MeasuredPhoto(PhotoEntry(file=item.path.name, status="judged"), True, squares=squares)
         view = view_of(photo, task.camera)
         measured = measure(view, item.path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
         if not item.with_pictures:
             return replace(measured, pictures={}, squares=squares)
         geometry = measured.entry.geometry
-        small = thumbnail(view.photo.srgb, geometry and geometry.homography_px_from_mm, task.surface)
+        small = _thumbnail(view.srgb, geometry and geometry.homography_px_from_mm, task.surface)
         return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
     except CannotJudge as cannot:
         return _rejected(item, Remark.of(cannot))
@@ -128,23 +122,40 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         return _rejected(item, Remark(code="unreadable", advice=advice))
 
 
+def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
+    """The photograph reduced, with the outline of the design and of the piece's markers where they are known to lie."""
+    shrink = min(1.0, _THUMBNAIL_PX / max(srgb.shape[:2]))
+    size = max(1, round(srgb.shape[1] * shrink)), max(1, round(srgb.shape[0] * shrink))
+    sparse = max(1, int(0.5 / shrink))  # all of 12 megapixels took a tenth of the whole measurement's time
+    small = cv2.resize(srgb[::sparse, ::sparse], size, interpolation=cv2.INTER_AREA)
+    if px_from_mm is None:
+        return small
+    small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.asarray(px_from_mm)
+    markers = [(surface.corners_mm[marker_id], _MARKER_COLOR, 1) for marker_id in sorted(surface.piece_ids)]
+    for corners_mm, color, width in (*markers, (rect_corners(surface.rect_mm), _DESIGN_COLOR, 2)):
+        # OpenCV counts from pixel centers and takes sixteenths of pixels here
+        points = np.clip((apply_homography(small_from_mm, corners_mm) - 0.5) * 16, -1e6, 1e6)
+        cv2.polylines(small, [points.round().astype(np.int32)], True, color, width, cv2.LINE_AA, 4)
+    return small
+
+
 def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:
-    return MeasuredPhoto(PhotoEntry(file=item.path.name, status="rejected", remark=remark), False, {})
+    return MeasuredPhoto(PhotoEntry(file=item.path.name, status="rejected", remark=remark), False)
 
 
-def shot_again(task: Task, size_px: int, item: tuple[Path, KeptPhoto]) -> Shot | None:
+def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Shot | None:
     """What the ledger needs of a photograph, which is read again for it: only few are, and none then waits.
 
     None where the ledger cannot work with it: it does not count, or its sheet is not flat or not to be believed.
     """
-    path, kept = item
-    geometry, light = kept.entry.geometry, kept.light
-    believed = kept.counted and usable(kept.entry.status, kept.entry.code)
+    path, measured = item
+    entry, geometry, light = measured.entry, measured.entry.geometry, measured.light
+    believed = measured.counted and usable(entry.status, entry.code)
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     try:
-        srgb = view_of(read_photo(path), task.camera).photo.srgb
-        mm, blur_px = geometry.homography_px_from_mm, geometry.blur_px
-        return shot_of(kept.entry.file, srgb, mm, blur_px, light, task.surface, size_px)
+        srgb = view_of(read_photo(path), task.camera).srgb
+        px_from_mm = np.array(geometry.homography_px_from_mm)
+        return shot_of(entry.file, srgb, px_from_mm, geometry.blur_px, light, task.surface, size_px)
     except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
         return None  # read before, so this is a file that went away: the ledger does without

@@ -23,7 +23,7 @@ FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
 class View:
     """A photograph with straight lines straight, its matrix (None: unknown), and whether a camera file says so."""
 
-    photo: Photo
+    srgb: np.ndarray
     matrix_px: np.ndarray | None
     calibrated: bool
 
@@ -35,11 +35,10 @@ def view_of(photo: Photo, camera: lens.Camera | None) -> View:
         for held in (camera, _turned(camera)):
             if abs(width * held.image_px[1] / (height * held.image_px[0]) - 1) <= lens.ASPECT_TOLERANCE:
                 matrix = lens.matrix_px(held, (width, height))
-                straight = Photo(_straightened(photo, held, matrix), float(matrix[0, 0]), photo.path)
-                return View(straight, matrix, True)
+                return View(_straightened(photo.srgb, held, matrix), matrix, True)
     focal = photo.focal_px
     matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return View(photo, matrix, False)
+    return View(photo.srgb, matrix, False)
 
 
 def _turned(camera: lens.Camera) -> lens.Camera:
@@ -49,13 +48,13 @@ def _turned(camera: lens.Camera) -> lens.Camera:
     return turned.changed(p1=camera.p2, p2=-camera.p1)
 
 
-def _straightened(photo: Photo, camera: lens.Camera, matrix: np.ndarray) -> np.ndarray:
+def _straightened(srgb: np.ndarray, camera: lens.Camera, matrix: np.ndarray) -> np.ndarray:
     """The picture through a pinhole of the same matrix."""
     if not camera.bends:
-        return photo.srgb
-    size_px = photo.srgb.shape[1], photo.srgb.shape[0]
+        return srgb
+    size_px = srgb.shape[1], srgb.shape[0]
     index = matrix.copy()
     index[:2, 2] -= 0.5  # OpenCV counts from pixel centers
     terms = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
     maps = cv2.initUndistortRectifyMap(index, terms, None, index, size_px, cv2.CV_32FC1)
-    return cv2.remap(photo.srgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(srgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

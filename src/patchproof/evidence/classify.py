@@ -35,11 +35,23 @@ class Judges:
 
 
 def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None:
-    """The networks as the sheet's judges; None where it promises nothing. Refused without the promise's own."""
+    """The networks as the sheet's judges; None where it promises nothing. Refused without the promise's own network, or
+    with another under its name.
+    """
     if manifest.promise is None:
         return None
-    promise, primary = manifest.promise, _primary(models, manifest.promise)
-    return Judges(models, {m.name: target_indices(m, promise, manifest.settings) for m in models}, primary)
+    promised, named = manifest.promise.models[0], {model.name: model for model in models}
+    if promised.name not in named:
+        raise Refused(f"the promise's own network {promised.name}", ", ".join(named) or "none", f"add {promised.name}")
+    primary = named[promised.name]
+    if promised.sha256 not in (None, primary.sha256):
+        raise Refused(
+            f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)",
+            "another file under that name",
+            "use the same weights, or make the sheet again",
+        )
+    indices = {model.name: target_indices(model, manifest.promise, manifest.settings) for model in models}
+    return Judges(models, indices, primary)
 
 
 def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
@@ -71,21 +83,6 @@ def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, A
         return target.indices
     wanted = settings.get("target", {})
     return find_labels(model.labels, wanted.get("label", target.label), wanted.get("accept", ()))
-
-
-def _primary(models: Sequence[Classifier], promise: Promise) -> Classifier:
-    """The judge that the promise was made for; refused where it is not there, or another under its name."""
-    primary = promise.models[0]
-    named = {model.name: model for model in models}
-    if primary.name not in named:
-        raise Refused(f"the promise's own network {primary.name}", ", ".join(named) or "none", f"add {primary.name}")
-    if primary.sha256 is not None and named[primary.name].sha256 != primary.sha256:
-        raise Refused(
-            f"the network {primary.name} that the promise was made for (SHA-256 {primary.sha256[:12]}...)",
-            "another file under that name",
-            "use the same weights, or make the sheet again",
-        )
-    return named[primary.name]
 
 
 def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray) -> Prediction:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -31,10 +32,8 @@ class Journal:
 
     def __init__(self, path: Path, key: str, resume: bool):
         make_folder(path.parent)
-        self._key, self._kept = key, {}
-        for line in _lines(path) if resume else ():
-            if isinstance(line, dict) and line.get("key") == key and {"file", "sha256", "result"} <= line.keys():
-                self._kept[line["file"]] = line
+        lines = [line for line in _lines(path) if line["key"] == key] if resume else []
+        self._key, self._kept = key, {line["file"]: line for line in lines}
         text = "".join(json.dumps(line) + "\n" for line in self._kept.values())
         write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
         self._file: TextIO = open(path, "a", encoding="utf-8")
@@ -90,14 +89,11 @@ def _printer_sha256(printer: Printer) -> str:
     return digest.hexdigest()
 
 
-def _lines(path: Path) -> list[Any]:
-    """The lines that are JSON; none where there is no file."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return []
-    lines = []
-    for line in text.splitlines():
-        with suppress(ValueError):  # cut short by a kill
-            lines.append(json.loads(line))
-    return lines
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines that are whole, and of this layout; none where there is no file."""
+    with suppress(FileNotFoundError):
+        for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError):  # cut short by a kill
+                line = json.loads(text)
+                if isinstance(line, dict) and {"file", "sha256", "key", "result"} <= line.keys():
+                    yield line

@@ -32,12 +32,13 @@ from patchproof.claims import LEAST_CLUSTERS, resampled_means
 from patchproof.color import linear_from_srgb
 from patchproof.evidence.classify import Judges
 from patchproof.evidence.print_fit import fit_print
-from patchproof.evidence.reproject import Reference, Shot, design_fit, light_fit, squares_with
+from patchproof.evidence.reproject import Reference, Shot, Switches, design_fit, light_fit, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
-from patchproof.evidence.surface import Promised, Surface, piece_picture, reduced
+from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture
+from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest
 
-Values = Mapping[tuple[bool, ...], float]  # confidence by what is switched on
+Values = Mapping[Switches, float]  # confidence by what is switched on
 
 GAMUT, PRINT, LIGHT, BLUR, PHOTO = "gamut", "print", "light_and_camera", "blur_and_noise", "photo"
 PRINT_AND_LIGHT = "print_light_and_camera"
@@ -63,9 +64,8 @@ def ledger_of(
     """The ledger of photographs whose own target confidence is `confidence` by file; None where nothing can be said."""
     if not shots or manifest.promise is None or manifest.design is None:
         return None
-    claims = [
-        (c.contrast, c.blur_px) for c in manifest.promise.conditions if c.contrast is not None and c.blur_px is not None
-    ]
+    conditions = manifest.promise.conditions
+    claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]
     if not claims:
         return None
     undo = [light_fit(shot, promised) for shot in shots]
@@ -129,17 +129,14 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
     return names[top] if clear and names[top] != PHOTO else None
 
 
-def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[tuple[bool, bool], np.ndarray]:
-    """The piece's light by (gamut, print), or by (gamut, False) alone where the print is not known."""
-    design = reduced(linear_from_srgb(sent_srgb / 255.0))
+def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[Switches, np.ndarray]:
+    """The piece's light by (gamut, print), or by (gamut,) alone where the print is not known."""
+    design = reduced(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
     sent = piece_picture(surface, design, linear_from_srgb(surface.swatches_srgb), np.zeros(3))
-    looks = {
-        (False, False): sent,
-        (True, False): piece_picture(surface, promised.design, promised.swatches, promised.ink),
-    }
-    if printed is not None:
-        looks |= {(gamut, True): printed(look) for (gamut, _), look in list(looks.items())}
-    return looks
+    looks = {False: sent, True: piece_picture(surface, promised.design, promised.swatches, promised.ink)}
+    if printed is None:
+        return {(gamut,): look for gamut, look in looks.items()}
+    return {(gamut, on): printed(look) if on else look for on in (False, True) for gamut, look in looks.items()}
 
 
 def _references(
@@ -156,26 +153,22 @@ def _references(
     low, high = camera.get("noise", (0.0, 0.0))
     noise = low + (high - low) * np.random.default_rng(1).permutation(len(shots) * 2)[: len(shots)] / (2 * len(shots))
     references = []
-    for shot, i, level in zip(shots, spread[rank], noise, strict=True):
-        side = shot.square.shape[0]
-        scale = side / min(camera["photo_px"]) if "photo_px" in camera else shot.scale
-        contrast, blur_px = claims[i]
+    for shot, (contrast, blur_px), level in zip(shots, (claims[i] for i in spread[rank]), noise, strict=True):
+        scale = len(shot.square) / min(camera["photo_px"]) if "photo_px" in camera else shot.scale
         white = contrast / (1 - float(promised.ink.mean()))
         references.append(Reference(white, blur_px * scale, float(level) * scale))
     return references
 
 
-def _confidences(squares: Mapping[tuple[bool, ...], np.ndarray], judges: Judges) -> Values:
-    """Target confidence by combination; the switch for print is dropped where it was never on."""
+def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges) -> Values:
+    """Target confidence by combination."""
     import torch
 
     from patchproof.classifier import center_square
 
-    model, keys = judges.primary, list(squares)
+    model = judges.primary
     with torch.inference_mode():
-        pictures = [torch.from_numpy(squares[key].transpose(2, 0, 1))[None].float() for key in keys]
+        pictures = [torch.from_numpy(square.transpose(2, 0, 1))[None].float() for square in squares.values()]
         batch = torch.cat([center_square(picture, model.input_px) for picture in pictures])
-        confidence = model.confidence(model.logits(batch), judges.indices[model.name]).double().cpu().tolist()
-    if not any(key[1] for key in keys):
-        keys = [(gamut, light, blur) for gamut, _, light, blur in keys]
-    return dict(zip(keys, confidence, strict=True))
+        confidence = model.confidence(model.logits(batch), judges.indices[model.name]).cpu().tolist()
+    return dict(zip(squares, confidence, strict=True))

@@ -1,6 +1,6 @@
 """One photograph against the printed surface: where it was taken from, how sharp, how far its colors are off.
 
-In: a `Photo`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
+In: a `View`, the `Surface`, its `Promised` look, and what the promise covered. Out: a `PhotoEntry` and pictures for
 the report. Every figure that can be had is filled in even where a later step fails. A photograph is `rejected` only
 for reasons that do not depend on the view (plus: outside of the promised ranges); where the sheet is identified but
 geometry or color cannot be trusted it is `judged`: recognition still counts, since far and oblique views fail first
@@ -9,7 +9,7 @@ and leaving them out would flatter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -18,26 +18,26 @@ from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Pose, Remark, Scale
-from patchproof.evidence.scan import scan_scale
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import local_scale, plane_pose, view_angles
+from patchproof.geometry import MM_PER_INCH, apply_homography, local_scale, plane_pose, rect_corners, view_angles
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
-from patchproof.photo.read import Photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
 from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
 
-MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighbouring cells melt together
+MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighboring cells melt together
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
 MOST_TILT_DEG = 78.0  # foreshortened to a fifth
 MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
 MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
 MOST_SCALE_ERROR = 0.01
+_MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
+_SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
@@ -55,7 +55,7 @@ class MeasuredPhoto:
 
     entry: PhotoEntry
     counted: bool
-    pictures: dict[str, np.ndarray]
+    pictures: dict[str, np.ndarray] = field(default_factory=dict)
     light: FrameLight | None = None
     squares: dict[int, np.ndarray] | None = None
 
@@ -69,35 +69,34 @@ def measure(
     scan_dpi: float | None = None,
 ) -> MeasuredPhoto:
     """Everything that one readable photograph says; `promised` None leaves color unmeasured."""
-    photo = view.photo
     try:
-        found, surface = identify(photo.srgb, surface)
+        detected, surface = identify(view.srgb, surface)
     except CannotJudge as cannot:
-        return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(cannot)), False, {})
-    size_px = photo.srgb.shape[1], photo.srgb.shape[0]
-    entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(found.markers))
-    fit = _fit(found, surface)
+        return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(cannot)), False)
+    size_px = view.srgb.shape[1], view.srgb.shape[0]
+    entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
+    fit = _fit(detected, surface)
     if fit is None:
         advice = "the marker in view is distorted: show the whole patch"
-        few = CannotJudge("too_few_markers", len(found.markers), 1, advice)
-        return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True, {})
-    light = frame_light(photo.srgb, found.markers.values())
-    unrolled = _unrolled(photo, found, surface)
-    srgb, fit = (photo.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
-    geometry = _geometry(fit, unrolled, found, light, surface)
+        few = CannotJudge("too_few_markers", len(detected.markers), 1, advice)
+        return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True)
+    light = frame_light(view.srgb, detected.markers.values())
+    unrolled = _unrolled(view, detected, surface)
+    srgb, fit = (view.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
+    geometry = _geometry(fit, unrolled, detected, light, surface)
     pose = _pose(view, fit, unrolled is None, surface)
     entry = partial(entry, geometry=geometry, pose=pose)
-    page_check = _is_uncut(fit, found, surface)
-    scale = None if scan_dpi is None else scan_scale(fit.px_from_mm, surface, scan_dpi)
+    page_check = _is_uncut(fit, detected, surface)
+    scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
-    trouble = _trouble(geometry, fit, found, surface)
+    trouble = _trouble(geometry, fit, detected, surface)
     try:
         if page_check and surface.page_mm is not None:
-            refuse_other_page(photo.srgb, fit.px_from_mm, surface.page_mm, surface.label)
+            refuse_other_page(view.srgb, fit.px_from_mm, surface.page_mm, surface.label)
         if counted and (outside := ranges.violated(entry(status="judged"), trust_angles=trouble is None)) is not None:
             raise outside
     except CannotJudge as cannot:
-        return MeasuredPhoto(entry(status="rejected", remark=Remark.of(cannot)), False, {})
+        return MeasuredPhoto(entry(status="rejected", remark=Remark.of(cannot)), False)
     color, pictures = None, {}
     # a page in tiles shows none of the design's frame, or a part of it
     if trouble is None and promised is not None and surface.piece_ids:
@@ -119,40 +118,42 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface
     wanted = surface.piece_ids or surface.page_ids
     if surface.pages:
         pages = [frozenset(page.corners_mm) for page in surface.pages]
-        found = find_markers(srgb, wanted, surface.all_ids, surface.dictionary, pages)
+        detected = find_markers(srgb, wanted, surface.all_ids, surface.dictionary, pages)
     else:
-        found = find_sheet(srgb, wanted, surface.corners_mm, surface.dictionary)
-    if not found.markers:
+        detected = find_sheet(srgb, wanted, surface.corners_mm, surface.dictionary)
+    if not detected.markers:
         if is_mirrored(srgb, surface.all_ids, surface.dictionary):
             advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
             raise CannotJudge("mirrored", None, None, advice)
         label = read_label(srgb)
-        if found.foreign or (label is not None and label != surface.label):
+        if detected.foreign or (label is not None and label != surface.label):
             which = "another sheet" if label is None else f"sheet {label.sheet_id} ({label.printed})"
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
-            raise CannotJudge("wrong_sheet", len(found.foreign), 0, advice)
+            raise CannotJudge("wrong_sheet", len(detected.foreign), 0, advice)
         raise CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
-    if len(found.foreign) > 1 or len(found.doubled) > 1:
-        others = max(len(found.foreign), len(found.doubled))
+    if len(detected.foreign) > 1 or len(detected.doubled) > 1:
+        others = max(len(detected.foreign), len(detected.doubled))
         raise CannotJudge("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
     if not surface.pages:
-        return found, surface
-    surface = _page_in_view(found, surface)
-    ours = {i: borders for i, borders in found.markers.items() if i in surface.corners_mm}
-    found = MarkersInView(ours, found.foreign, found.doubled)
-    return complete(srgb, found, surface.corners_mm, surface.dictionary), surface
+        return detected, surface
+    surface = _page_in_view(detected, surface)
+    ours = {i: borders for i, borders in detected.markers.items() if i in surface.corners_mm}
+    detected = MarkersInView(ours, detected.foreign, detected.doubled)
+    return complete(srgb, detected, surface.corners_mm, surface.dictionary), surface
 
 
-def _page_in_view(found: MarkersInView, surface: Surface) -> Surface:
+def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
     """The page that most of the markers belong to which an assembled piece hides; the whole where there is none."""
-    hidden = [len(found.markers.keys() & page.corners_mm.keys() - surface.corners_mm.keys()) for page in surface.pages]
+    hidden = [
+        len(detected.markers.keys() & page.corners_mm.keys() - surface.corners_mm.keys()) for page in surface.pages
+    ]
     return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 
-def _fit(found: MarkersInView, surface: Surface) -> PageFit | None:
+def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
     """The homography of the piece, with the page's own markers where they lie in the same plane."""
-    sure = {i: b.corners_px for i, b in found.markers.items() if b.fitted}
-    corners = sure or found.corners_px
+    sure = {i: b.corners_px for i, b in detected.markers.items() if b.fitted}
+    corners = sure or detected.corners_px
     on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
     try:
         fit = fit_page(on_piece or corners, surface.corners_mm)
@@ -166,36 +167,35 @@ def _fit(found: MarkersInView, surface: Surface) -> PageFit | None:
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
 
 
-def _unrolled(photo: Photo, found: MarkersInView, surface: Surface) -> Unrolled | None:
+def _unrolled(view: View, detected: MarkersInView, surface: Surface) -> Unrolled | None:
     """The piece made flat where its markers do not lie in one plane and a cylinder or a lens says why."""
-    corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in surface.piece_ids}
+    corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
+    focal_px = None if view.matrix_px is None else float(view.matrix_px[0, 0])
     try:
-        return unroll(photo.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, photo.focal_px)
+        return unroll(view.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, focal_px)
     except (np.linalg.LinAlgError, ValueError):
         return None  # a shape that no camera sees is no explanation; the plane's residual decides
 
 
-def _is_uncut(fit: PageFit, found: MarkersInView, surface: Surface) -> bool:
+def _is_uncut(fit: PageFit, detected: MarkersInView, surface: Surface) -> bool:
     pages = set(fit.inlier_ids) & surface.page_ids
-    return bool(pages) or not (found.markers.keys() & surface.piece_ids)
+    return bool(pages) or not (detected.markers.keys() & surface.piece_ids)
 
 
 def _geometry(
-    fit: PageFit, unrolled: Unrolled | None, found: MarkersInView, light: FrameLight, surface: Surface
+    fit: PageFit, unrolled: Unrolled | None, detected: MarkersInView, light: FrameLight, surface: Surface
 ) -> Geometry:
     px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
-    shown = partial(
-        Geometry,
+    return Geometry(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
         tilt_deg=tilt_deg,
         contrast=light.contrast,
-        blur_px=blur_px(found.markers.values()),
-    )
-    if unrolled is not None:  # no homography maps the page to the photograph
-        return shown(corner_uncertainty_mm=unrolled.uncertainty_mm, curl_radius_mm=unrolled.radius_mm)
-    return shown(
-        corner_uncertainty_mm=corner_uncertainty_mm(fit, surface.rect_mm), homography_px_from_mm=fit.px_from_mm.tolist()
+        blur_px=blur_px(detected.markers.values()),
+        corner_uncertainty_mm=unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm),
+        curl_radius_mm=unrolled and unrolled.radius_mm,
+        # none maps a page that was unrolled to the photograph
+        homography_px_from_mm=None if unrolled else fit.px_from_mm.tolist(),
     )
 
 
@@ -217,13 +217,13 @@ def _pose(view: View, fit: PageFit, flat: bool, surface: Surface) -> Pose | None
     )
 
 
-def _trouble(geometry: Geometry, fit: PageFit, found: MarkersInView, surface: Surface) -> CannotJudge | None:
+def _trouble(geometry: Geometry, fit: PageFit, detected: MarkersInView, surface: Surface) -> CannotJudge | None:
     """Why geometry or color cannot be trusted, the nearest cause first; None where they can."""
     tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
-    most_blur = MOST_BLUR * float(np.median([b.module_px for b in found.markers.values()]))
+    most_blur = MOST_BLUR * float(np.median([b.module_px for b in detected.markers.values()]))
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
-    agreeing, markers = len(fit.inlier_ids), len(found.markers)
+    agreeing, markers = len(fit.inlier_ids), len(detected.markers)
     least = min(LEAST_MARKERS, len(surface.piece_ids) or 1)
     bent = residual > most_residual or agreeing < 0.5 * markers
     most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
@@ -239,6 +239,23 @@ def _trouble(geometry: Geometry, fit: PageFit, found: MarkersInView, surface: Su
     ):
         if wrong:
             return CannotJudge(code, figure, limit, advice)
+    return None
+
+
+def _scan_scale(px_from_mm: np.ndarray, surface: Surface, scan_dpi: float) -> Scale | None:
+    """The print's scale through the middle of the design, by the DPI that the user states (never the file's own claim);
+    None where the picture is no scan: it has perspective or another resolution. Stretched prints are scans, too.
+    """
+    corners = apply_homography(px_from_mm, rect_corners(surface.rect_mm))
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    perspective = max(abs(sides[0] / sides[2] - 1), abs(sides[1] / sides[3] - 1))
+    x, y, w, h = surface.rect_mm
+    ends = np.array([[x, y + h / 2], [x + w, y + h / 2], [x + w / 2, y], [x + w / 2, y + h]])
+    left, right, top, bottom = apply_homography(px_from_mm, ends)
+    px_per_mm = scan_dpi / MM_PER_INCH
+    scale_x, scale_y = (float(np.linalg.norm(px) / mm / px_per_mm) for px, mm in ((right - left, w), (bottom - top, h)))
+    if perspective < _MOST_PERSPECTIVE and all(_SIZES[0] < scale < _SIZES[1] for scale in (scale_x, scale_y)):
+        return Scale(scale_x=scale_x, scale_y=scale_y)
     return None
 
 

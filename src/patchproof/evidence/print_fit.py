@@ -21,11 +21,12 @@ _SMOOTHING = 1e-3  # keeps reading errors of half a code value from bending the 
 
 
 def fit_print(
-    relative: Sequence[np.ndarray], promised: np.ndarray, seen_ink: np.ndarray, ink: np.ndarray
+    relative: Sequence[np.ndarray], promised: np.ndarray, ink_in_photos: np.ndarray, ink: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray] | None:
     """Linear light `... × 3` as printed from linear light as promised; `relative` N×3 per photo, NaN where unread.
 
-    Paper keeps its light: that it does is how light is told from print. The markers' `ink` became `seen_ink`.
+    Paper keeps its light: that it does is how light is told from print. The markers' `ink` became
+    `ink_in_photos`.
     """
     from scipy.interpolate import RBFInterpolator
 
@@ -38,14 +39,14 @@ def fit_print(
     if readable.sum() < LEAST_SWATCHES:
         return None
     sent = srgb_from_linear(np.stack([*promised[readable], np.ones(3), ink]))
-    seen = srgb_from_linear(np.clip(np.stack([*pooled[readable], np.ones(3), seen_ink]), 0, 1))
+    printed = srgb_from_linear(np.clip(np.stack([*pooled[readable], np.ones(3), ink_in_photos]), 0, 1))
     try:
-        difference = RBFInterpolator(sent, seen - sent, kernel="thin_plate_spline", degree=1, smoothing=_SMOOTHING)
+        difference = RBFInterpolator(sent, printed - sent, kernel="thin_plate_spline", degree=1, smoothing=_SMOOTHING)
     except np.linalg.LinAlgError:  # swatches in one plane of the color cube
         return None
 
-    def printed(linear: np.ndarray) -> np.ndarray:
+    def as_printed(linear: np.ndarray) -> np.ndarray:
         colors = srgb_from_linear(np.clip(linear, 0, 1)).reshape(-1, 3)
         return linear_from_srgb(np.clip(colors + difference(colors), 0, 1)).reshape(linear.shape).astype(np.float32)
 
-    return printed
+    return as_printed

@@ -58,11 +58,8 @@ class PromisedRanges:
 
 def promised_side_px(manifest: Manifest) -> float | None:
     """Pixels of the shorter side of the photographs that were promised; None where the settings do not say."""
-    camera = manifest.settings.get("camera")
-    sides = camera.get("photo_px") if isinstance(camera, dict) else None
-    if not isinstance(sides, list | tuple) or not sides:
-        return None
-    return float(min(sides)) if all(isinstance(v, int | float) and v >= 1 for v in sides) else None
+    sides = manifest.settings.get("camera", {}).get("photo_px")
+    return float(min(sides)) if sides else None
 
 
 def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None = None) -> PromisedRanges:
@@ -73,12 +70,11 @@ def promised_ranges(conditions: Sequence[ConditionClaim], side_px: float | None 
         if not values:
             continue
         low, high = min(values), max(values)
-        margin = MARGIN * (high - low)
+        least = [_LEAST_ANGLE_MARGIN_DEG] * 2
         if name == "px_per_mm":
-            limits[name] = low - max(margin, _LEAST_SCALE_MARGIN * low), high + max(margin, _LEAST_SCALE_MARGIN * high)
-        else:
-            margin = max(margin, _LEAST_ANGLE_MARGIN_DEG)
-            limits[name] = low - margin, high + margin
+            least = [_LEAST_SCALE_MARGIN * low, _LEAST_SCALE_MARGIN * high]
+        below, above = (max(MARGIN * (high - low), margin) for margin in least)
+        limits[name] = low - below, high + above
     return PromisedRanges(limits, side_px)
 
 
@@ -103,15 +99,16 @@ def _figures(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
 
 
 def _rate_near(figures: Mapping[str, float], conditions: Sequence[ConditionClaim]) -> float | None:
-    names = list(figures)
-    full = [c for c in conditions if all(getattr(c, n) is not None for n in names)]
-    if len(full) < len(conditions) / 2:  # the promise does not have all of the photo's figures: use those it has
-        names = [n for n in names if sum(getattr(c, n) is not None for c in conditions) > len(conditions) / 2]
-        full = [c for c in conditions if all(getattr(c, n) is not None for n in names)]
-    if not names or not full:
+    if not figures or not conditions:
         return None
-    table = np.array([[getattr(c, n) for n in names] for c in full])
-    spread = np.maximum(table.std(0), 1e-9)
-    distance = np.linalg.norm((table - [figures[n] for n in names]) / spread, axis=1)
-    nearest = np.argsort(distance, kind="stable")[:_NEAREST]
-    return float(np.mean([full[i].recognized for i in nearest]))
+    point, recognized = np.array(list(figures.values())), np.array([c.recognized for c in conditions])
+    table = np.array([[getattr(c, name) for name in figures] for c in conditions], float)
+    known = np.isfinite(table)
+    if 2 * known.all(1).sum() < len(table):  # the promise does not have all of the photo's figures: use those it has
+        often = 2 * known.sum(0) > len(table)
+        table, point, known = table[:, often], point[often], known[:, often]
+    full = known.all(1)
+    if not point.size or not full.any():
+        return None
+    distance = np.linalg.norm((table[full] - point) / np.maximum(table[full].std(0), 1e-9), axis=1)
+    return float(np.mean(recognized[full][np.argsort(distance, kind="stable")[:_NEAREST]]))

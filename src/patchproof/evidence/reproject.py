@@ -17,18 +17,19 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from patchproof.color import LUMINANCE, srgb_from_linear
-from patchproof.evidence.appearance import LINEAR, part_around, piece_only, seen_swatches
+from patchproof.evidence.appearance import piece_only, seen_swatches
 from patchproof.evidence.classify import square_of
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
-from patchproof.photo.colorfit import ColorFit, affine12, white_black
+from patchproof.photo.colorfit import ColorFit, affine12, inverse, white_black
+from patchproof.photo.detect import LIGHT
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
-from patchproof.photo.rectify import rectify
+from patchproof.photo.rectify import part_around, rectify
 
+Switches = tuple[bool, ...]  # which effects are on
 FINER = 3  # times the network's input size
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
 _CELLS = 16  # of the design, along its shorter side, where its own colors stand in for swatches
@@ -69,7 +70,7 @@ class Reference:
 def shot_of(
     file: str,
     srgb: np.ndarray,
-    px_from_mm: ArrayLike,
+    px_from_mm: np.ndarray,
     blur_px: float,
     light: FrameLight,
     surface: Surface,
@@ -84,18 +85,17 @@ def shot_of(
     scale = work / len(square)
     if scale < 1:
         square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
-    homography = np.asarray(px_from_mm)
     to_square = np.array([[scale, 0, -left * scale], [0, scale, -top * scale], [0, 0, 1.0]])
-    part, part_from_mm = piece_only(srgb, homography, surface)
+    part, part_from_mm = piece_only(srgb, px_from_mm, surface)
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
-    unmixed = pattern_light(srgb, homography, on_piece, surface.dictionary, blur_px)
+    unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px)
     if unmixed is not None:
         if unmixed.agreement < _LEAST_AGREEMENT:
             return None
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
-    swatches = seen_swatches(part, LINEAR[part], part_from_mm, surface, blur_px, light.paper)
+    swatches = seen_swatches(part, LIGHT[part], part_from_mm, surface, blur_px, light.paper)
     square = np.ascontiguousarray(square)
-    return Shot(file, square, to_square @ homography, light, blur_px * scale, noise_of(square), swatches, scale)
+    return Shot(file, square, to_square @ px_from_mm, light, blur_px * scale, noise_of(square), swatches, scale)
 
 
 def noise_of(srgb: np.ndarray) -> float:
@@ -104,7 +104,7 @@ def noise_of(srgb: np.ndarray) -> float:
     Immerkaer, Fast Noise Variance Estimation, CVIU 64 (1996) 300-302, with a low quantile in place of the mean: a
     fifth of most photographs is smooth, and texture would count as noise.
     """
-    luminance = (LINEAR[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
+    luminance = (LIGHT[srgb] @ np.array(LUMINANCE, np.float32)).astype(np.float32)
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # of white noise, it makes 6 times as much
     detail = np.abs(cv2.filter2D(luminance, -1, mask)[1:-1, 1:-1])
     return float(np.quantile(detail, 0.2) / 0.2533 / 6)
@@ -118,7 +118,7 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
     """
     paper, ink = shot.light.paper, shot.light.ink
     # means, since noise that is cut off at zero lifts dark ink as it lifts them
-    darkest = np.quantile(cv2.blur(LINEAR[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
+    darkest = np.quantile(cv2.blur(LIGHT[shot.square], (_PATCH, _PATCH)).reshape(-1, 3), _DARKEST, axis=0)
     veil = np.clip((ink - paper * promised.ink) / (1 - promised.ink), 0, darkest)
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
@@ -126,40 +126,40 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
 def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:
     """Print, light and camera together, from the design's own coarse colors; paper and ink where these do not do."""
     cells_per_mm = _CELLS / min(surface.rect_mm[2:])
-    seen = rectify(LINEAR[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
-    expected = cv2.resize(promised.design, seen.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
+    cells = rectify(LIGHT[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
+    expected = cv2.resize(promised.design, cells.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
     # the rim has the white of the frame in it, which is put back, too
     frame = [shot.light.paper, shot.light.ink], [np.ones(3), promised.ink]
-    pairs = zip((seen, expected), frame, strict=True)
-    return affine12(*(np.concatenate([c[1:-1, 1:-1].reshape(-1, 3), *[f] * _CELLS]) for c, f in pairs)) or light_fit(
-        shot, promised
-    )
+    pairs = zip((cells, expected), frame, strict=True)
+    fit = affine12(*(np.concatenate([c[1:-1, 1:-1].reshape(-1, 3), *[f] * _CELLS]) for c, f in pairs))
+    return fit or light_fit(shot, promised)
 
 
 def squares_with(
     shot: Shot,
-    looks: Mapping[tuple[bool, bool], np.ndarray],
+    looks: Mapping[Switches, np.ndarray],
     rect_mm: tuple[float, float, float, float],
     undo: ColorFit,
     print_light: ColorFit,
     reference: Reference,
-) -> dict[tuple[bool, bool, bool, bool], np.ndarray]:
-    """Float32 sRGB squares W×W×3 by (gamut, print, light, blur).
+) -> dict[Switches, np.ndarray]:
+    """Float32 sRGB squares W×W×3 by the switches of a look, light and blur.
 
-    `looks` are the media-relative linear light of the piece at `rect_mm` by (gamut, print). `undo` takes photographed
-    light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
+    `looks` are the media-relative linear light of the piece at `rect_mm` by switches of their own. `undo` takes
+    photographed light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
     """
-    box = _box(shot, rect_mm)
-    seen = LINEAR[shot.square]
+    corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
+    box = part_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)  # and what blur carries over
+    photo = LIGHT[shot.square]
     around = {}
-    for blur, picture in ((True, seen), (False, deblurred(seen, shot.blur_px, reference.blur_px, shot.noise))):
+    for blur, picture in ((True, photo), (False, deblurred(photo, shot.blur_px, reference.blur_px, shot.noise))):
         around[True, blur] = picture
         around[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
     coded = {key: srgb_from_linear(picture) for key, picture in around.items()}
-    grain = np.random.default_rng(0).standard_normal(seen[box].shape, np.float32)
-    lit = {True: _inverse(print_light), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
+    grain = np.random.default_rng(0).standard_normal(photo[box].shape, np.float32)
+    lit = {True: inverse(print_light.matrix), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
     out = {}
-    for (gamut, printed), look in looks.items():
+    for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
         for blur, sigma in ((True, shot.blur_px), (False, reference.blur_px)):
             layer = _blurred(sharp, sigma)
@@ -173,7 +173,7 @@ def squares_with(
                 mixed = mixed + share * noise * grain
                 picture = coded[light, blur].copy()
                 picture[box] = srgb_from_linear(np.clip(mixed, 0, 1))
-                out[gamut, printed, light, blur] = picture
+                out[(*switches, light, blur)] = picture
     return out
 
 
@@ -197,24 +197,18 @@ def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) ->
     return np.clip(back[margin:-margin, margin:-margin], 0, 1).astype(np.float32)
 
 
-def _box(shot: Shot, rect_mm) -> tuple[slice, slice]:
-    """The part of the square that holds the piece and what blur carries beyond it."""
-    quad = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
-    return part_around(quad, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape[:2])
-
-
 def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, slice]) -> np.ndarray:
     """H×W×4: the look's light times its share of each pixel, and the share."""
     x, y, w, h = rect_mm
-    top, left = box[0].start, box[1].start
+    finer, top, left = _SUPERSAMPLE, box[0].start, box[1].start
     height, width = box[0].stop - top, box[1].stop - left
     look = _no_finer_than(look, px_from_mm, rect_mm)
     mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
-    to_fine = np.array([[_SUPERSAMPLE, 0, -_SUPERSAMPLE * left], [0, _SUPERSAMPLE, -_SUPERSAMPLE * top], [0, 0, 1]])
+    to_fine = np.array([[finer, 0, -finer * left], [0, finer, -finer * top], [0, 0, 1]])
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centers
     matrix = np.linalg.inv(half) @ to_fine @ px_from_mm @ mm_from_texel @ half
     # one texel of margin repeats the rim, so that interpolation does not darken it; the share cuts it off again
-    size = (width * _SUPERSAMPLE, height * _SUPERSAMPLE)
+    size = (width * finer, height * finer)
     color = cv2.warpPerspective(look, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = cv2.warpPerspective(np.ones(look.shape[:2], np.float32), matrix, size, flags=cv2.INTER_LINEAR)
     share = (inside > 0.5).astype(np.float32)[..., None]
@@ -235,9 +229,3 @@ def _blurred(layer: np.ndarray, sigma_px: float) -> np.ndarray:
     if sigma_px < _NOT_BLURRED_PX:
         return layer
     return cv2.GaussianBlur(layer, (0, 0), float(sigma_px), borderType=cv2.BORDER_REPLICATE)
-
-
-def _inverse(fit: ColorFit) -> np.ndarray:
-    """3×4 from media-relative light to photographed light."""
-    back = np.linalg.inv(fit.matrix[:, :3])
-    return np.column_stack([back, -back @ fit.matrix[:, 3]])

@@ -1,4 +1,4 @@
-"""report.json, as types: what was found in each photograph and what all of them say together.
+"""report.json, as types: what was measured in each photograph and what all of them say together.
 
 Lengths in mm and px as named, angles in degrees, rates in [0, 1]; null is "not measured". `measured` implies judged,
 except in page checks.
@@ -92,13 +92,7 @@ class Remark(Strict):
         return cls(code=cannot.code, figure=cannot.figure, threshold=cannot.threshold, advice=cannot.advice)
 
 
-_PARTS: dict[str, type[Strict]] = {
-    "geometry": Geometry,
-    "pose": Pose,
-    "scale": Scale,
-    "color": Color,
-    "remark": Remark,
-}
+_PARTS = {"geometry": Geometry, "pose": Pose, "scale": Scale, "color": Color, "remark": Remark}
 # one photograph in report.json, in this order
 KEYS = """
     file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
@@ -197,7 +191,9 @@ class Summary(Strict):
 
 @dataclass(frozen=True)
 class Control:
-    """Photographs of one control and how the patch compares; null where there was nothing to compare."""
+    """Photographs of one control and how the patch compares, null where there was nothing to compare; `difference` is
+    patch minus control, `pairs` 0 where photographs are not paired.
+    """
 
     name: str
     recognized: int
@@ -219,18 +215,11 @@ class Origin(Strict):
 
 
 class Report(Strict):
-    """A whole report.json."""
+    """A whole report.json; beside it the ledger, for its chart."""
 
     sheet_id: str
     photos: tuple[PhotoEntry, ...]
     summary: Summary
     controls: tuple[Control, ...] = ()
     origin: Origin = Origin()
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """A report, and the ledger with what its chart needs besides the shares."""
-
-    report: Report
-    ledger: Ledger | None = None
+    ledger: Ledger | None = Field(None, exclude=True)

@@ -1,9 +1,9 @@
 """A folder of photographs against a manifest: every photograph listed, one bad file never stops the batch.
 
-In: photographs, a manifest, networks, and where there are any photographs of controls. Out: `Evidence`: the report
-and what its page shows besides. Photographs are taken in the order of their names; sidecar files and anything that is
-no picture by its suffix are never opened. Each is measured on its own (over processes when `jobs` > 1), classified at
-once and let go, so that memory does not grow with their number; with a journal, what is finished survives a kill.
+In: photographs, a manifest, networks, and where there are any photographs of controls. Out: a `Report`. Photographs
+are taken in the order of their names; sidecar files and anything that is no picture by its suffix are never opened.
+Each is measured on its own (over processes when `jobs` > 1), classified at once and let go, so that memory does not
+grow with their number; with a journal, what is finished survives a kill.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.claims import wilson
-from patchproof.evidence.batch import WITH_PICTURES, Item, KeptPhoto, measure_all, shot_again
+from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
-from patchproof.evidence.ranges import matched_rate, promised_side_px
-from patchproof.evidence.results import Control, Effect, Evidence, Ledger, ModelRate, PhotoEntry, Report, Scale, Summary
+from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.ranges import matched_rate
+from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, Summary
 from patchproof.evidence.task import Options, task_of
-from patchproof.evidence.verdict import Comparison, Verdict, compare, effect_of, judge
+from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
 from patchproof.photo.read import list_photos, pictures_in
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
@@ -41,7 +42,7 @@ def gather_evidence(
     resume: bool = False,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Evidence:
+) -> Report:
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
 
     Photographs are measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is
@@ -57,21 +58,21 @@ def gather_evidence(
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with kept as open_journal, open_workers(jobs, cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
-        shots, most = [], min(len(paths), options.ledger_photos)
+        own, ledger = results[: len(paths)], None
         if judges and task.promised:
+            most, name = min(len(paths), options.ledger_photos), judges.primary.name
             chosen = [number * len(paths) // most for number in range(most)]  # evenly spread
             again = partial(shot_again, task, judges.primary.input_px)
             shots = workers.map(again, [(paths[number], results[number]) for number in chosen])
-    shots, own = [shot for shot in shots if shot is not None], results[: len(paths)]
-    ledger, controls = None, {}
-    if judges and task.promised:
-        name = judges.primary.name
-        confidence = {k.entry.file: k.entry.predictions[name].target_confidence for k in own if k.entry.predictions}
-        ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
+            shots = [shot for shot in shots if shot is not None]
+            judged = (photo.entry for photo in own if photo.entry.predictions)
+            confidence = {entry.file: entry.predictions[name].target_confidence for entry in judged}
+            ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
+    controls: dict[str, list[PhotoEntry]] = {}
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
             controls.setdefault(item.control, []).append(result.entry)
-    return Evidence(_report(manifest, judges, own, controls, ledger, options.ruler_mm), ledger)
+    return _report(manifest, judges, own, controls, ledger, options.ruler_mm, task.ranges.side_px)
 
 
 def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
@@ -93,16 +94,16 @@ def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
 def _report(
     manifest: Manifest,
     judges: Judges | None,
-    photos: Sequence[KeptPhoto],
+    photos: Sequence[MeasuredPhoto],
     controls: Mapping[str, Sequence[PhotoEntry]],
     ledger: Ledger | None,
     ruler_mm: tuple[float, float] | None,
+    side_px: float | None,
 ) -> Report:
     """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
-    effect: Effect = "not_tested"
-    compared, rates, rate = (), {}, _rate({})
+    compared, rates, rate = [], {}, _rate({})
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
@@ -111,11 +112,8 @@ def _report(
         goal = promise.target.goal
         verdict = judge(sum(recognized.values()), len(recognized), promise.rate, promise.n, goal, without)
         measured = (entry for entry in counted if entry.status == "measured")
-        matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
-        answers = {name: _recognized(shown, primary) for name, shown in controls.items()}
-        comparisons = {name: compare(recognized, answer, goal) for name, answer in answers.items()}
-        effect = effect_of(list(comparisons.values()))
-        compared = tuple(_control(name, answers[name], comparison) for name, comparison in comparisons.items())
+        matched = matched_rate(measured, promise.conditions, side_px)
+        compared = [compare(recognized, name, _recognized(shown, primary), goal) for name, shown in controls.items()]
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
@@ -124,7 +122,7 @@ def _report(
         interval=rate.interval,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
-        effect=effect,
+        effect=effect_of(compared),
         matched_rate=matched,
         ledger=ledger and ledger.shares,
         culprit=ledger and ledger.culprit,
@@ -135,7 +133,8 @@ def _report(
         x, y = (measured / nominal for measured, nominal in zip(ruler_mm, manifest.ruler_mm, strict=True))
         scale = Scale(scale_x=x, scale_y=y)
         entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
-    return Report(sheet_id=manifest.sheet_id, photos=tuple(entries), summary=summary, controls=compared)
+    sheet_id = manifest.sheet_id
+    return Report(sheet_id=sheet_id, photos=tuple(entries), summary=summary, controls=tuple(compared), ledger=ledger)
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:
@@ -146,8 +145,3 @@ def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:
 def _rate(recognized: Mapping[str, bool]) -> ModelRate:
     k, n = sum(recognized.values()), len(recognized)
     return ModelRate(rate=k / n, interval=wilson(k, n)) if n else ModelRate(rate=None, interval=None)
-
-
-def _control(name: str, recognized: Mapping[str, bool], comparison: Comparison | None) -> Control:
-    k, n = sum(recognized.values()), len(recognized)
-    return Control(name, k, n, wilson(k, n), **(vars(comparison) if comparison else {}))

@@ -17,12 +17,13 @@ from patchproof.color import linear_from_srgb
 from patchproof.geometry import rect_corners
 from patchproof.photo.detect import cells_of
 from patchproof.photo.label import Label, label_of
+from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest, Rect
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
 
-_LARGEST_PX = 512  # of the design as it is compared; photographs never resolve more
+DESIGN_PX = 512  # of the design as it is compared; photographs never resolve more
 _LARGEST_PIECE_PX = 1024  # of the piece as it is put back
 
 
@@ -124,7 +125,8 @@ def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promi
     if manifest.design is None:
         return None
     swatches = printed(np.concatenate([surface.swatches_srgb, [[0.0, 0.0, 0.0]]])[None])[0]
-    return Promised(reduced(printed(manifest.design.pixels() / 255.0)), swatches[:-1], swatches[-1])
+    design = printed(manifest.design.pixels() / 255.0).astype(np.float32)
+    return Promised(reduced(design, DESIGN_PX), swatches[:-1], swatches[-1])
 
 
 def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, ink: np.ndarray) -> np.ndarray:
@@ -144,24 +146,13 @@ def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, in
             picture[y0:y1, x0:x1] = cv2.resize(pixels.astype(np.float32), size, interpolation=how)
 
     ids = sorted(surface.piece_ids)
-    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, surface.dictionary))
-    for i, cells in zip(ids, cells_of(printed, ids) if ids else (), strict=True):
+    for i, cells in zip(ids, cells_of(surface.dictionary, ids), strict=True):
         low, high = surface.corners_mm[i].min(0), surface.corners_mm[i].max(0)
         paste((*low, *(high - low)), ink + cells[..., None] * (1 - ink), cv2.INTER_NEAREST)
     for rect, color in zip(surface.swatch_rects_mm, swatches, strict=True):
         paste(rect, color[None, None], cv2.INTER_NEAREST)
     paste(surface.rect_mm, design, cv2.INTER_AREA)
     return picture
-
-
-def reduced(linear: np.ndarray) -> np.ndarray:
-    """A design's light H×W×3 at the size at which it is compared, float32."""
-    linear = linear.astype(np.float32)
-    shrink = _LARGEST_PX / max(linear.shape[:2])
-    if shrink >= 1:
-        return linear
-    size = max(1, round(linear.shape[1] * shrink)), max(1, round(linear.shape[0] * shrink))
-    return cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
 
 
 def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:

@@ -13,10 +13,17 @@ mirrored for `deceive`, where a rate too high breaks the promise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from patchproof.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, prediction_interval
-from patchproof.evidence.results import Effect, Word
+from patchproof.claims import (
+    CONFIDENCE,
+    independent_difference,
+    mcnemar_p,
+    paired_difference,
+    prediction_interval,
+    wilson,
+)
+from patchproof.evidence.results import Control, Effect, Word
 from patchproof.goal import Goal
 
 LEAST_JUDGED = 5
@@ -56,36 +63,30 @@ def judge(
     return Verdict("cannot_tell", (low, high), f"{counts}, which is too wide to tell: take more photographs.")
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Patch against one control; `difference` is patch minus control, `pairs` 0 where photographs are not paired."""
-
-    difference: float
-    difference_interval: tuple[float, float]
-    pairs: int
-    p_value: float | None
-    shown: bool
-
-
-def compare(patch: Mapping[str, bool], control: Mapping[str, bool], goal: Goal) -> Comparison | None:
-    """Whether the patch changes recognition in the goal's direction; results by file name, equal names are pairs."""
+def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:
+    """Whether the patch changes recognition in the goal's direction; answers by file name, equal names are pairs."""
+    counts = sum(control.values()), len(control)
+    beside = Control(name, *counts, wilson(*counts))
     if not patch or not control:
-        return None
+        return beside
     names = sorted(patch.keys() & control.keys())
     if len(names) >= LEAST_PAIRS:
         a, b = [patch[name] for name in names], [control[name] for name in names]
         difference, interval = paired_difference(a, b)
         p_value = mcnemar_p(a, b)
         shown = p_value < 1 - CONFIDENCE and goal.sign * difference > 0
-        return Comparison(difference, interval, len(names), p_value, shown)
-    difference, interval = independent_difference(sum(patch.values()), len(patch), sum(control.values()), len(control))
-    shown = min(goal.sign * end for end in interval) > 0
-    return Comparison(difference, interval, 0, None, shown)
+        pairs = len(names)
+    else:
+        difference, interval = independent_difference(sum(patch.values()), len(patch), *counts)
+        shown, p_value, pairs = min(goal.sign * end for end in interval) > 0, None, 0
+    return replace(
+        beside, pairs=pairs, difference=difference, difference_interval=interval, p_value=p_value, shown=shown
+    )
 
 
-def effect_of(comparisons: Sequence[Comparison | None]) -> Effect:
+def effect_of(controls: Sequence[Control]) -> Effect:
     """`shown` only where every control was beaten; controls without a judged photograph are not tests."""
-    tested = [c for c in comparisons if c is not None]
-    if not tested:
+    answers = [control.shown for control in controls if control.shown is not None]
+    if not answers:
         return "not_tested"
-    return "shown" if all(c.shown for c in tested) else "not_shown"
+    return "shown" if all(answers) else "not_shown"

@@ -26,8 +26,7 @@ import torch
 from pydantic import BeforeValidator
 from torch import Tensor
 
-from patchproof.classifier.network import Classifier
-from patchproof.classifier.view import center_square
+from patchproof.classifier.network import Classifier, center_square
 from patchproof.harden.attacks import Loss, cross_entropy, even_loss
 
 Method = Literal["pgd", "fgsm", "adam"]

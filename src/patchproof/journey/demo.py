@@ -92,13 +92,10 @@ def run_demo(
             folder / "report",
             on_photo=lambda done, total: on_stage("verify", done, total),
         )
-    lines = [
+    return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
         *promise_lines(run.promise),
         *verdict_lines(report),
-    ]
-    return [
-        *lines,
         *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
     ]
 

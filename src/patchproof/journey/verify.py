@@ -7,10 +7,7 @@ the judge, its networks and the page. The promise's primary network always judge
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.channel.lens import load_camera
@@ -18,11 +15,13 @@ from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
+from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.output import check_folder
 from patchproof.report.images import save_pictures
+from patchproof.report.results import versions_of
 from patchproof.report.write import write_report
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.strict import Refused
@@ -67,7 +66,7 @@ def verify_photos(
         controls=controls,
         ledger_photos=ledger_photos,
     )
-    evidence = gather_evidence(
+    report = gather_evidence(
         photos,
         manifest,
         options,
@@ -78,13 +77,18 @@ def verify_photos(
         on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
         progress=on_photo,
     )
-    given = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "camera": camera and Path(camera).name}
-    hashes = {"manifest": hashlib.sha256(Path(sheet).read_bytes()).hexdigest()}
-    hashes |= {f"network {network.name}": network.sha256 for network in networks}
-    origin = Origin(options=given | {"ledger_photos": ledger_photos}, sha256=hashes, versions=_versions())
-    report = evidence.report.changed(origin=origin)
+    given = {
+        "scan_dpi": scan_dpi,
+        "ruler_mm": ruler_mm,
+        "camera": camera and Path(camera).name,
+        "ledger_photos": ledger_photos,
+    }
+    hashes = {"manifest": file_sha256(Path(sheet))} | {
+        f"network {network.name}": network.sha256 for network in networks
+    }
+    report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
     _drop_pictures(out / "pictures", {photo.file for photo in report.photos[:WITH_PICTURES]})
-    ledger = evidence.ledger and evidence.ledger.model_dump()
+    ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
     return report
 
@@ -105,14 +109,6 @@ def _drop_pictures(folder: Path, files: set[str]) -> None:
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.name.rsplit(".", 2)[0] not in files:
             path.unlink()
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in _LIBRARIES:
-        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
-            versions[name] = version(name)
-    return versions
 
 
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:

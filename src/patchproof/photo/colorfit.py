@@ -27,25 +27,25 @@ class ColorFit:
         return linear @ self.matrix[:, :3].T + self.matrix[:, 3]
 
 
-def affine12(seen: np.ndarray, promised: np.ndarray) -> ColorFit | None:
+def affine12(photographed: np.ndarray, promised: np.ndarray) -> ColorFit | None:
     """Robust affine map of N×3 swatches; None where they are too few or too much alike to hold it.
 
-    Fitted from promised to seen and turned round: the promise is exact, and a glare on one swatch is then an outlier
-    of the answer and not of the question, where it would pull the map towards itself.
+    Fitted from promised to photographed and turned round: the promise is exact, and a glare on one swatch is then an
+    outlier of the answer and not of the question, where it would pull the map towards itself.
     """
-    if len(seen) < LEAST_SWATCHES:
+    if len(photographed) < LEAST_SWATCHES:
         return None
     rows = np.column_stack([promised, np.ones(len(promised))])
     singular = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-12), compute_uv=False)
     if singular[-1] < 0.02 * singular[0]:
         return None
     # errors count as the eye sees them: steps of code values are finer in the dark
-    eye = 1 / (np.maximum(seen.mean(1), 0) + 0.05) ** 0.6
-    weight, seen_from_promised = np.ones(len(seen)), np.zeros((3, 4))
+    eye = 1 / (np.maximum(photographed.mean(1), 0) + 0.05) ** 0.6
+    weight, seen_from_promised = np.ones(len(photographed)), np.zeros((3, 4))
     for turn in range(30):
         w = (eye * np.sqrt(weight))[:, None]
-        seen_from_promised = np.linalg.lstsq(rows * w, seen * w, rcond=None)[0].T
-        error = eye * np.linalg.norm(rows @ seen_from_promised.T - seen, axis=1)
+        seen_from_promised = np.linalg.lstsq(rows * w, photographed * w, rcond=None)[0].T
+        error = eye * np.linalg.norm(rows @ seen_from_promised.T - photographed, axis=1)
         spread = max(1.4826 * float(np.median(error)), 1e-6)
         if turn < 10:
             weight = np.minimum(1, 1.345 * spread / np.maximum(error, 1e-12))  # Huber finds the basin,
@@ -53,11 +53,15 @@ def affine12(seen: np.ndarray, promised: np.ndarray) -> ColorFit | None:
             weight = np.maximum(1 - (error / (4.685 * spread)) ** 2, 0) ** 2  # Tukey lets the outliers go
         if (weight > 0).sum() < LEAST_SWATCHES - 2:
             return None
-    gains, veil = seen_from_promised[:, :3], seen_from_promised[:, 3]
-    if np.linalg.cond(gains) > 50:  # no camera mixes its channels so far
+    if np.linalg.cond(seen_from_promised[:, :3]) > 50:  # no camera mixes its channels so far
         return None
-    back = np.linalg.inv(gains)
-    return ColorFit("affine12", np.column_stack([back, -back @ veil]))
+    return ColorFit("affine12", inverse(seen_from_promised))
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """The 3×4 affine map that undoes another."""
+    back = np.linalg.inv(matrix[:, :3])
+    return np.column_stack([back, -back @ matrix[:, 3]])
 
 
 def white_black(paper: np.ndarray, ink: np.ndarray, promised_ink: np.ndarray) -> ColorFit:

@@ -32,7 +32,7 @@ from patchproof.photo.detect import (
     whole,
 )
 from patchproof.photo.edges import Borders, sample
-from patchproof.photo.rectify import fit_page
+from patchproof.photo.rectify import fit_page, part_around
 
 # of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
 LEAST_CORRELATION = 0.7
@@ -58,7 +58,7 @@ def find_sheet(
         before = set(detections)
         look(srgb, box, level, printed, detections)
         if detections.keys() != before:
-            view = complete(srgb, fitted(srgb, detections, set(corners_mm), printed), corners_mm, dictionary)
+            view = complete(srgb, fitted(srgb, detections, set(corners_mm), dictionary), corners_mm, dictionary)
         wanted = expected - view.markers.keys()
         if wanted and view.markers:
             wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
@@ -69,43 +69,37 @@ def find_sheet(
 
 def _still_wanted(srgb, wanted: Set[int], view: MarkersInView, corners_mm, scale: float) -> tuple[Set[int], Box]:
     """Which of the missing markers a finer level could still show, and the part of the picture to look at for them."""
-    if sum(b.fitted for b in view.markers.values()) < 2:  # one marker says too little about where the others are
+    quads = None
+    if sum(b.fitted for b in view.markers.values()) >= 2:  # one marker says too little about where the others are
+        quads = _predicted(srgb, view, wanted, corners_mm)
+    if quads is not None:
+        wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
+    if quads is None or not wanted:
         return wanted, whole(srgb)
-    quads = _predicted(srgb, view, {i: corners_mm[i] for i in wanted}, corners_mm)
-    if quads is None:
-        return wanted, whole(srgb)
-    wanted = {i for i, quad in quads.items() if _side_px(quad) * scale < READABLE_PX}
-    if not wanted:
-        return wanted, whole(srgb)
-    points = np.concatenate([quads[i] for i in wanted])
     margin = 2 * max(_side_px(quads[i]) for i in wanted)
-    low = np.maximum(np.floor(points.min(0) - margin).astype(int), 0)
-    high = np.minimum(np.ceil(points.max(0) + margin).astype(int), [srgb.shape[1], srgb.shape[0]])
-    return wanted, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return wanted, part_around(np.concatenate([quads[i] for i in wanted]), margin, srgb.shape)
 
 
 def complete(
     srgb: np.ndarray, view: MarkersInView, corners_mm: Mapping[int, np.ndarray], dictionary: str = DICTIONARY
 ) -> MarkersInView:
     """`view` with all markers of `corners_mm` that verify at their predicted places; bad fits are replaced."""
-    printed = printed_markers(dictionary)
     for _ in range(3):  # each round's markers predict farther ones better
-        more = _round(srgb, view, corners_mm, printed)
+        more = _round(srgb, view, corners_mm, dictionary)
         if not more:
             break
-        kept = {i: b for i, b in view.markers.items() if i not in more}
-        view = MarkersInView(dict(sorted((kept | more).items())), view.foreign, view.doubled)
+        view = MarkersInView(dict(sorted((view.markers | more).items())), view.foreign, view.doubled)
     return view
 
 
-def _round(srgb, view: MarkersInView, corners_mm, printed) -> dict[int, Borders]:
+def _round(srgb, view: MarkersInView, corners_mm, dictionary: str) -> dict[int, Borders]:
     """Markers that are not fitted yet and verify at the places that the fitted ones predict."""
-    sure = {i for i, b in view.markers.items() if b.fitted}
-    predicted = _predicted(srgb, view, {i: mm for i, mm in corners_mm.items() if i not in sure}, corners_mm)
+    unsure = {i for i in corners_mm if i not in view.markers or not view.markers[i].fitted}
+    predicted = _predicted(srgb, view, unsure, corners_mm)
     if not predicted:
         return {}
     ids = sorted(predicted)
-    cells = cells_of(printed, ids)
+    cells = cells_of(dictionary, ids)
     borders = refine(srgb, np.array([predicted[i] for i in ids]), cells)
     return {
         i: b
@@ -114,13 +108,13 @@ def _round(srgb, view: MarkersInView, corners_mm, printed) -> dict[int, Borders]
     }
 
 
-def _predicted(srgb, view: MarkersInView, missing_mm, corners_mm) -> dict[int, np.ndarray] | None:
+def _predicted(srgb, view: MarkersInView, missing: Set[int], corners_mm) -> dict[int, np.ndarray] | None:
     """Where the fitted markers say that missing ones lie in the picture, by id; None where they cannot tell."""
     try:
         px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
     except (CannotJudge, np.linalg.LinAlgError):
         return None
-    quads = {i: apply_homography(px_from_mm, np.asarray(mm)) for i, mm in missing_mm.items()}
+    quads = {i: apply_homography(px_from_mm, corners_mm[i]) for i in missing}
     return {i: quad for i, quad in quads.items() if possible(quad) and _inside(quad, srgb)}
 
 
@@ -144,10 +138,7 @@ def _reads(srgb: np.ndarray, borders: Borders, code: np.ndarray) -> bool:
     to_px = cv2.getPerspectiveTransform(square, borders.corners_px.astype(np.float32))
     rows, columns = np.mgrid[0:n, 0:n] + 0.5
     centers = apply_homography(to_px, np.column_stack([columns.ravel(), rows.ravel()]))
-    inner = np.zeros((n, n), bool)
-    inner[1:-1, 1:-1] = True
-    low, high = np.floor(centers.min(0)).astype(int) - 1, np.ceil(centers.max(0)).astype(int) + 1
-    low, high = np.maximum(low, 0), np.minimum(high, [srgb.shape[1], srgb.shape[0]])
-    light = luminance(np.ascontiguousarray(srgb[low[1] : high[1], low[0] : high[0]]))
-    cells = sample(light, centers - low)[inner.ravel()]
-    return float(cells.std()) > 1e-6 and float(np.corrcoef(cells, code[inner])[0, 1]) > LEAST_CORRELATION
+    box = part_around(centers, 1, srgb.shape)
+    light = luminance(np.ascontiguousarray(srgb[box]))
+    cells = sample(light, centers - [box[1].start, box[0].start]).reshape(n, n)[1:-1, 1:-1].ravel()  # without the rim
+    return float(cells.std()) > 1e-6 and float(np.corrcoef(cells, code[1:-1, 1:-1].ravel())[0, 1]) > LEAST_CORRELATION

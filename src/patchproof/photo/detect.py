@@ -1,7 +1,7 @@
 """Find the printed markers in a photograph, coarse to fine.
 
 In: uint8 sRGB pixels and the ids that the sheet carries. Out: `MarkersInView`: corners in photo pixels (centers at .5,
-clockwise from the code's top-left) with what their borders show of blur and light, the ids of the same dictionary
+clockwise from the code's top-left) with what their borders show of blur, the ids of the same dictionary
 that are not the sheet's, and ids seen at two places. The detector looks at linear light: in code values blurred paper
 grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linear light read 45. The pyramid starts
 below 1000 px and stops at the level where every expected id has been found; only if some are missing are code values
@@ -12,16 +12,18 @@ look at. Corners of all levels are then fitted in the full photograph (`edges`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from patchproof.color import LUMINANCE, linear_from_srgb
 from patchproof.photo.edges import Borders, fit_borders
+from patchproof.photo.rectify import part_around, reduced
 
 DICTIONARY = "DICT_5X5_1000"
+LIGHT = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # linear, by code value
 COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # of what one level looks at: a second of work and 0.3 GB; sharper pictures are halved
@@ -29,8 +31,8 @@ MIRROR_PX = 3000  # longer side of the picture in which a mirrored sheet is look
 DARK = 70  # median code value below which local contrast helps; in light photos it hurts sharp markers
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least that has been read
 
-Box = tuple[int, int, int, int]
-"""Left, top, right, bottom of a part of the photograph, in whole pixels."""
+Box = tuple[slice, slice]
+"""Rows and columns of a part of the photograph."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,8 @@ def find_markers(
     dictionary: str = DICTIONARY,
     or_all_of: Sequence[Set[int]] = (),
 ) -> MarkersInView:
-    """All markers of `expected` and `also` in the picture; the search ends when every one of `expected` is found, or
-    every one of a set in `or_all_of`.
+    """All markers of `expected` and `also` in the picture; the search ends when all of `expected` are found, or all of
+    a set in `or_all_of`.
     """
     printed = printed_markers(dictionary)
     detections: dict[int, list[np.ndarray]] = {}
@@ -71,14 +73,14 @@ def find_markers(
         look(srgb, whole(srgb), level, printed, detections)
         if any(wanted <= detections.keys() for wanted in (expected, *or_all_of)):
             break
-    return fitted(srgb, detections, set(expected) | set(also), printed)
+    return fitted(srgb, detections, set(expected) | set(also), dictionary)
 
 
-def fitted(srgb: np.ndarray, detections: dict[int, list[np.ndarray]], ours: Set[int], printed) -> MarkersInView:
+def fitted(srgb: np.ndarray, detections: dict[int, list[np.ndarray]], ours: Set[int], dictionary: str) -> MarkersInView:
     """`detections` with borders fitted in the full photograph."""
     known = sorted(detections.keys() & ours)
-    rough = np.array([detections[marker_id][0] for marker_id in known]).reshape(-1, 4, 2)
-    borders = refine(srgb, rough, cells_of(printed, known)) if known else []
+    rough = np.array([detections[marker_id][0] for marker_id in known])
+    borders = refine(srgb, rough, cells_of(dictionary, known)) if known else []
     markers = {i: b for i, b in zip(known, borders, strict=True) if possible(b.corners_px)}
     foreign = tuple(sorted(detections.keys() - set(known)))
     return MarkersInView(markers, foreign, tuple(i for i in known if len(detections[i]) > 1))
@@ -91,10 +93,8 @@ def printed_markers(dictionary: str):
 
 def is_mirrored(srgb: np.ndarray, expected: Set[int], dictionary: str = DICTIONARY) -> bool:
     """Whether the sheet shows up when the picture is flipped: selfie cameras and scans through the back do that."""
-    shrink = MIRROR_PX / max(srgb.shape)
-    if shrink < 1:
-        srgb = cv2.resize(srgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return bool(find_markers(np.ascontiguousarray(srgb[:, ::-1]), expected, frozenset(), dictionary).markers)
+    mirrored = np.ascontiguousarray(reduced(srgb, MIRROR_PX)[:, ::-1])
+    return bool(find_markers(mirrored, expected, frozenset(), dictionary).markers)
 
 
 def possible(corners: np.ndarray) -> bool:
@@ -106,15 +106,17 @@ def possible(corners: np.ndarray) -> bool:
     return bool(np.isfinite(corners).all() and (turns > 0).all() and lengths.max() < 12 * lengths.min())
 
 
-def cells_of(printed, ids) -> np.ndarray:
+def cells_of(dictionary: str, ids: Iterable[int]) -> np.ndarray:
     """The printed modules M×n×n of marker ids, rim included: 1 = paper, 0 = ink."""
+    printed = printed_markers(dictionary)
     side = printed.markerSize + 2
-    return np.stack([cv2.aruco.generateImageMarker(printed, int(i), side) for i in ids]).astype(float) / 255
+    cells = [cv2.aruco.generateImageMarker(printed, int(i), side) for i in ids]
+    return np.array(cells).reshape(-1, side, side).astype(float) / 255
 
 
 def whole(srgb: np.ndarray) -> Box:
     """The box of all of the photograph."""
-    return 0, 0, srgb.shape[1], srgb.shape[0]
+    return slice(0, srgb.shape[0]), slice(0, srgb.shape[1])
 
 
 def levels(srgb: np.ndarray, box: Box, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
@@ -124,31 +126,32 @@ def levels(srgb: np.ndarray, box: Box, coarsest_px: int = COARSEST_PX) -> Iterat
         yield Level(0.5**n, light_picture)
     yield Level(1.0, code_picture)
     codes = [code_picture]
-    x0, y0, x1, y1 = box
-    sparse = max(1, max(srgb.shape) // 512)
-    if float(np.median(code_picture(np.ascontiguousarray(srgb[y0:y1:sparse, x0:x1:sparse])))) < DARK:
+    part, sparse = srgb[box], max(1, max(srgb.shape) // 512)
+    if float(np.median(code_picture(np.ascontiguousarray(part[::sparse, ::sparse])))) < DARK:
         codes = [contrast_picture]
         yield Level(1.0, contrast_picture)
-    if (y1 - y0) * (x1 - x0) < UPSCALE_BELOW_PX:
-        for picture in (light_picture, *codes):
-            yield Level(2.0, picture)
+    if part.shape[0] * part.shape[1] < UPSCALE_BELOW_PX:
+        yield from (Level(2.0, picture) for picture in (light_picture, *codes))
 
 
 def look(srgb: np.ndarray, box: Box, level: Level, printed, detections: dict[int, list[np.ndarray]]) -> None:
     """Add to `detections` the corners, in the full photograph's pixels, of what one level shows of a part of it."""
-    x0, y0, x1, y1 = box
-    if (x1 - x0) * (y1 - y0) * level.scale**2 > LARGEST_LEVEL_PX:
+    part = srgb[box]
+    height, width = part.shape[:2]
+    if width * height * level.scale**2 > LARGEST_LEVEL_PX:
         return
-    part = srgb[y0:y1, x0:x1]
-    size = max(1, round((x1 - x0) * level.scale)), max(1, round((y1 - y0) * level.scale))
+    size = max(1, round(width * level.scale)), max(1, round(height * level.scale))
     if level.scale < 1:
         part = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
     picture = level.picture(np.ascontiguousarray(part))
     if level.scale > 1:
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
-    to_full = np.array([(x1 - x0) / size[0], (y1 - y0) / size[1]])
+    to_full, start = np.array([width / size[0], height / size[1]]), [box[1].start, box[0].start]
     for marker_id, quad in _detect(picture, printed, level.scale * max(srgb.shape)):
-        _add(detections, marker_id, quad * to_full + [x0, y0])
+        corners, others = quad * to_full + start, detections.setdefault(marker_id, [])
+        apart = 0.5 * np.linalg.norm(corners[2] - corners[0])  # nearer, it is the same marker as at another level
+        if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > apart for other in others):
+            others.append(corners)
 
 
 def light_picture(srgb: np.ndarray) -> np.ndarray:
@@ -197,28 +200,17 @@ def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int
             yield int(marker_id), quad
 
 
-def _add(detections: dict[int, list[np.ndarray]], marker_id: int, corners: np.ndarray) -> None:
-    """Remember one detection; the same marker seen again at another level is not a second one."""
-    others = detections.setdefault(marker_id, [])
-    size = np.linalg.norm(corners[2] - corners[0])
-    if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > 0.5 * size for other in others):
-        others.append(corners)
-
-
 def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
     """Fit borders in the part of the photograph that holds the markers; only that part is turned into light."""
-    height, width = srgb.shape[:2]
-    low = np.maximum(np.floor(rough.min((0, 1))).astype(int) - 16, 0)
-    high = np.minimum(np.ceil(rough.max((0, 1))).astype(int) + 16, [width, height])
-    part = np.ascontiguousarray(srgb[low[1] : high[1], low[0] : high[0]])
-    borders = fit_borders(luminance(part), rough - low, cells)
-    return [Borders(b.corners_px + low, b.blur_px, b.black, b.white, b.module_px, b.fitted) for b in borders]
+    rows, columns = part_around(rough.reshape(-1, 2), 16, srgb.shape)
+    low = np.array([columns.start, rows.start])
+    borders = fit_borders(luminance(np.ascontiguousarray(srgb[rows, columns])), rough - low, cells)
+    return [replace(b, corners_px=b.corners_px + low) for b in borders]
 
 
 def luminance(srgb: np.ndarray) -> np.ndarray:
     """Linear luminance H×W float32 of uint8 sRGB."""
-    light = linear_from_srgb(np.arange(256) / 255).astype(np.float32)
-    table, weights = np.repeat(light[None, :, None], 3, 2), np.array([LUMINANCE], np.float32)
+    table, weights = np.repeat(LIGHT[None, :, None], 3, 2), np.array([LUMINANCE], np.float32)
     out = np.empty(srgb.shape[:2], np.float32)
     for rows in _strips(srgb):  # the table makes 12 bytes of each pixel
         cv2.transform(cv2.LUT(srgb[rows], table), weights, out[rows])

@@ -1,8 +1,8 @@
 """The straight black-to-white borders of markers, measured to a fraction of a pixel in linear light.
 
 In: linear luminance, rough corners and the printed cells. Out: per marker the corners where its four fitted borders
-meet, the blur of those borders and the light of ink and paper beside them. What a Gaussian blur σ makes of a border,
-with the rim one module m wide and the cells behind it known (q is their blurred row, 1 = paper):
+meet, and the blur of those borders. What a Gaussian blur σ makes of a border, with the rim one module m wide and the
+cells behind it known (q is their blurred row, 1 = paper):
 
     light(s, t) = black + (white - black) · [Φ(u / σ) + q(s) · Φ(-(u + m) / σ)],   u = t - d - a·s
 
@@ -19,6 +19,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
+# 49 points of a rectangle, its rim included, as shares of its width and height
+GRID = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7)), -1).reshape(-1, 2)
 ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
 REACH = 0.87  # of a border's half-length: nearer to its ends the next border's blur mixes in
 # in modules: inwards the printed cells are known, outwards only one module of paper is
@@ -32,12 +34,10 @@ _MOST_STEPS, _SETTLED_PX = (6, 5), 1e-3
 
 @dataclass(frozen=True)
 class Borders:
-    """One marker: corners 4×2 px, Gaussian blur (0 when sharper than the pixels), linear light of ink and paper."""
+    """One marker: corners 4×2 px, Gaussian blur (0 when sharper than the pixels), the side of a module."""
 
     corners_px: np.ndarray
     blur_px: float
-    black: float
-    white: float
     module_px: float
     fitted: bool  # False: the borders could not be fitted, the corners are as they came
 
@@ -47,26 +47,17 @@ def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray
     rough, modules = np.asarray(corners_px, float), cells.shape[1]
     # M×4×n, along each border
     behind = np.stack([cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1)
-    corners, good, reach_px = rough, np.zeros(len(rough), bool), np.full((len(rough), 4), np.inf)
-    sigma = black = white = np.zeros((len(rough), 4))
+    corners, good = rough, np.zeros(len(rough), bool)
+    sigma, reach_px = np.zeros((len(rough), 4)), np.full((len(rough), 4), np.inf)
     for _ in range(2):  # the second round samples across the borders that the first one found, no farther than needed
-        met, good, sigma, black, white = _fit_round(luminance, corners, behind, reach_px)
+        met, good, sigma = _fit_round(luminance, corners, behind, reach_px)
         moved = np.linalg.norm(met - rough, axis=2).max(1)
         good &= moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
         corners = np.where(good[:, None, None], met, rough)
         reach_px = np.where(good[:, None], np.maximum(REACH_SIGMAS * sigma, LEAST_REACH_PX), np.inf)
-    module = _module_px(corners, modules)
-    return [
-        Borders(
-            corners[m],
-            float(np.sqrt(max(0.0, np.median(sigma[m]) ** 2 - _SAMPLING_VARIANCE))),
-            float(np.median(black[m])),
-            float(np.median(white[m])),
-            float(np.sqrt(module[m, 0] * module[m, 1])),
-            bool(good[m]),
-        )
-        for m in range(len(corners))
-    ]
+    blur_px = np.sqrt(np.maximum(0.0, np.median(sigma, 1) ** 2 - _SAMPLING_VARIANCE)).tolist()
+    module_px = np.sqrt(_module_px(corners, modules)[:, :2].prod(1)).tolist()
+    return [Borders(*marker) for marker in zip(corners, blur_px, module_px, good.tolist(), strict=True)]
 
 
 def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -112,7 +103,7 @@ def _fit_round(luminance, corners, behind, reach_px):
     d, a, sigma, black, white = (fit[:, i].reshape(-1, 4) for i in range(5))
     ends = [middle + sign * half + (d + sign * a)[..., None] * normal for sign in (-1, 1)]
     fitted = (white - black > 0.01).all(1) & (np.abs(d) < outward).all(1) & np.isfinite(fit).reshape(-1, 20).all(1)
-    return meet(*ends), fitted, sigma, black, white
+    return meet(*ends), fitted, sigma
 
 
 def meet(start: np.ndarray, end: np.ndarray) -> np.ndarray:

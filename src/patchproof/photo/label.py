@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.rectify import rectify
+from patchproof.photo.rectify import rectify, reduced
 from patchproof.sheets.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
@@ -46,10 +46,7 @@ def parsed(text: str) -> Label | None:
 
 def read_label(srgb: np.ndarray) -> Label | None:
     """The code that a picture shows."""
-    shrink = _LARGEST_PX / max(srgb.shape[:2])
-    if shrink < 1:
-        srgb = cv2.resize(srgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
+    gray = cv2.cvtColor(reduced(srgb, _LARGEST_PX), cv2.COLOR_RGB2GRAY)
     # of 7 oblique pages of either size they read 6 and 1 (A4), 5 and 7 (labels): neither is enough
     for detector in (cv2.QRCodeDetectorAruco(), cv2.QRCodeDetector()):
         try:
@@ -67,9 +64,8 @@ def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[f
     read = read_label(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
     if read is None or read == label:
         return
-    if read.sheet_id != label.sheet_id:
-        advice = f"its code says sheet {read.sheet_id}, the JSON is of {label.sheet_id}: name that sheet's JSON"
-    else:
+    advice = f"its code says sheet {read.sheet_id}, the JSON is of {label.sheet_id}: name that sheet's JSON"
+    if read.sheet_id == label.sheet_id:
         advice = (
             f"it is sheet {read.sheet_id} with another design: its code says {read.printed}, the JSON {label.printed}; "
             "name the JSON that was written with this PDF"

@@ -16,7 +16,7 @@ import numpy as np
 
 from patchproof.color import linear_from_srgb
 from patchproof.geometry import apply_homography, local_scale
-from patchproof.photo.detect import cells_of, printed_markers
+from patchproof.photo.detect import cells_of
 from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE
 
@@ -42,10 +42,9 @@ def pattern_light(
     srgb: np.ndarray, px_from_mm: np.ndarray, corners_mm: Mapping[int, np.ndarray], dictionary: str, blur_px: float
 ) -> PatternLight | None:
     """Paper, ink and blur of an uint8 photograph whose borders show `blur_px`; None where too few cells are in it."""
-    printed = printed_markers(dictionary)
     ids = sorted(corners_mm)
     markers, lights = [], []
-    for cells, corners in zip(cells_of(printed, ids), (corners_mm[i] for i in ids), strict=True):
+    for cells, corners in zip(cells_of(dictionary, ids), (corners_mm[i] for i in ids), strict=True):
         module_px = local_scale(px_from_mm, corners.mean(0))[0] * np.linalg.norm(corners[1] - corners[0]) / len(cells)
         points = apply_homography(px_from_mm, _centers_mm(corners, len(cells)))
         usable = ((points > 1) & (points < [srgb.shape[1] - 1, srgb.shape[0] - 1])).all(1)

@@ -31,15 +31,12 @@ class FrameLight:
 
 def blur_px(markers: Iterable[Borders]) -> float:
     """Gaussian sigma of the borders in photo pixels: the median over fitted markers, else over all."""
-    markers = list(markers)
-    sure = [b.blur_px for b in markers if b.fitted]
-    return float(np.median(sure or [b.blur_px for b in markers]))
+    return float(np.median([b.blur_px for b in _surest(markers)]))
 
 
 def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
     """Paper and ink around at least one marker of an uint8 sRGB photograph."""
-    markers = list(markers)
-    sure = [b for b in markers if b.fitted] or markers
+    sure = _surest(markers)
     corners = np.stack([b.corners_px for b in sure])
     module = np.array([b.module_px for b in sure])[:, None, None, None]
     middle, half, normal = border_frame(corners)
@@ -55,3 +52,9 @@ def frame_light(srgb: np.ndarray, markers: Iterable[Borders]) -> FrameLight:
     ink = np.maximum(light_in - (1 - share) * span, 0)
     paper = np.minimum(ink + span, 1.2)
     return FrameLight(paper, ink, float(np.dot(LUMINANCE, paper - ink)), clipped)
+
+
+def _surest(markers: Iterable[Borders]) -> list[Borders]:
+    """The fitted ones, or all where none is."""
+    markers = list(markers)
+    return [b for b in markers if b.fitted] or markers

@@ -34,7 +34,6 @@ class Photo:
 
     srgb: np.ndarray
     focal_px: float | None
-    path: Path
 
 
 def read_photo(path: str | Path) -> Photo:
@@ -62,7 +61,7 @@ def read_photo(path: str | Path) -> Photo:
     except Exception as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...), all alike here
         raise _unreadable(_why(path, error)) from error
     diagonal_px = math.hypot(*srgb.shape[:2])
-    return Photo(srgb, focal_35mm / _DIAGONAL_35MM * diagonal_px if focal_35mm else None, path)
+    return Photo(srgb, focal_35mm / _DIAGONAL_35MM * diagonal_px if focal_35mm else None)
 
 
 def list_photos(folder: str | Path) -> list[Path]:

@@ -52,9 +52,8 @@ def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.n
         if len(ids) < 3 or (again == keep).all():
             break
         keep = again
-    return _with_figures(
-        homography, mm[keep], px[keep], tuple(i for n, i in enumerate(ids) if keep[4 * n : 4 * n + 4].sum() >= 2)
-    )
+    inlier_ids = tuple(i for i, agreeing in zip(ids, keep.reshape(-1, 4).sum(1), strict=True) if agreeing >= 2)
+    return _with_figures(homography, mm[keep], px[keep], inlier_ids)
 
 
 def common_corners(
@@ -119,30 +118,38 @@ def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: floa
     fine = max(1, int(np.ceil(finest * width_mm / size[0])))  # samples at least as dense as the photo's own pixels
     fine = max(1, min(fine, _LARGEST_PIXELS // max(size)))
     grid = size[0] * fine, size[1] * fine
-    part, px_from_mm = _crop(pixels, px_from_mm, rect_mm)
-    mm_from_index = np.array(
-        [
-            [width_mm / grid[0], 0, x + width_mm / grid[0] / 2],
-            [0, height_mm / grid[1], y + height_mm / grid[1] / 2],
-            [0, 0, 1],
-        ]
-    )
+    part, px_from_mm = crop(pixels, px_from_mm, rect_corners(rect_mm), 2)
+    step_x, step_y = width_mm / grid[0], height_mm / grid[1]
+    mm_from_index = np.array([[step_x, 0, x + step_x / 2], [0, step_y, y + step_y / 2], [0, 0, 1]])
     index_from_px = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
+    index_from_index = index_from_px @ px_from_mm @ mm_from_index
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(
-        part, index_from_px @ px_from_mm @ mm_from_index, grid, None, flags, cv2.BORDER_REPLICATE
-    )
+    warped = cv2.warpPerspective(part, index_from_index, grid, None, flags, cv2.BORDER_REPLICATE)
     return warped if fine == 1 else cv2.resize(warped, size, interpolation=cv2.INTER_AREA)
 
 
-def _crop(pixels, px_from_mm, rect_mm):
-    """The part of the photo that shows the rectangle, and the homography to it."""
-    quad = apply_homography(px_from_mm, rect_corners(rect_mm))
-    limit = np.array([pixels.shape[1], pixels.shape[0]])
-    low = np.clip(np.floor(quad.min(0)).astype(int) - 2, 0, limit - 1)
-    high = np.clip(np.ceil(quad.max(0)).astype(int) + 2, low + 1, limit)
-    shift = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1.0]])
-    return np.ascontiguousarray(pixels[low[1] : high[1], low[0] : high[0]]), shift @ px_from_mm
+def reduced(pixels: np.ndarray, longest_px: int) -> np.ndarray:
+    """A picture averaged down until its longer side has no more pixels than that."""
+    shrink = longest_px / max(pixels.shape[:2])
+    if shrink >= 1:
+        return pixels
+    size = max(1, round(pixels.shape[1] * shrink)), max(1, round(pixels.shape[0] * shrink))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
+def crop(pixels: np.ndarray, px_from_mm: np.ndarray, points_mm, margin_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a photo that shows the page's points N×2 and a margin about them, and the homography to it."""
+    rows, columns = part_around(apply_homography(px_from_mm, points_mm), margin_px, pixels.shape[:2])
+    shift = np.array([[1, 0, -columns.start], [0, 1, -rows.start], [0, 0, 1.0]])
+    return np.ascontiguousarray(pixels[rows, columns]), shift @ px_from_mm
+
+
+def part_around(points_px: np.ndarray, margin_px: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a picture H×W that hold points N×2 (x, y) and a margin about them; at least a pixel."""
+    limit = np.array([shape[1], shape[0]])
+    low = np.clip(np.floor(points_px.min(0) - margin_px).astype(int), 0, limit - 1)
+    high = np.clip(np.ceil(points_px.max(0) + margin_px).astype(int), low + 1, limit)
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
 
 def _agreeing(mm, px) -> np.ndarray:
@@ -181,17 +188,14 @@ def _jacobian(homography, mm) -> np.ndarray:
 
 def _mm_from_px(homography, mm) -> np.ndarray:
     """N×2×2 derivatives of page millimeters by photo pixels at page points."""
-    ones = np.column_stack([mm, np.ones(len(mm))])
-    u, v, w = (ones @ homography.T).T
-    place = np.stack([u / w, v / w], 1)
-    forward = (homography[None, :2, :2] - place[:, :, None] * homography[2, :2]) / w[:, None, None]
-    return np.linalg.inv(forward)
+    u, v, w = (np.column_stack([mm, np.ones(len(mm))]) @ homography.T).T
+    px = np.stack([u / w, v / w], 1)
+    return np.linalg.inv((homography[:2, :2] - px[:, :, None] * homography[2, :2]) / w[:, None, None])
 
 
 def _with_figures(homography, mm, px, ids) -> PageFit:
     residual = px - apply_homography(homography, mm)
-    freedom = residual.size - 8
-    noise = UNSEEN_NOISE_PX
+    freedom, noise = residual.size - 8, UNSEEN_NOISE_PX
     if freedom > 0:
         student = stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
         noise = max(CORNER_NOISE_PX, float(np.sqrt((residual**2).sum() / freedom) * student))

@@ -22,13 +22,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from patchproof.geometry import apply_homography, fit_homography, plane_pose, rect_corners
-from patchproof.photo.edges import REACH, border_frame, meet
+from patchproof.photo.edges import GRID, REACH, border_frame, meet
 from patchproof.photo.rectify import (
     CORNER_NOISE_PX,
     PageFit,
     common_corners,
     covariance_of,
     largest_shift_mm,
+    part_around,
     rms_length_mm,
     root_of,
 )
@@ -120,7 +121,7 @@ def unroll(
     if explained is None:
         return None
     flat, mm, px, best = explained.flat, explained.mm, explained.px, explained.shape
-    grid = _net(sheet_mm)
+    grid = sheet_mm[:2] + np.multiply(sheet_mm[2:], GRID)
     straight = fit_homography(grid, best.px(grid))
     error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
     picture = _straightened(srgb, best.px, straight, sheet_mm, margin_px=error)
@@ -177,7 +178,9 @@ def rolled(flat, mm, px, size, focal_px) -> Shape | None:
     for starts in (_starts(flat, mm, px, matrix @ pose[:3], center, reach), _ANY_BEND):
         for bend, direction in starts:
             start = np.array([*begin, bend, direction])
-            fits.append(least_squares(rows, start, x_scale=_scales(start), max_nfev=40, method="lm"))
+            # how far each parameter may be off, about
+            scales = np.array([0.1, 0.1, 0.1, *[0.05 * max(abs(start[5]), 1.0)] * 3, 0.2, 0.2, 0.5])
+            fits.append(least_squares(rows, start, x_scale=scales, max_nfev=40, method="lm"))
         best = min(fits, key=lambda fit: fit.cost)
         if _rms(best.fun) < _LOST_PX:
             break
@@ -196,8 +199,9 @@ def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
     """
     at = mm - center
     base = np.column_stack([at, np.zeros(len(at))])
-    moved = [_projected(camera, base + off) for off in (reach * 0.01 * np.eye(3)[2], -reach * 0.01 * np.eye(3)[2])]
-    by_depth = (moved[0] - moved[1]) / (0.02 * reach)
+    images = ((base + np.array([0, 0, off])) @ camera[:, :3].T + camera[:, 3] for off in (0.01 * reach, -0.01 * reach))
+    farther, nearer = (image[:, :2] / image[:, 2:] for image in images)
+    by_depth = (farther - nearer) / (0.02 * reach)
     x, y = at.T / reach
     form = [by_depth * (term * reach)[:, None] for term in (x * x, x * y, y * y)]
     plain = apply_homography(flat, mm)
@@ -214,16 +218,6 @@ def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
         bend = sign * np.copysign(np.clip(abs(2 * values[i]), *_FIRST_BEND), values[i])
         starts.append((float(bend), float(np.arctan2(vectors[1, i], vectors[0, i]))))
     return starts
-
-
-def _projected(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
-    image = points @ camera[:, :3].T + camera[:, 3]
-    return image[:, :2] / image[:, 2:]
-
-
-def _scales(start: np.ndarray) -> np.ndarray:
-    """How far each parameter may be off, about."""
-    return np.array([0.1, 0.1, 0.1, *[0.05 * max(abs(start[5]), 1.0)] * 3, 0.2, 0.2, 0.5])
 
 
 def through_lens(flat, mm, px, size) -> Shape:
@@ -267,28 +261,18 @@ def _mm_from_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> 
 
 def _straightened(srgb, project, px_from_mm, sheet_mm, margin_px: float) -> np.ndarray:
     """The photograph with the sheet's part resampled as if it were flat."""
-    quad = apply_homography(px_from_mm, rect_corners(sheet_mm))
-    limit = np.array([srgb.shape[1], srgb.shape[0]])
-    low = np.clip(np.floor(quad.min(0) - margin_px).astype(int), 0, limit - 1)
-    high = np.clip(np.ceil(quad.max(0) + margin_px).astype(int), low + 1, limit)
-    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5
+    box = part_around(apply_homography(px_from_mm, rect_corners(sheet_mm)), margin_px, srgb.shape)
+    y, x = np.mgrid[box] + 0.5
     mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))
     left, top, width, height = sheet_mm
     on_sheet = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
-    source = (project(mm[on_sheet]) - 0.5).astype(np.float32)
     where = on_sheet.reshape(x.shape)
-    at = np.full((*x.shape, 2), -1, np.float32)
-    at[where] = source
-    part = cv2.remap(srgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    source = np.full((*x.shape, 2), -1, np.float32)
+    source[where] = project(mm[on_sheet]) - 0.5
+    part = cv2.remap(srgb, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     picture = srgb.copy()
-    picture[low[1] : high[1], low[0] : high[0]][where] = part[where]
+    picture[box][where] = part[where]
     return picture
-
-
-def _net(rect_mm) -> np.ndarray:
-    x, y, width, height = rect_mm
-    across, down = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7))
-    return np.column_stack([x + width * across.ravel(), y + height * down.ravel()])
 
 
 def _rms(values: np.ndarray) -> float:

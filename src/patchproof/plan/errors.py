@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.view import center_square
+from patchproof.classifier.network import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.output import image_bytes, image_pixels

@@ -7,7 +7,8 @@ from outside of itself. The same input gives the same bytes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -40,7 +41,7 @@ class Results:
 
 def write_results(folder: Path, results: Results) -> None:
     """Write all of it into the folder."""
-    versions = _versions()
+    versions = versions_of(_LIBRARIES)
     pictures = [(drawing, png(drawing)) for drawing in results.figures]
     for table in results.tables:
         _write(folder / f"{results.name}_{table.name}.csv", csv_text(table).encode())
@@ -84,11 +85,10 @@ def _page(results: Results, pictures: Sequence[tuple[Drawing, bytes]], versions:
     )
 
 
-def _versions() -> dict[str, str]:
-    installed = {}
-    for name in _LIBRARIES:
-        try:
-            installed[name] = version(name)
-        except PackageNotFoundError:  # run from a checkout
-            continue
-    return installed
+def versions_of(libraries: Iterable[str]) -> dict[str, str]:
+    """The versions of those that are installed."""
+    versions = {}
+    for name in libraries:
+        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
+            versions[name] = version(name)
+    return versions

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -70,8 +69,7 @@ def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
     """The page as light H×W×3 at `PX_PER_MM`, with some writing beside the chart, as sheets have."""
     width, height = (round(side * PX_PER_MM) for side in manifest.page_mm)
     page = np.full((height, width, 3), 255, np.uint8)
-    printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
-    for marker, code in zip(manifest.markers, cells_of(printed, [m.id for m in manifest.markers]), strict=True):
+    for marker, code in zip(manifest.markers, cells_of(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
         side = round(MARKER_MM * PX_PER_MM)
         _fill(
             page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
@@ -117,7 +115,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     codes = codes_of_light(linear_from_srgb(picture), camera)
     file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return Shot(Photo(image_pixels(file), None, Path("page.jpg")), at_middle * exposure * white_balance)
+    return Shot(Photo(image_pixels(file), None), at_middle * exposure * white_balance)
 
 
 def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:

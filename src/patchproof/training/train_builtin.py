@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.builtin import INPUT_PX, SmallNetwork, folded
-from patchproof.classifier.view import center_square
+from patchproof.classifier.network import center_square
 from patchproof.color import codes_of
 from patchproof.mesh import primitives
 from patchproof.mesh.mesh import Mesh

@@ -87,7 +87,7 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     rng = np.random.default_rng([settings.seed, number])
     truth = sheet.px_from_page(conditions)
     srgb, hidden = _photographed(sheet, conditions, truth, rng, rng.random() < settings.hidden)
-    photo = Photo(srgb, float(scene.matrix_px(scene.settings.camera.photo_px)[0, 0]), Path("photo.jpg"))
+    photo = Photo(srgb, float(scene.matrix_px(scene.settings.camera.photo_px)[0, 0]))
     entry = measure(view_of(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
     geometry = entry.geometry
     px_per_mm, tilt_deg = local_scale(truth, surface.center_mm)

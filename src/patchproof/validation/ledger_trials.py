@@ -139,8 +139,8 @@ class _Hall:
         with TemporaryDirectory() as folder:
             for i, photo in enumerate(photos):
                 (Path(folder) / f"{i:03d}.jpg").write_bytes(photo)
-            evidence = gather_evidence(folder, self.manifest, Options([self.model], self.sheet.printer))
-        report, ledger = evidence.report, evidence.ledger
+            report = gather_evidence(folder, self.manifest, Options([self.model], self.sheet.printer))
+        ledger = report.ledger
         used = np.array([usable(entry.status, entry.code) for entry in report.photos])
         codes = [entry.code or "fine" for entry in report.photos]
         found = {"codes": {code: codes.count(code) for code in sorted(set(codes))}}

@@ -28,7 +28,6 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import AT_A_TIME, ask
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import image_pixels
-from patchproof.photo.read import Photo
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
@@ -192,8 +191,7 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     if scene.HAS_OBJECT:  # of pictures nobody knows the focal length
         matrix_px = needs_mesh(scene).matrix_px(whole_px).copy()
         matrix_px[:2, 2] -= origin_px
-    photo = Photo(srgb, None if matrix_px is None else float(matrix_px[0, 0]), Path("photo"))
-    view = View(photo, matrix_px, calibrated=False)
+    view = View(srgb, matrix_px, calibrated=False)
     entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
     if entry.status == "measured" and entry.geometry and entry.geometry.homography_px_from_mm is not None:
