@@ -12,7 +12,7 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -65,10 +65,7 @@ Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
 NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
-Model = TypeVar("Model", bound=BaseModel)
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
-Model = TypeVar("Model", bound=BaseModel)
-
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -113,7 +110,7 @@ def validated(model: type[Model], data: Any, where: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         # a misspelt key is also a missing one: the spelling says more
-        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        first = min(error.errors(), key=lambda error: error["type"] != "extra_forbidden")
         raise _explain(model, first, where) from error
 
 
@@ -178,10 +175,13 @@ def _keys_at(model: Any, location: tuple) -> Iterable[str]:
     """The known keys of the table at a location, through lists, dictionaries and optional tables."""
     for part in location:
         if part in model.model_fields:  # else an index or a dictionary's own key
-            inner, todo = None, [model.model_fields[part].annotation]
-            while todo and inner is None:
-                one = todo.pop()
-                inner = one if isinstance(one, type) and issubclass(one, BaseModel) else None
-                todo.extend(get_args(one))
-            model = inner or model
+            model = next(models_in(model.model_fields[part].annotation), model)
     return model.model_fields
+
+
+def models_in(hint: Any) -> Iterator[type[BaseModel]]:
+    """The tables that a type speaks of."""
+    if isinstance(hint, type) and issubclass(hint, BaseModel):
+        yield hint
+    for inner in get_args(hint):
+        yield from models_in(inner)

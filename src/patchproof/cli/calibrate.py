@@ -64,5 +64,5 @@ def camera(
 
     ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
     with progress() as bar:
-        found = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
-    say(*calibration_lines(found), f"camera: {out}")
+        fitted = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
+    say(*calibration_lines(fitted), f"camera: {out}")

@@ -72,11 +72,11 @@ def plan(
     if out is not None:
         check_file(out, overwrite)
     with progress() as bar:
-        found = plan_scene(scene, timing=not no_timing, on_stage=bar)
-    warn(found.warnings)
-    say(*plan_lines(found))
+        planned = plan_scene(scene, timing=not no_timing, on_stage=bar)
+    warn(planned.warnings)
+    say(*plan_lines(planned))
     if out is not None:
-        write_whole(out, lambda path: path.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8"))
+        write_whole(out, planned.model_dump_json(indent=1) + "\n")
 
 
 def optimize(
