@@ -81,7 +81,13 @@ def measure_terms(
     changed = {term.name: setup for term in terms if (setup := term.change(base)) is not None}
     on = [term for term in terms if term.name in changed]
     photo = Album(problem, base, min(problem.scene.settings.camera.photo_px))
-    advance = _counter(on_view, 3 * len(conditions))
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        on_view(done, 3 * len(conditions))
+
     with torch.no_grad():
         wholes = [term for term in on if term.whole]
         whole = photo.look([changed[term.name] for term in wholes], advance)
@@ -89,18 +95,18 @@ def measure_terms(
         points = _point_sampled(problem, base)
         confidence = _confidence(problem, whole[0])
         threshold = float(confidence.std()) / selection_views**0.5
-        rows = {}
-        for term, pictures in zip(on, small[1:], strict=True):
-            rows[term.name] = _row(problem, term, small[0], pictures)
+        rows = {t.name: _row(problem, t, small[0], pictures) for t, pictures in zip(on, small[1:], strict=True)}
         for term, pictures in zip(wholes, whole[1:], strict=True):
             shows = bool(rows[term.name].codes_mean)
             rows[term.name] = _row(problem, term, whole[0], pictures).changed(in_training=shows)
-        for term in _RENDERED:
-            if term.name in points:
-                rows[term.name] = _row(problem, term, points[""], points[term.name])
+        rows |= {t.name: _row(problem, t, points[""], points[t.name]) for t in _RENDERED if t.name in points}
         judged = {row.name: row for row in _judged(terms, rows, threshold)}
-        gone = [term for term in on if term.key and judged[term.name].verdict == "can go"]
-        together = _together(problem, photo, gone, confidence, advance)
+        gone, setup, together = [t for t in on if t.key and judged[t.name].verdict == "can go"], base, None
+        for term in gone:
+            setup = term.change(setup) or setup
+        if gone:
+            (pictures,) = replace(photo, base=setup).look([], advance)
+            together = float((_confidence(problem, pictures) - confidence).abs().mean())
     return Terms(
         views=len(conditions),
         confidence=float(confidence.mean()),
@@ -132,17 +138,6 @@ def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: floa
     ]
 
 
-def _counter(on_view: Callable[[int, int], None], total: int) -> Callable[[int], None]:
-    done = 0
-
-    def advance(n: int) -> None:
-        nonlocal done
-        done += n
-        on_view(done, total)
-
-    return advance
-
-
 def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermError:
     codes = (255 * (changed - base)).abs().cpu().numpy()
     change = _confidence(problem, changed) - _confidence(problem, base)
@@ -155,19 +150,6 @@ def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermErr
         confidence=float(change.abs().mean()),
         bias=float(change.mean()),
     )
-
-
-def _together(
-    problem: Problem, photo: Album, gone: list[Term], confidence: Tensor, on_view: Callable[[int], None]
-) -> float | None:
-    """The mean absolute change of confidence when all of these are left out at once; None of none."""
-    if not gone:
-        return None
-    setup = photo.base
-    for term in gone:
-        setup = term.change(setup) or setup
-    pictures = replace(photo, base=setup).look([], on_view)[0]
-    return float((_confidence(problem, pictures) - confidence).abs().mean())
 
 
 def _confidence(problem: Problem, pictures: Tensor) -> Tensor:
@@ -220,8 +202,7 @@ def _chunks(views: int, side_px: int) -> list[slice]:
 
 def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
     """Pictures N×3×H×W that were JPEG files in between."""
-    both = zip(pictures, quality, strict=True)
-    files = [image_bytes(as_pixels(picture), "JPEG", {"quality": int(one)}) for picture, one in both]
+    files = [image_bytes(as_pixels(p), "JPEG", {"quality": int(q)}) for p, q in zip(pictures, quality, strict=True)]
     return torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])
 
 
@@ -242,8 +223,8 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
         parts.append(
             torch.stack([rendered, torch.where(inside, points, rendered), torch.where(edge, points, rendered)])
         )
-    both = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
-    rendered, inside, edge = both.unflatten(0, (3, -1))
+    squares = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
+    rendered, inside, edge = squares.unflatten(0, (3, -1))
     named = {"": rendered, "footprint filtering": inside}
     return named | {"piece's edges": edge} if scene.HAS_PIECE else named
 
