@@ -84,7 +84,7 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
 
 
 def test_designs_are_judged_on_the_same_new_conditions(problem):
-    run, effort = train.Run(views=60), train.Effort(120, 2, 4)
+    run, effort = OptimizeSettings(views=60), train.Effort(120, 2, 4)
     losses = train.trained_losses(problem, [run], effort, quiet)
     assert list(losses) == [(run, 120)] and len(set(losses[run, 120])) == 2
     assert losses == train.trained_losses(problem, [run], effort, quiet)

@@ -125,10 +125,10 @@ def expand(text: str, base: Path) -> str:
     text = re.sub(r"\$\{(\w+)\}", variable, text)
     prefix, colon, rest = text.partition(":")
     if colon and prefix == "file":
-        return f"file:{_absolute(rest, base)}"
+        return f"file:{base / rest}"  # an absolute path stays as it is
     if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text == "builtin":
         return text
-    return str(_absolute(text, base))
+    return str(base / text)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -136,10 +136,6 @@ def nearest(word: str, known: Iterable[str]) -> str:
     known = list(known)
     near = difflib.get_close_matches(word, known, 1, 0.5)
     return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
-
-
-def _absolute(path: str, base: Path) -> Path:
-    return path_ if (path_ := Path(path)).is_absolute() else base / path_
 
 
 def within(low: float, high: float) -> AfterValidator:

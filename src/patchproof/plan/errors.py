@@ -10,7 +10,6 @@ Left out on purpose: interactions of terms, but for one check of all that can go
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -80,7 +79,7 @@ def measure_terms(
     terms = scene_terms(problem, design, other_surface)
     changed = {term.name: setup for term in terms if (setup := term.change(base)) is not None}
     on = [term for term in terms if term.name in changed]
-    photo = Album(problem, base, min(problem.scene.settings.camera.photo_px))
+    photo_px = min(problem.scene.settings.camera.photo_px)
     done = 0
 
     def advance(count: int) -> None:
@@ -90,8 +89,8 @@ def measure_terms(
 
     with torch.no_grad():
         wholes = [term for term in on if term.whole]
-        whole = photo.look([changed[term.name] for term in wholes], advance)
-        small = Album(problem, base, problem.training_px).look([changed[t.name] for t in on], advance)
+        whole = _squares(problem, photo_px, base, [changed[term.name] for term in wholes], advance)
+        small = _squares(problem, problem.training_px, base, [changed[term.name] for term in on], advance)
         points = _point_sampled(problem, base)
         confidence = _confidence(problem, whole[0])
         threshold = float(confidence.std()) / selection_views**0.5
@@ -105,7 +104,7 @@ def measure_terms(
         for term in gone:
             setup = term.change(setup) or setup
         if gone:
-            (pictures,) = replace(photo, base=setup).look([], advance)
+            (pictures,) = _squares(problem, photo_px, setup, [], advance)
             together = float((_confidence(problem, pictures) - confidence).abs().mean())
     return Terms(
         views=len(conditions),
@@ -158,40 +157,35 @@ def _confidence(problem: Problem, pictures: Tensor) -> Tensor:
     return classifier.confidence(classifier.logits(pictures), problem.indices[0])
 
 
-@dataclass(frozen=True)
-class Album:
-    """Square views of one size, as the primary classifier gets them."""
+def _squares(
+    problem: Problem, side_px: int, base: Setup, setups: list[Setup], on_view: Callable[[int], None]
+) -> Tensor:
+    """(1 + len(setups))×N×3×S×S views as the primary classifier gets them: the base setup's, then each other one's."""
+    size_px, stack = (side_px, side_px), []
+    for rows in _chunks(len(base.conditions), side_px):
+        views, parts = _views(base, base.conditions[rows], size_px), []
+        for setup in (base, *setups):
+            conditions = setup.conditions[rows]
+            same = setup.stage is base.stage and setup.supersample == base.supersample
+            same = same and (conditions.pose.printed_scale == base.conditions.pose.printed_scale).all()
+            shown = relit(views, conditions) if same else _views(setup, conditions, size_px)
+            parts.append(_pictures(problem, shown, setup.shown))
+        stack.append(torch.stack(parts))
+        on_view(len(base.conditions))
+    return torch.cat(stack, 1)
 
-    problem: Problem
-    base: Setup
-    side_px: int
 
-    def look(self, setups: list[Setup], on_view: Callable[[int], None]) -> Tensor:
-        """(1 + len(setups))×N×3×S×S: the base setup's pictures, then those of each other one."""
-        stack = []
-        for rows in _chunks(len(self.base.conditions), self.side_px):
-            base = self._views(self.base, self.base.conditions[rows])
-            parts = []
-            for setup in (self.base, *setups):
-                conditions = setup.conditions[rows]
-                same = setup.stage is self.base.stage and setup.supersample == self.base.supersample
-                same = same and (conditions.pose.printed_scale == base.conditions.pose.printed_scale).all()
-                views = relit(base, conditions) if same else self._views(setup, conditions)
-                parts.append(self._pictures(views, setup.shown))
-            stack.append(torch.stack(parts))
-            on_view(len(base.conditions))
-        return torch.cat(stack, 1)
+def _views(setup: Setup, conditions: Conditions, size_px: tuple[int, int]) -> Views:
+    piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
+    return see(setup.stage, piece, conditions, size_px, setup.supersample)
 
-    def _views(self, setup: Setup, conditions: Conditions) -> Views:
-        piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
-        return see(setup.stage, piece, conditions, (self.side_px, self.side_px), setup.supersample)
 
-    def _pictures(self, views: Views, shown: Shown) -> Tensor:
-        """A whole photograph goes through a real JPEG, a training view as training exposes it."""
-        pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
-        if not views.reduced and quality.any():
-            pictures = _stored(pictures, quality)
-        return center_square(pictures, self.problem.classifiers[0].input_px)
+def _pictures(problem: Problem, views: Views, shown: Shown) -> Tensor:
+    """A whole photograph goes through a real JPEG, a training view as training exposes it."""
+    pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
+    if not views.reduced and quality.any():
+        pictures = _stored(pictures, quality)
+    return center_square(pictures, problem.classifiers[0].input_px)
 
 
 def _chunks(views: int, side_px: int) -> list[slice]:
@@ -214,8 +208,7 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
     scene, parts = setup.stage.scene, []
     for rows in _chunks(len(base.conditions), _FINE * side):
         conditions = setup.conditions[rows]
-        piece = setup.shown if isinstance(setup.shown, PiecePicture) else None
-        views = see(setup.stage, piece, conditions, (side, side))
+        views = _views(setup, conditions, (side, side))
         fine = photograph(setup.stage, setup.shown, conditions, (_FINE * side, _FINE * side), jpeg=False)
         points = fine[..., _FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
         rendered = expose(views, setup.shown, jpeg=False)
