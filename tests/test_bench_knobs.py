@@ -65,7 +65,7 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     monkeypatch.setattr(loop, "_score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     train.trained(with_optimize(problem, OptimizeSettings(views=3, steps=2)), [2])
-    assert sum(seen) == train.network_views(3, 2)
+    assert sum(seen) == loop.views_seen(OptimizeSettings(views=3, steps=2))
 
 
 def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
@@ -78,7 +78,7 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
     charts = train.charts(True, quiet)
     for chart, name in ((next(charts), f"{usual.views}"), (next(charts), f"{usual.optimizer} {Patch.STEP_SIZE:g}")):
         (default,) = (p for points in chart.series.values() for p in points if p.default)
-        assert default.setting == name and default.cost == train.network_views(usual.views, 120 // usual.views)
+        assert default.setting == name and default.cost == loop.views_seen(usual.changed(steps=120 // usual.views))
     (*_, last) = chart.series.values()
     assert [p.error.value for p in last] == pytest.approx([*train.QUICK_ADAM, *train.QUICK_SIGN])
 

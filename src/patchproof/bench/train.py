@@ -17,7 +17,7 @@ from torch import Tensor
 from patchproof.bench.chart import Chart, OnStage, Point
 from patchproof.bench.world import demo_problem, set_world, with_optimize
 from patchproof.claims import Estimate, paired_means, standard_deviation, student_mean
-from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, steps
+from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
@@ -67,7 +67,7 @@ def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], loss
     series: dict[int, list[Point]] = {end: [] for end in sorted({end for _, _, end in columns})}
     table = np.array([losses[run, end] for _, run, end in columns]).T
     for (setting, run, end), loss in zip(columns, paired_means(table), strict=True):
-        cost = network_views(run.views, end // run.views)
+        cost = views_seen(run.changed(steps=end // run.views))
         series[end].append(Point(setting, cost, loss, run == USUAL and end == effort.views))
     return Chart(
         name=name,
@@ -84,11 +84,6 @@ def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], loss
 def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
     """Training views after which a run is charted: there the design was tried on the selection set."""
     return [end for end in (effort.views // 2, effort.views) if selects(run, end // run.views)]
-
-
-def network_views(views: int, steps_done: int) -> int:
-    """Views that a network sees in so many steps, selection included."""
-    return views * steps_done + SELECT_VIEWS * selections(OptimizeSettings(views=views, steps=steps_done))
 
 
 def trained_losses(
