@@ -12,6 +12,7 @@ import difflib
 import math
 import os
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -91,9 +92,9 @@ class Strict(BaseModel):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
-    try:
+    if sys.version_info >= (3, 11):
         import tomllib
-    except ModuleNotFoundError:
+    else:
         import tomli as tomllib
     path = Path(path)
     if not path.is_file():

@@ -101,7 +101,8 @@ def pareto(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
     """Which points no other beats: none is as good in both and better in one; bool, one per point."""
     figures = np.stack([cost, error], 1).astype(float)
     own, other = figures[:, None], figures
-    return ~((other <= own).all(2) & (other < own).any(2)).any(1)
+    beaten = np.all(other <= own, axis=2) & np.any(other < own, axis=2)
+    return np.logical_not(np.any(beaten, axis=1))
 
 
 def all_checks(chart: Chart) -> list[Check]:

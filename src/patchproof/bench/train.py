@@ -52,7 +52,7 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     moves = {f"adam {size:g}": USUAL.changed(step_size=size) for size in (QUICK_ADAM if quick else ADAM)}
     for size in QUICK_SIGN if quick else SIGN:
         moves[f"sign {size:g}"] = USUAL.changed(optimizer="sign", step_size=size)
-    losses = trained_losses(demo_problem(), {*views.values(), *moves.values()}, effort, on_stage)
+    losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, on_stage)
     yield runs_chart("views", "Views per step, for as many views in all", views, losses, effort)
     yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
     yield draws_chart(quick, on_stage)

@@ -69,12 +69,13 @@ def meanings(model: type[Strict]) -> dict[str, str]:
             continue
         source = inspect.getsource(owner)
         lines = source.splitlines()
-        for field in ast.parse(source).body[0].body:
+        (definition,) = ast.parse(source).body
+        for field in definition.body if isinstance(definition, ast.ClassDef) else ():
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
                 above = takewhile(lambda line: line.startswith("    # "), lines[field.lineno - 2 :: -1])
-                text = lines[field.end_lineno - 1].partition("  # ")[2] or " ".join([*above][::-1]).replace(
-                    "    # ", ""
-                )
+                text = lines[(field.end_lineno or field.lineno) - 1].partition("  # ")[2] or " ".join(
+                    [*above][::-1]
+                ).replace("    # ", "")
                 texts |= {field.target.id: text} if text else {}
     return texts
 
