@@ -120,7 +120,7 @@ def test_a_default_is_checked_where_it_stands():
 def test_one_tap_is_further_off_than_the_default(world):
     look = texture.look(world.piece, world.control("noise"), *LOOKED_AT)
     noise = texture.texels(world.control("noise"))
-    few, default = (measure.psnr(noise.seen(look, n).detach(), look.truth) for n in (1, texture.DESIGN_TAPS))
+    few, default = (measure.psnr(noise.colors(look, n).detach(), look.truth) for n in (1, texture.DESIGN_TAPS))
     assert default > texture.LEAST_PSNR > few + 5
 
 

@@ -65,7 +65,7 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     monkeypatch.setattr(loop, "_score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     train.trained(with_optimize(problem, OptimizeSettings(views=3, steps=2)), [2])
-    assert sum(seen) == train.network_views(3, 2)
+    assert sum(seen) == loop.views_seen(OptimizeSettings(views=3, steps=2))
 
 
 def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
@@ -78,13 +78,13 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
     charts = train.charts(True, quiet)
     for chart, name in ((next(charts), f"{usual.views}"), (next(charts), f"{usual.optimizer} {Patch.STEP_SIZE:g}")):
         (default,) = (p for points in chart.series.values() for p in points if p.default)
-        assert default.setting == name and default.cost == train.network_views(usual.views, 120 // usual.views)
+        assert default.setting == name and default.cost == loop.views_seen(usual.changed(steps=120 // usual.views))
     (*_, last) = chart.series.values()
     assert [p.error.value for p in last] == pytest.approx([*train.QUICK_ADAM, *train.QUICK_SIGN])
 
 
 def test_designs_are_judged_on_the_same_new_conditions(problem):
-    run, effort = train.Run(views=60), train.Effort(120, 2, 4)
+    run, effort = OptimizeSettings(views=60), train.Effort(120, 2, 4)
     losses = train.trained_losses(problem, [run], effort, quiet)
     assert list(losses) == [(run, 120)] and len(set(losses[run, 120])) == 2
     assert losses == train.trained_losses(problem, [run], effort, quiet)

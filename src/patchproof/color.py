@@ -88,8 +88,7 @@ def ciede2000(lab_a, lab_b):
     a1p, a2p = (1 + G) * a1, (1 + G) * a2
     C1p, C2p = xp.sqrt(a1p**2 + b1**2 + tiny), xp.sqrt(a2p**2 + b2**2 + tiny)
     h1p, h2p = _hue(xp, b1, a1p), _hue(xp, b2, a2p)
-    gray = C1p * C2p < 1e-10
-    dh = h2p - h1p
+    gray, dh = C1p * C2p < 1e-10, h2p - h1p
     dh = xp.where(dh > math.pi, dh - 2 * math.pi, xp.where(dh < -math.pi, dh + 2 * math.pi, dh))
     dh = xp.where(gray, 0 * dh, dh)
     dL, dC, dH = L2 - L1, C2p - C1p, 2 * xp.sqrt(C1p * C2p + tiny) * xp.sin(dh / 2)
@@ -131,3 +130,6 @@ def _at_least(xp, array, floor: float):
 
 def _stack(xp, parts):
     return np.stack(parts, -1) if xp is np else xp.stack(parts, -1)
+
+
+LIGHT_OF_CODE = linear_from_srgb(np.arange(256) / 255)  # of 8-bit code values

@@ -64,11 +64,16 @@ def make_folder(path: Path) -> None:
         raise Refused("a folder that can be made", f"{path} ({error.strerror})", "choose another --out") from error
 
 
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let `write` fill a file beside `path`, then move it there: a reader sees the old file or the new one, whole."""
+def write_whole(path: Path, content: str | bytes | Callable[[Path], Any]) -> None:
+    """Put the content, or what a function fills a file with, beside `path` and move it there: a reader sees the old
+    file or the new one, whole.
+    """
     part = path.with_name(f".{path.name}.part")
     try:
-        write(part)
+        if callable(content):
+            content(part)
+        else:
+            part.write_bytes(content.encode() if isinstance(content, str) else content)
         os.replace(part, path)
     except OSError as error:
         got = f"{path} ({error.strerror or error})"
@@ -94,8 +99,7 @@ def write_together(contents: dict[Path, bytes]) -> None:
         raise Refused("a folder that can be written to", f"{path} ({reason})", "choose another --out") from error
     finally:
         for part in waiting.values():
-            if part.exists():
-                part.unlink()
+            part.unlink(missing_ok=True)
 
 
 def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None = None) -> bytes:

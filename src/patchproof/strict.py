@@ -12,7 +12,8 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -65,10 +66,7 @@ Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
 NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
-Model = TypeVar("Model", bound=BaseModel)
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
-Model = TypeVar("Model", bound=BaseModel)
-
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -94,9 +92,9 @@ class Strict(BaseModel):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
-    try:
+    if sys.version_info >= (3, 11):
         import tomllib
-    except ModuleNotFoundError:
+    else:
         import tomli as tomllib
     path = Path(path)
     if not path.is_file():
@@ -113,7 +111,7 @@ def validated(model: type[Model], data: Any, where: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         # a misspelt key is also a missing one: the spelling says more
-        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        first = min(error.errors(), key=lambda error: error["type"] != "extra_forbidden")
         raise _explain(model, first, where) from error
 
 
@@ -128,10 +126,10 @@ def expand(text: str, base: Path) -> str:
     text = re.sub(r"\$\{(\w+)\}", variable, text)
     prefix, colon, rest = text.partition(":")
     if colon and prefix == "file":
-        return f"file:{_absolute(rest, base)}"
+        return f"file:{base / rest}"  # an absolute path stays as it is
     if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text == "builtin":
         return text
-    return str(_absolute(text, base))
+    return str(base / text)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -139,10 +137,6 @@ def nearest(word: str, known: Iterable[str]) -> str:
     known = list(known)
     near = difflib.get_close_matches(word, known, 1, 0.5)
     return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
-
-
-def _absolute(path: str, base: Path) -> Path:
-    return path_ if (path_ := Path(path)).is_absolute() else base / path_
 
 
 def within(low: float, high: float) -> AfterValidator:
@@ -178,10 +172,13 @@ def _keys_at(model: Any, location: tuple) -> Iterable[str]:
     """The known keys of the table at a location, through lists, dictionaries and optional tables."""
     for part in location:
         if part in model.model_fields:  # else an index or a dictionary's own key
-            inner, todo = None, [model.model_fields[part].annotation]
-            while todo and inner is None:
-                one = todo.pop()
-                inner = one if isinstance(one, type) and issubclass(one, BaseModel) else None
-                todo.extend(get_args(one))
-            model = inner or model
+            model = next(models_in(model.model_fields[part].annotation), model)
     return model.model_fields
+
+
+def models_in(hint: Any) -> Iterator[type[BaseModel]]:
+    """The tables that a type speaks of."""
+    if isinstance(hint, type) and issubclass(hint, BaseModel):
+        yield hint
+    for inner in get_args(hint):
+        yield from models_in(inner)

@@ -28,6 +28,16 @@ class Point:
     error: Estimate | float
     default: bool = False
 
+    @property
+    def drawable(self) -> bool:
+        """Whether its error is finite."""
+        return bool(np.isfinite(span(self.error)).all())
+
+    @property
+    def at(self) -> tuple[float, float]:
+        """Cost and error without their intervals."""
+        return span(self.cost)[0], span(self.error)[0]
+
 
 @dataclass(frozen=True)
 class Check:
@@ -72,16 +82,14 @@ class Chart:
     @property
     def tasks(self) -> dict[str, list[Point]]:
         """Points among which one chooses, by task; those without a finite error are no choice."""
-        tasks = {
-            label: [p for p in points if np.isfinite(span(p.error)).all()] for label, points in self.series.items()
-        }
+        tasks = {label: [p for p in points if p.drawable] for label, points in self.series.items()}
         return {self.name: [p for points in tasks.values() for p in points]} if self.one_front else tasks
 
     def front(self, points: Sequence[Point]) -> list[Point]:
         """Those of a task's points that no other beats, cheapest first."""
         sign = -1 if self.higher_is_better else 1
-        kept = pareto([span(p.cost)[0] for p in points], [sign * span(p.error)[0] for p in points])
-        return sorted((p for p, is_kept in zip(points, kept, strict=True) if is_kept), key=lambda p: span(p.cost)[0])
+        kept = pareto([p.at[0] for p in points], [sign * p.at[1] for p in points])
+        return sorted((p for p, is_kept in zip(points, kept, strict=True) if is_kept), key=lambda p: p.at[0])
 
 
 def span(figure: Estimate | float) -> tuple[float, float, float]:
@@ -91,8 +99,10 @@ def span(figure: Estimate | float) -> tuple[float, float, float]:
 
 def pareto(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
     """Which points no other beats: none is as good in both and better in one; bool, one per point."""
-    both = np.stack([cost, error], 1).astype(float)
-    return np.array([not any((other <= own).all() and (other < own).any() for other in both) for own in both], bool)
+    figures = np.stack([cost, error], 1).astype(float)
+    own, other = figures[:, None], figures
+    beaten = np.all(other <= own, axis=2) & np.any(other < own, axis=2)
+    return np.logical_not(np.any(beaten, axis=1))
 
 
 def all_checks(chart: Chart) -> list[Check]:
@@ -102,7 +112,7 @@ def all_checks(chart: Chart) -> list[Check]:
     checks = list(chart.checks)
     for task, points in chart.tasks.items():
         for default in (p for p in points if p.default):
-            rivals = [_error(p, chart) for p in points if span(p.cost)[0] <= span(default.cost)[0]]
+            rivals = [_error(p, chart) for p in points if p.at[0] <= default.at[0]]
             claim = f"{task}: % more error of the default than of the front at its cost"
             checks.append(Check(claim, _excess(_error(default, chart), min(rivals)), OFF_FRONT))
     return checks
@@ -130,8 +140,7 @@ def points_table(chart: Chart) -> Table:
         for p in points:
             marks = (("default", p.default), ("front", any(p is other for other in on_front)))
             mark = ", ".join(word for word, applies in marks if applies)
-            error = p.error if np.isfinite(span(p.error)).all() else None
-            rows.append((label, p.setting, p.cost, error, mark))
+            rows.append((label, p.setting, p.cost, p.error if p.drawable else None, mark))
     head = ("series", "setting", "cost", "quality" if chart.higher_is_better else "error", "")
     return Table(chart.name, f"{chart.title}: {chart.error}, by {chart.cost}", head, tuple(rows), chart.about)
 
@@ -148,9 +157,5 @@ def checks_table(charts: Iterable[Chart]) -> Table:
 
 def failed_checks(charts: Iterable[Chart]) -> dict[str, str]:
     """A sentence for each claim that does not hold."""
-    return {
-        f"{chart.name}, {c.claim}": f"{c.figure:.3g}, {c.bound} was claimed"
-        for chart in charts
-        for c in all_checks(chart)
-        if not c.holds
-    }
+    checks = [(chart, check) for chart in charts for check in all_checks(chart) if not check.holds]
+    return {f"{chart.name}, {c.claim}": f"{c.figure:.3g}, {c.bound} was claimed" for chart, c in checks}

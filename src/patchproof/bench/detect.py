@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from patchproof.bench.chart import Chart, Check, OnStage, Point, span
+from patchproof.bench.chart import Chart, Check, OnStage, Point
 from patchproof.bench.measure import clocked
 from patchproof.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
 from patchproof.claims import median
@@ -61,9 +61,9 @@ def _levels_chart(shots: list[Shot], size_px: tuple[int, int]) -> Chart:
             points.append(Point(setting, cost, error, coarsest_px == COARSEST_PX and find is find_fitted))
             shares.append((setting, trial.share))
     default = next(point for point in points if point.default)
-    checks = [Check("px of corner error by default", span(default.error)[0], 0.1)]
+    checks = [Check("px of corner error by default", default.at[1], 0.1)]
     if size_px == SIZES_PX[-1]:
-        checks.append(Check("milliseconds by default", span(default.cost)[0], MOST_MS))
+        checks.append(Check("milliseconds by default", default.at[0], MOST_MS))
     return Chart(
         name=f"levels_{megapixels}mp",
         title=f"Detection in photographs of {megapixels} MP: start size and refinement",

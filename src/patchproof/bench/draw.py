@@ -37,17 +37,15 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
     filled = [p for front in fronts.values() for p in front]
     for (label, points), color, marker in zip(chart.series.items(), _COLORS, _MARKERS, strict=False):
         axes.plot([], [], marker, color=color, mfc="white", ms=5, label=label)
-        for p in _drawable(points):
+        for p in (p for p in points if p.drawable):
             _draw_point(axes, p, color, marker, any(p is other for other in filled))
     for front, color in zip(fronts.values(), ("0.4",) if chart.one_front else _COLORS, strict=False):
-        axes.plot(
-            *np.array([(span(p.cost)[0], span(p.error)[0]) for p in front]).T, color=color, lw=1, ls="--", zorder=1
-        )
+        axes.plot(*np.array([p.at for p in front]).T, color=color, lw=1, ls="--", zorder=1)
     axes.plot([], [], color="0.4", lw=1, ls="--", label="Pareto front (filled)")
     axes.plot([], [], **_RING, label="default")
     if chart.target is not None:
         axes.axhline(chart.target, color="0.5", lw=1, ls=":", label=f"target {chart.target:g}")
-    _scale(axes, [p for points in chart.series.values() for p in _drawable(points)])
+    _scale(axes, [p for points in chart.series.values() for p in points if p.drawable])
     figure.suptitle(chart.title, x=0.01, ha="left")
     figure.supxlabel(machine, fontsize=6.5, color="0.35", x=0.995, ha="right")
     axes.set_xlabel(fill(chart.cost, _LINE))
@@ -57,10 +55,6 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(edgecolor="none", framealpha=0.8, fontsize=8)
     _write_settings(figure, axes, chart)
-
-
-def _drawable(points) -> list[Point]:
-    return [p for p in points if np.isfinite(span(p.error)).all()]
 
 
 def _draw_point(axes: Axes, point: Point, color: str, marker: str, filled: bool) -> None:
@@ -74,7 +68,7 @@ def _draw_point(axes: Axes, point: Point, color: str, marker: str, filled: bool)
 
 def _scale(axes: Axes, points: list[Point]) -> None:
     """Logarithmic axes where figures spread far."""
-    costs, errors = [span(p.cost)[0] for p in points], [span(p.error)[0] for p in points]
+    costs, errors = zip(*(p.at for p in points), strict=True)
     if max(costs) > 4 * min(costs) > 0:
         _plain_log(axes.xaxis, axes.set_xscale, max(costs) / min(costs))
     if max(errors) > 20 * min(errors) > 0:
@@ -96,14 +90,14 @@ def _write_settings(figure: Figure, axes: Axes, chart: Chart) -> None:
     from matplotlib.transforms import Bbox
 
     figure.draw_without_rendering()  # places are known only when the figure is laid out
-    named = [
-        (p, color) for points, color in zip(chart.series.values(), _COLORS, strict=False) for p in _drawable(points)
-    ]
-    at = axes.transData.transform([(span(p.cost)[0], span(p.error)[0]) for p, _ in named])
+    colored = zip(chart.series.values(), _COLORS, strict=False)
+    named = [(p, color) for points, color in colored for p in points if p.drawable]
+    at = axes.transData.transform([p.at for p, _ in named])
     taken = [Bbox([xy - 6, xy + 6]) for xy in at]
     for point, color in named:
-        place, style = (span(point.cost)[0], span(point.error)[0]), {"color": color, "fontsize": 8}
-        text = axes.annotate(point.setting, place, xytext=(0, 0), textcoords="offset points", **style)
+        text = axes.annotate(
+            point.setting, point.at, xytext=(0, 0), textcoords="offset points", color=color, fontsize=8
+        )
         text.set_in_layout(False)
 
         def move(right: bool, up: bool, text=text) -> Bbox:
@@ -121,4 +115,4 @@ def _hidden(box: Bbox, taken: list[Bbox], frame: Bbox) -> float:
     shared = (box.intersection(box, other) for other in taken)
     inside = box.intersection(box, frame)
     outside = box.width * box.height - (inside.width * inside.height if inside else 0.0)
-    return outside + sum(both.width * both.height for both in shared if both)
+    return outside + sum(part.width * part.height for part in shared if part)

@@ -81,8 +81,8 @@ def board_views(terms: np.ndarray, count: int, seed: int) -> list[View]:
         aside = rng.uniform(-0.25, 0.25, 2) * SIZE_PX / FOCAL_PX * away
         move = np.array([*aside, away]) - turn @ flat.mean(0)
         px = cv2.projectPoints(flat, cv2.Rodrigues(turn)[0], move, matrix, terms)[0].reshape(-1, 2)
-        seen = ((px > 5) & (px < np.array(SIZE_PX) - 5)).all(1)
-        if seen.sum() >= len(flat) // 2:
+        inside = ((px > 5) & (px < np.array(SIZE_PX) - 5)).all(1)
+        if inside.sum() >= len(flat) // 2:
             px = px + rng.normal(0, CORNER_NOISE_PX, px.shape)
-            views.append(View(f"{len(views):02d}.jpg", np.flatnonzero(seen), places[seen], px[seen], SIZE_PX))
+            views.append(View(f"{len(views):02d}.jpg", np.flatnonzero(inside), places[inside], px[inside], SIZE_PX))
     return views

@@ -98,9 +98,9 @@ def _choices(trials: list[Trial]) -> Table:
     """By driver: the chosen rung's error, how often it is near the best, what was chosen."""
     rows = []
     for driver in (*dict.fromkeys(trial.driver for trial in trials), "all"):
-        some = [trial for trial in trials if driver in (trial.driver, "all")]
-        errors, names = [trial.errors[trial.chosen] for trial in some], [trial.chosen for trial in some]
-        near = rate([trial.behind <= NEAR for trial in some])
+        own = [trial for trial in trials if driver in (trial.driver, "all")]
+        errors, names = [trial.errors[trial.chosen] for trial in own], [trial.chosen for trial in own]
+        near = rate([trial.behind <= NEAR for trial in own])
         picked = ", ".join(f"{name} {names.count(name)}" for name in sorted(set(names), key=names.count)[::-1])
         rows.append((driver, mean(errors), max(errors), near, picked))
     head = ("printer", "ΔE00 of the chosen", "worst", f"within {NEAR} of the best", "chosen")
@@ -116,13 +116,13 @@ def try_printer(seed: int, swatches: int) -> Trial:
     shot = photograph_page(printed_page(manifest, shows), seed)
     light = read_chart(shot.photo, manifest).light
     usable = np.isfinite(light).all(1)
-    sent, seen = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
+    sent, shown = np.array([s.srgb for s in manifest.chart])[usable], srgb_from_linear(light[usable])
     kinds = kinds_of_maps(priors)
-    choice = choose(kinds, sent, seen)
+    choice = choose(kinds, sent, shown)
     truth, errors = shown_by(shows, shot, held_out_colors()), {}
     for kind in (kind for kind in kinds if kind.name not in choice.left_out):
-        seen_by = relative(kind.fit(*distinct(sent, seen)), held_out_colors())
-        errors[kind.name] = float(difference(seen_by, truth).mean())
+        predicted = relative(kind.fit(*distinct(sent, shown)), held_out_colors())
+        errors[kind.name] = float(difference(predicted, truth).mean())
     return Trial(driver, swatches, errors, choice.seconds, choice.chosen.name)
 
 

@@ -65,14 +65,14 @@ def markers_chart(count: int, on_stage: OnStage) -> Chart:
         photo = photographed(sheet, rng)
         for n, ids in MARKERS.items():
             places = {i: corners_mm()[i] for i in ids}
-            result, taken = clocked(partial(find_sheet, photo, frozenset(ids), places, DICTIONARY))
-            corners = result.corners_px
+            sightings, taken = clocked(partial(find_sheet, photo, frozenset(ids), places, DICTIONARY))
             milliseconds[n].append(taken)
             for way, covered in ways.items():
-                seen = {i: px for i, px in corners.items() if i not in covered}
-                errors[way, n].append(error_mm(plane(seen), sheet) if seen else np.inf)
+                left = {i: px for i, px in sightings.corners_px.items() if i not in covered}
+                errors[way, n].append(error_mm(plane(left), sheet) if left else np.inf)
         on_stage("markers", seed + 1, count)
     default = len(lay_out_piece(DESIGN_MM[2:], MARKER_MM, "", "design").markers)
+    times = [(n, median(ms)) for n, ms in milliseconds.items()]
     area = 100 * (MARKER_MM * (MODULES + 2) / MODULES) ** 2 / PIECE_MM**2
     return Chart(
         name="markers",
@@ -83,14 +83,7 @@ def markers_chart(count: int, on_stage: OnStage) -> Chart:
         about=f"{count} photographs of {SIZE_PX[0]} × {SIZE_PX[1]} px of a piece of {PIECE_MM:g} mm with markers of "
         f"{MARKER_MM:g} mm, tilt to 45°. 1: a corner, 2: two opposite corners, 4: all corners, 8: and the sides' "
         "middles, which the frame has room for. With its only marker covered a sheet is not found: no point.",
-        tables=(
-            Table(
-                "markers_time",
-                "Time to find markers",
-                ("markers", "ms"),
-                tuple((n, median(ms)) for n, ms in milliseconds.items()),
-            ),
-        ),
+        tables=(Table("markers_time", "Time to find markers", ("markers", "ms"), tuple(times)),),
     )
 
 

@@ -49,7 +49,7 @@ class Texels:
     where: Layout
     table: Tensor
 
-    def seen(self, look: Look, taps: int) -> Tensor:
+    def colors(self, look: Look, taps: int) -> Tensor:
         """The P×3 that a view's pixels see."""
         first = torch.zeros(len(look.truth), dtype=torch.long)
         return look_up(footprint(self.where, first, *look.uv, taps, blocks=True), self.table)
@@ -73,11 +73,11 @@ def texture_chart(world: World, widths_px: Sequence[int], rounds: int, on_stage:
             looks.append(look(world.piece, picture, *view))
             on_stage("texture", len(series) * len(views) + len(looks), len(kinds) * len(views))
         with torch.no_grad():
-            quality = {taps: [psnr(content.seen(view, taps), view.truth) for view in looks] for taps in TAPS}
+            quality = {taps: [psnr(content.colors(view, taps), view.truth) for view in looks] for taps in TAPS}
 
         def work(taps: int, looks=looks, content=content) -> None:
             for view in looks:
-                torch.autograd.grad(content.seen(view, taps).sum(), content.table)
+                torch.autograd.grad(content.colors(view, taps).sum(), content.table)
 
         seconds = timed({taps: lambda taps=taps, work=work: work(taps) for taps in TAPS}, rounds)
         series[kind] = [

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from torch import Tensor
@@ -18,7 +17,7 @@ from torch import Tensor
 from patchproof.bench.chart import Chart, OnStage, Point
 from patchproof.bench.world import demo_problem, set_world, with_optimize
 from patchproof.claims import Estimate, paired_means, standard_deviation, student_mean
-from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selections, selects, steps
+from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
@@ -33,20 +32,8 @@ SIGN, QUICK_SIGN = (0.01, 0.03, 0.1), (0.03,)
 SAMPLES, QUICK_SAMPLES = (8, 16, 32, 64, 128, 256), (8, 16, 32, 64)
 
 
-@dataclass(frozen=True)
-class Run:
-    """Settings of the loop that are compared; by default its own."""
-
-    views: int = OptimizeSettings().views
-    optimizer: Literal["adam", "sign"] = OptimizeSettings().optimizer
-    step_size: float = Patch.STEP_SIZE
-
-    def settings(self, number: int) -> OptimizeSettings:
-        """For so many steps."""
-        return OptimizeSettings(steps=number, views=self.views, optimizer=self.optimizer, step_size=self.step_size)
-
-
-Losses = Mapping[tuple[Run, int], Sequence[float]]  # by settings and training views, one per seed
+USUAL = OptimizeSettings(step_size=Patch.STEP_SIZE)
+Losses = Mapping[tuple[OptimizeSettings, int], Sequence[float]]  # by settings and training views, one per seed
 
 
 @dataclass(frozen=True)
@@ -61,10 +48,11 @@ class Effort:
 def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     """Every chart of training, one after the other."""
     effort = Effort(120, 3, 64) if quick else Effort(960, 4, 256)
-    views = {f"{n}": Run(n) for n in (QUICK_VIEWS if quick else VIEWS)}
-    moves = {f"adam {size:g}": Run(step_size=size) for size in (QUICK_ADAM if quick else ADAM)}
-    moves |= {f"sign {size:g}": Run(optimizer="sign", step_size=size) for size in (QUICK_SIGN if quick else SIGN)}
-    losses = trained_losses(demo_problem(), {*views.values(), *moves.values()}, effort, on_stage)
+    views = {f"{n}": USUAL.changed(views=n) for n in (QUICK_VIEWS if quick else VIEWS)}
+    moves = {f"adam {size:g}": USUAL.changed(step_size=size) for size in (QUICK_ADAM if quick else ADAM)}
+    for size in QUICK_SIGN if quick else SIGN:
+        moves[f"sign {size:g}"] = USUAL.changed(optimizer="sign", step_size=size)
+    losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, on_stage)
     yield runs_chart("views", "Views per step, for as many views in all", views, losses, effort)
     yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
     yield draws_chart(quick, on_stage)
@@ -73,14 +61,14 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
 # Views per step, and how the design moves: quality after as many views
 
 
-def runs_chart(name: str, title: str, runs: Mapping[str, Run], losses: Losses, effort: Effort) -> Chart:
+def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], losses: Losses, effort: Effort) -> Chart:
     """Settings by name, after half of the views and after all, against the loss of what has been trained."""
     columns = [(setting, run, end) for setting, run in runs.items() for end in ends_of(run, effort)]
     series: dict[int, list[Point]] = {end: [] for end in sorted({end for _, _, end in columns})}
     table = np.array([losses[run, end] for _, run, end in columns]).T
     for (setting, run, end), loss in zip(columns, paired_means(table), strict=True):
-        cost = network_views(run.views, end // run.views)
-        series[end].append(Point(setting, cost, loss, run == Run() and end == effort.views))
+        cost = views_seen(run.changed(steps=end // run.views))
+        series[end].append(Point(setting, cost, loss, run == USUAL and end == effort.views))
     return Chart(
         name=name,
         title=title,
@@ -93,28 +81,21 @@ def runs_chart(name: str, title: str, runs: Mapping[str, Run], losses: Losses, e
     )
 
 
-def ends_of(run: Run, effort: Effort) -> list[int]:
+def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
     """Training views after which a run is charted: there the design was tried on the selection set."""
-    settings = OptimizeSettings(views=run.views)
-    return [end for end in (effort.views // 2, effort.views) if selects(settings, end // run.views)]
-
-
-def network_views(views: int, steps_done: int) -> int:
-    """Views that a network sees in so many steps, selection included."""
-    settings = OptimizeSettings(views=views, steps=steps_done)
-    return views * steps_done + SELECT_VIEWS * selections(settings)
+    return [end for end in (effort.views // 2, effort.views) if selects(run, end // run.views)]
 
 
 def trained_losses(
-    problem: Problem, runs: Collection[Run], effort: Effort, on_stage: OnStage
-) -> dict[tuple[Run, int], list[float]]:
+    problem: Problem, runs: Collection[OptimizeSettings], effort: Effort, on_stage: OnStage
+) -> dict[tuple[OptimizeSettings, int], list[float]]:
     """Losses on new conditions, the same for every design."""
     shown = {}
     for seed in range(effort.seeds):
         for i, run in enumerate(runs):
             ends = ends_of(run, effort)
             numbers = [end // run.views for end in ends]
-            designs = trained(with_optimize(problem, run.settings(numbers[-1]), seed), numbers)
+            designs = trained(with_optimize(problem, run.changed(steps=numbers[-1]), seed), numbers)
             shown |= {(run, end, seed): problem.subject.shown(d) for end, d in zip(ends, designs, strict=True)}
             on_stage("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)

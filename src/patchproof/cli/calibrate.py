@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from patchproof.cli.console import Overwrite, pair_of, progress, say, warn
 
 
-class Intent(str, Enum):
-    """How a driver brings colors into its printer's gamut."""
-
-    relative = "relative"
-    perceptual = "perceptual"
-
-
 def printer(
     out: Annotated[Path, typer.Option(help="NAME.npz; NAME.json is written beside it.")],
     more: Annotated[list[Path] | None, typer.Argument(metavar="[PHOTO]...", help="More photographs.")] = None,
     icc: Annotated[Path | None, typer.Option(help="An RGB or CMYK output profile.")] = None,
-    intent: Annotated[Intent, typer.Option(help="The profile's intent that the driver is set to.")] = Intent.relative,
+    intent: Annotated[
+        Literal["relative", "perceptual"], typer.Option(help="The profile's intent that the driver is set to.")
+    ] = "relative",
     licence: Annotated[str, typer.Option(help="Of the profile, for the record.")] = "unknown",
     source: Annotated[str, typer.Option(help="Where the profile is from, for the record.")] = "unknown",
     chart: Annotated[
@@ -39,7 +33,7 @@ def printer(
     if (icc is None) == (chart is None) or (more and chart is None):
         raise typer.BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
     if icc is not None:
-        lines, warned = printer_from_icc(icc, out, intent.value == "perceptual", licence, source, overwrite), ()
+        lines, warned = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
     elif sheet is None:
         raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
     else:
@@ -64,5 +58,5 @@ def camera(
 
     ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
     with progress() as bar:
-        found = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
-    say(*calibration_lines(found), f"camera: {out}")
+        fitted = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
+    say(*calibration_lines(fitted), f"camera: {out}")

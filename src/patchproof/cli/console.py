@@ -24,26 +24,13 @@ Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
     """A bar with time left on standard error: call it with a stage's name, what is done, and the total."""
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
-    columns = (
-        TextColumn("{task.description:>12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        tasks: dict[str, TaskID] = {}
+    times = rich.TimeElapsedColumn(), rich.TimeRemainingColumn()
+    columns = rich.TextColumn("{task.description:>12}"), rich.BarColumn(), rich.MofNCompleteColumn(), *times
+    with rich.Progress(*columns, console=Console(stderr=True)) as progress:
+        tasks: dict[str, rich.TaskID] = {}
 
         def advance(stage: str, done: int, total: int) -> None:
             if stage not in tasks:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from typer.core import TyperCommand
@@ -12,20 +11,12 @@ from typer.core import TyperCommand
 from patchproof.cli.console import Cluster, Jobs, Overwrite, Resume, names_of, progress, say, say_study
 
 
-class Hardening(str, Enum):
-    """Ways to step towards the true class."""
-
-    pgd = "pgd"
-    fgsm = "fgsm"
-    adam = "adam"
-
-
 def harden(
     images: Annotated[Path, typer.Argument(help="A folder of images.")],
     labels: Annotated[Path, typer.Option(help="CSV: file name, label.")],
     model: Annotated[str, typer.Option(help="Comma-separated classifiers to harden for, all together.")],
     out: Annotated[Path, typer.Option(help="Folder for the PNGs and the tables.")],
-    method: Annotated[Hardening, typer.Option(help="How to step.")] = Hardening.pgd,
+    method: Annotated[Literal["pgd", "fgsm", "adam"], typer.Option(help="How to step.")] = "pgd",
     eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
     steps: Annotated[int, typer.Option(min=1, help="Steps.")] = 100,
     step_size: Annotated[float | None, typer.Option(help="In place of the method's own.")] = None,
@@ -48,7 +39,7 @@ def harden(
         "models": names_of(model),
         "together": True,
         "judges": names_of(judges) or (),
-        "methods": (method.value,),
+        "methods": (method,),
         "epsilons": (eps,),
         "steps": steps,
         "step_size": step_size,

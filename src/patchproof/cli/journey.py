@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -24,24 +23,8 @@ from patchproof.cli.console import (
     warn,
 )
 
-
-class Control(str, Enum):
-    """Controls that can be printed."""
-
-    mean = "mean"
-    gray = "gray"
-    noise = "noise"
-    shuffled = "shuffled"
-    blank = "blank"
-
-
-class Shown(str, Enum):
-    """What hangs on the object in place of the design."""
-
-    bare = "bare"
-    mean = "mean"
-    gray = "gray"
-    noise = "noise"
+Control = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
+Shown = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
 
 
 def demo(
@@ -72,11 +55,11 @@ def plan(
     if out is not None:
         check_file(out, overwrite)
     with progress() as bar:
-        found = plan_scene(scene, timing=not no_timing, on_stage=bar)
-    warn(found.warnings)
-    say(*plan_lines(found))
+        planned = plan_scene(scene, timing=not no_timing, on_stage=bar)
+    warn(planned.warnings)
+    say(*plan_lines(planned))
     if out is not None:
-        write_whole(out, lambda path: path.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8"))
+        write_whole(out, planned.model_dump_json(indent=1) + "\n")
 
 
 def optimize(
@@ -158,13 +141,12 @@ def sheet(
     paths = manifest_paths(out, len(runs))
     for path in (out, *paths):
         check_file(path, overwrite)
-    kind = control.value if control else None
     if not runs:
-        manifests = [blank_page(out, template=template, control=kind)]
+        manifests = [blank_page(out, template=template, control=control)]
     elif len(runs) == 1:
-        manifests = [sheet_of(load_run(runs[0]), out, template=template, control=kind, copies=copies)]
+        manifests = [sheet_of(load_run(runs[0]), out, template=template, control=control, copies=copies)]
     else:
-        manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=kind)
+        manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=control)
     for manifest, path in zip(manifests, paths, strict=True):
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
@@ -201,7 +183,7 @@ def reprint(
     if path_traced and scan_dpi is not None:
         raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
     made = load_run(run)
-    how = Hanging(printer, scale, control.value if control else None, path_traced)
+    how = Hanging(printer, scale, control, path_traced)
     if scan_dpi is not None:
         truth = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
     else:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import ast
 import inspect
 import json
-import tokenize
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import lru_cache, partial
-from importlib import import_module
+from itertools import takewhile
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -32,7 +31,6 @@ nearest one that does. `[low, high]` is a range to draw from. Paths are relative
 `${VAR}` in them is expanded.
 """
 _UNITS = {"mm": "mm", "deg": "°", "px": "px", "ev": "stops"}
-_BOUNDS = ("ge", "gt", "le", "lt", "min_length")
 _WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
 
 
@@ -62,41 +60,24 @@ def keys_page(name: str | None = None) -> str:
     return _document(name, *known[name], {})
 
 
+@lru_cache
 def meanings(model: type[Strict]) -> dict[str, str]:
     """By key the comment that says what it means; a key without one is missing."""
-    return {
-        key: text
-        for owner in reversed(model.__mro__)
-        if issubclass(owner, Strict) and owner is not Strict
-        for key, text in _comments(owner.__module__).get(owner.__qualname__, {}).items()
-    }
-
-
-@lru_cache
-def _comments(module: str) -> dict[str, dict[str, str]]:
-    """By class and field of a module the comment at the field's end, else the one above it."""
-    source = inspect.getsource(import_module(module))
-    lines = iter(source.splitlines(keepends=True))
-    tokens = tokenize.generate_tokens(lambda: next(lines, ""))
-    comments = {token.start[0]: token for token in tokens if token.type == tokenize.COMMENT}
-
-    def comment(field: ast.AnnAssign) -> str | None:
-        if (last := field.end_lineno) in comments:
-            return comments[last].string.lstrip("# ")
-        first = above = field.lineno
-        while above - 1 in comments and comments[above - 1].start[1] == field.col_offset:
-            above -= 1
-        return " ".join(comments[line].string.lstrip("# ") for line in range(above, first)) or None
-
-    return {
-        node.name: {
-            field.target.id: text
-            for field in node.body
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and (text := comment(field))
-        }
-        for node in ast.parse(source).body
-        if isinstance(node, ast.ClassDef)
-    }
+    texts = {}
+    for owner in reversed(model.__mro__):
+        if not issubclass(owner, Strict) or owner is Strict:
+            continue
+        source = inspect.getsource(owner)
+        lines = source.splitlines()
+        (definition,) = ast.parse(source).body
+        for field in definition.body if isinstance(definition, ast.ClassDef) else ():
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                above = takewhile(lambda line: line.startswith("    # "), lines[field.lineno - 2 :: -1])
+                text = lines[(field.end_lineno or field.lineno) - 1].partition("  # ")[2] or " ".join(
+                    [*above][::-1]
+                ).replace("    # ", "")
+                texts |= {field.target.id: text} if text else {}
+    return texts
 
 
 def _document(name: str, about: str, settings: type[Strict], where: dict[type[Strict], str]) -> str:
@@ -132,14 +113,8 @@ def _models_in(hint: Any, many: bool = False) -> Iterator[tuple[type[Strict], bo
 
 def _row(model: type[Strict], key: str, field: FieldInfo) -> str:
     kind = _kind(get_type_hints(model, include_extras=True)[key])
-    unit = _UNITS.get(key.rpartition("_")[2], "")
-    cells = (
-        f"`{key}`",
-        kind,
-        unit,
-        _default(field),
-        meanings(model).get(key, "its own table" if kind.startswith("table") else ""),
-    )
+    meaning = meanings(model).get(key, "its own table" if kind.startswith("table") else "")
+    cells = (f"`{key}`", kind, _UNITS.get(key.rpartition("_")[2], ""), _default(field), meaning)
     return "| " + " | ".join(map(_cell, cells)) + " |"
 
 
@@ -178,9 +153,8 @@ def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
     if origin is dict:
         return f"table{plural} of {_kind(inner[1], plural='s')}"
     if origin is tuple and inner[-1] is Ellipsis:
-        least = int(_limits(checks).get("min_length", 0))
-        some = {0: "", 1: ", not empty"}.get(least, f", {least} or more")
-        return f"list of {_kind(inner[0], plural='s')}{some}"
+        least = max((value for name, value in _bounds(checks) if name == "min_length"), default=0)
+        return f"list of {_kind(inner[0], plural='s')}{ {0: '', 1: ', not empty'}.get(least, f', {least} or more') }"
     if origin is tuple and AfterValidator(ordered) in checks:
         return f"[low, high]{_range((*get_args(inner[0])[1:], *checks))}"
     if origin is tuple:
@@ -191,31 +165,23 @@ def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
 
 
 def _range(checks: tuple[Any, ...]) -> str:
-    limits = _limits(checks)
-    # the tighter one of two; of equal ones the one that leaves the end out
-    low = max(
-        ((limits[name], name == "gt", sign) for name, sign in (("ge", "≥"), ("gt", ">")) if name in limits),
-        default=None,
-    )
-    high = min(
-        ((limits[name], name == "le", sign) for name, sign in (("le", "≤"), ("lt", "<")) if name in limits),
-        default=None,
-    )
-    if low and high and low[2] + high[2] == "≥≤":
+    """The tighter one of two bounds; of equal ones the one that leaves the end out."""
+    bounds = _bounds(checks)
+    low = max(((value, name == "gt") for name, value in bounds if name in ("ge", "gt")), default=None)
+    high = min(((value, name == "le") for name, value in bounds if name in ("le", "lt")), default=None)
+    if low and high and (low[1], high[1]) == (False, True):
         return f", {low[0]:g} to {high[0]:g}"
-    return "".join(f", {end[2]} {end[0]:g}" for end in (low, high) if end)
+    parts = [f", {'>' if low[1] else '≥'} {low[0]:g}"] if low else []
+    return "".join([*parts, f", {'≤' if high[1] else '<'} {high[0]:g}"] if high else parts)
 
 
-def _limits(checks: tuple[Any, ...]) -> dict[str, float]:
-    """The tightest of the bounds that a type's checks set, by pydantic's names."""
-    limits: dict[str, float] = {}
+def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
+    """What a type's checks bound it by, by pydantic's names."""
+    bounds = []
     for check in checks:
         if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # strict.within
-            given = dict(zip(("ge", "le"), check.func.args, strict=True))
-        else:
-            bounds = getattr(check, "metadata", ())
-            given = {name: getattr(bound, name) for bound in bounds for name in _BOUNDS if hasattr(bound, name)}
-        for name, value in given.items():
-            tighter = max if name.startswith("g") else min
-            limits[name] = tighter(limits.get(name, value), value)
-    return limits
+            bounds += zip(("ge", "le"), check.func.args, strict=True)
+        for limit in getattr(check, "metadata", ()):
+            names = ("ge", "gt", "le", "lt", "min_length")
+            bounds += [(name, getattr(limit, name)) for name in names if hasattr(limit, name)]
+    return bounds

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from patchproof.color import LUMINANCE, linear_from_srgb
+from patchproof.color import LIGHT_OF_CODE, LUMINANCE
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.rectify import part_around, reduced
 
@@ -210,7 +210,12 @@ def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borde
 
 def luminance(srgb: np.ndarray) -> np.ndarray:
     """Linear luminance H×W float32 of uint8 sRGB."""
+<<<<<<< HEAD
     table, weights = np.repeat(LIGHT[None, :, None], 3, 2), np.array([LUMINANCE], np.float32)
+=======
+    table = np.repeat(LIGHT_OF_CODE.astype(np.float32)[None, :, None], 3, 2)
+    weights = np.array([LUMINANCE], np.float32)
+>>>>>>> pb2
     out = np.empty(srgb.shape[:2], np.float32)
     for rows in _strips(srgb):  # the table makes 12 bytes of each pixel
         cv2.transform(cv2.LUT(srgb[rows], table), weights, out[rows])

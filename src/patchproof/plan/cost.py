@@ -58,13 +58,8 @@ def measure_cost(
     median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
     total = sum(median.values())
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
-    return Cost(
-        views=settings.views,
-        side_px=problem.training_px,
-        threads=torch.get_num_threads(),
-        ms=total,
-        parts=parts,
-    )
+    threads = torch.get_num_threads()
+    return Cost(views=settings.views, side_px=problem.training_px, threads=threads, ms=total, parts=parts)
 
 
 def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tensor) -> dict[str, float]:
@@ -73,17 +68,16 @@ def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tens
     for number in range(REPEATS + 1):
         conditions = problem.scene.draw("train", views, start=number * views)
         for name, other in others.items():
-            own_ms, other_ms = (sum(_step_ms(each, design, conditions).values()) for each in (problem, other))
+            own_ms, other_ms = (sum(_step_ms(p, design, conditions).values()) for p in (problem, other))
             ratios[name].append(other_ms / own_ms)
     return {name: statistics.median(values[1:]) for name, values in ratios.items()}
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
     """Milliseconds of each part of one step, in the order of the loop."""
-    clock = _Clock(problem.device)
     design = design.clone().requires_grad_()
     parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
-    clock.start()
+    clock = _Clock(problem.device)
     shown = problem.subject.shown(design)
     parts[problem.subject.LOOK] = clock.lap()
     pictures = expose(views, shown)
@@ -105,8 +99,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
 
 def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dict[str, float], Views]:
     """(milliseconds of the parts of `see`, the views)."""
-    clock, size = _Clock(problem.device), (problem.training_px, problem.training_px)
-    clock.start()
+    size, clock = (problem.training_px, problem.training_px), _Clock(problem.device)
     views = problem.see(shown, conditions, problem.training_px)
     whole = clock.lap()
     see(problem.stage, None, conditions, size)
@@ -129,15 +122,11 @@ class _Clock:
 
     def __init__(self, device: torch.device):
         self._device, self._last = device, 0.0
-
-    def start(self) -> None:
-        """Begin now."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        self._last = time.perf_counter()
+        self.lap()
 
     def lap(self) -> float:
         """Milliseconds since the last time, and begin again."""
-        before = self._last
-        self.start()
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        before, self._last = self._last, time.perf_counter()
         return 1000 * (self._last - before)

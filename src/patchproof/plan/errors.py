@@ -10,7 +10,6 @@ Left out on purpose: interactions of terms, but for one check of all that can go
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -80,27 +79,33 @@ def measure_terms(
     terms = scene_terms(problem, design, other_surface)
     changed = {term.name: setup for term in terms if (setup := term.change(base)) is not None}
     on = [term for term in terms if term.name in changed]
-    photo = Album(problem, base, min(problem.scene.settings.camera.photo_px))
-    advance = _counter(on_view, 3 * len(conditions))
+    photo_px = min(problem.scene.settings.camera.photo_px)
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        on_view(done, 3 * len(conditions))
+
     with torch.no_grad():
         wholes = [term for term in on if term.whole]
-        whole = photo.look([changed[term.name] for term in wholes], advance)
-        small = Album(problem, base, problem.training_px).look([changed[t.name] for t in on], advance)
+        whole = _squares(problem, photo_px, base, [changed[term.name] for term in wholes], advance)
+        small = _squares(problem, problem.training_px, base, [changed[term.name] for term in on], advance)
         points = _point_sampled(problem, base)
         confidence = _confidence(problem, whole[0])
         threshold = float(confidence.std()) / selection_views**0.5
-        rows = {}
-        for term, pictures in zip(on, small[1:], strict=True):
-            rows[term.name] = _row(problem, term, small[0], pictures)
+        rows = {t.name: _row(problem, t, small[0], pictures) for t, pictures in zip(on, small[1:], strict=True)}
         for term, pictures in zip(wholes, whole[1:], strict=True):
             shows = bool(rows[term.name].codes_mean)
             rows[term.name] = _row(problem, term, whole[0], pictures).changed(in_training=shows)
-        for term in _RENDERED:
-            if term.name in points:
-                rows[term.name] = _row(problem, term, points[""], points[term.name])
+        rows |= {t.name: _row(problem, t, points[""], points[t.name]) for t in _RENDERED if t.name in points}
         judged = {row.name: row for row in _judged(terms, rows, threshold)}
-        gone = [term for term in on if term.key and judged[term.name].verdict == "can go"]
-        together = _together(problem, photo, gone, confidence, advance)
+        gone, setup, together = [t for t in on if t.key and judged[t.name].verdict == "can go"], base, None
+        for term in gone:
+            setup = term.change(setup) or setup
+        if gone:
+            (pictures,) = _squares(problem, photo_px, setup, [], advance)
+            together = float((_confidence(problem, pictures) - confidence).abs().mean())
     return Terms(
         views=len(conditions),
         confidence=float(confidence.mean()),
@@ -132,17 +137,6 @@ def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: floa
     ]
 
 
-def _counter(on_view: Callable[[int, int], None], total: int) -> Callable[[int], None]:
-    done = 0
-
-    def advance(n: int) -> None:
-        nonlocal done
-        done += n
-        on_view(done, total)
-
-    return advance
-
-
 def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermError:
     codes = (255 * (changed - base)).abs().cpu().numpy()
     change = _confidence(problem, changed) - _confidence(problem, base)
@@ -157,58 +151,40 @@ def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermErr
     )
 
 
-def _together(
-    problem: Problem, photo: Album, gone: list[Term], confidence: Tensor, on_view: Callable[[int], None]
-) -> float | None:
-    """The mean absolute change of confidence when all of these are left out at once; None of none."""
-    if not gone:
-        return None
-    setup = photo.base
-    for term in gone:
-        setup = term.change(setup) or setup
-    pictures = replace(photo, base=setup).look([], on_view)[0]
-    return float((_confidence(problem, pictures) - confidence).abs().mean())
-
-
 def _confidence(problem: Problem, pictures: Tensor) -> Tensor:
     """N confidences of the primary classifier in the target."""
     classifier = problem.classifiers[0]
     return classifier.confidence(classifier.logits(pictures), problem.indices[0])
 
 
-@dataclass(frozen=True)
-class Album:
-    """Square views of one size, as the primary classifier gets them."""
+def _squares(
+    problem: Problem, side_px: int, base: Setup, setups: list[Setup], on_view: Callable[[int], None]
+) -> Tensor:
+    """(1 + len(setups))×N×3×S×S views as the primary classifier gets them: the base setup's, then each other one's."""
+    size_px, stack = (side_px, side_px), []
+    for rows in _chunks(len(base.conditions), side_px):
+        views, parts = _views(base, base.conditions[rows], size_px), []
+        for setup in (base, *setups):
+            conditions = setup.conditions[rows]
+            same = setup.stage is base.stage and setup.supersample == base.supersample
+            same = same and (conditions.pose.printed_scale == base.conditions.pose.printed_scale).all()
+            shown = relit(views, conditions) if same else _views(setup, conditions, size_px)
+            parts.append(_pictures(problem, shown, setup.shown))
+        stack.append(torch.stack(parts))
+        on_view(len(base.conditions))
+    return torch.cat(stack, 1)
 
-    problem: Problem
-    base: Setup
-    side_px: int
 
-    def look(self, setups: list[Setup], on_view: Callable[[int], None]) -> Tensor:
-        """(1 + len(setups))×N×3×S×S: the base setup's pictures, then those of each other one."""
-        stack = []
-        for rows in _chunks(len(self.base.conditions), self.side_px):
-            base = self._views(self.base, self.base.conditions[rows])
-            parts = []
-            for setup in (self.base, *setups):
-                conditions = setup.conditions[rows]
-                same = setup.stage is self.base.stage and setup.supersample == self.base.supersample
-                same = same and (conditions.pose.printed_scale == base.conditions.pose.printed_scale).all()
-                views = relit(base, conditions) if same else self._views(setup, conditions)
-                parts.append(self._pictures(views, setup.shown))
-            stack.append(torch.stack(parts))
-            on_view(len(base.conditions))
-        return torch.cat(stack, 1)
+def _views(setup: Setup, conditions: Conditions, size_px: tuple[int, int]) -> Views:
+    return see(setup.stage, setup.shown, conditions, size_px, setup.supersample)
 
-    def _views(self, setup: Setup, conditions: Conditions) -> Views:
-        return see(setup.stage, setup.shown, conditions, (self.side_px, self.side_px), setup.supersample)
 
-    def _pictures(self, views: Views, shown: Shown) -> Tensor:
-        """A whole photograph goes through a real JPEG, a training view as training exposes it."""
-        pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
-        if not views.reduced and quality.any():
-            pictures = _stored(pictures, quality)
-        return center_square(pictures, self.problem.classifiers[0].input_px)
+def _pictures(problem: Problem, views: Views, shown: Shown) -> Tensor:
+    """A whole photograph goes through a real JPEG, a training view as training exposes it."""
+    pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
+    if not views.reduced and quality.any():
+        pictures = _stored(pictures, quality)
+    return center_square(pictures, problem.classifiers[0].input_px)
 
 
 def _chunks(views: int, side_px: int) -> list[slice]:
@@ -219,8 +195,7 @@ def _chunks(views: int, side_px: int) -> list[slice]:
 
 def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
     """Pictures N×3×H×W that were JPEG files in between."""
-    both = zip(pictures, quality, strict=True)
-    files = [image_bytes(as_pixels(picture), "JPEG", {"quality": int(one)}) for picture, one in both]
+    files = [image_bytes(as_pixels(p), "JPEG", {"quality": int(q)}) for p, q in zip(pictures, quality, strict=True)]
     return torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])
 
 
@@ -232,7 +207,7 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
     scene, parts = setup.stage.scene, []
     for rows in _chunks(len(base.conditions), _FINE * side):
         conditions = setup.conditions[rows]
-        views = see(setup.stage, setup.shown, conditions, (side, side))
+        views = _views(setup, conditions, (side, side))
         fine = photograph(setup.stage, setup.shown, conditions, (_FINE * side, _FINE * side), jpeg=False)
         points = fine[..., _FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
         rendered = expose(views, setup.shown, jpeg=False)
@@ -240,8 +215,8 @@ def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
         parts.append(
             torch.stack([rendered, torch.where(inside, points, rendered), torch.where(edge, points, rendered)])
         )
-    both = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
-    rendered, inside, edge = both.unflatten(0, (3, -1))
+    squares = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
+    rendered, inside, edge = squares.unflatten(0, (3, -1))
     named = {"": rendered, "footprint filtering": inside}
     return named | {"piece's edges": edge} if scene.HAS_PIECE else named
 

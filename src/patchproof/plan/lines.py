@@ -81,8 +81,8 @@ def _term_lines(plan: Plan) -> list[str]:
 
 
 def _term_line(term: TermError) -> str:
-    said = {"keep": "keep", "can go": "can go", "missing": "missing in training", "left out": "rightly left out"}
-    verdict = said[term.verdict] if term.key or term.verdict != "can go" else "matters little"
+    words = {"missing": "missing in training", "left out": "rightly left out"}
+    verdict = words.get(term.verdict, term.verdict) if term.key or term.verdict != "can go" else "matters little"
     key = f" ({term.key})" if term.key else ""
     unseen = "; training's views do not show it" if term.in_training is False else ""
     return (

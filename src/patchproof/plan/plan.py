@@ -11,6 +11,7 @@ Left out on purpose: deciding for the user. The plan says what can go; the scene
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ class Surface(Strict):
 
 
 class Resolution(Strict):
-    """Pixels per millimetre at the 5 % and 95 % points of the views, and the design's own; null where unknown."""
+    """Pixels per millimeter at the 5 % and 95 % points of the views, and the design's own; null where unknown."""
 
     network_px: int
     photo_px: tuple[int, int]
@@ -106,11 +107,8 @@ def plan_scene(
     other, sentence = scene.other_surface()
     design, draft = _draft(problem, on_stage)
     conditions = scene.draw("select", views)
-    advance = lambda done, total: on_stage("terms", done, total)  # noqa: E731
-    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, advance)
-    cost = None
-    if timing:
-        cost = measure_cost(problem, design, lambda done, total: on_stage("cost", done, total))
+    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(on_stage, "terms"))
+    cost = measure_cost(problem, design, partial(on_stage, "cost")) if timing else None
     target = scene.settings.target
     return Plan(
         scene=Path(scene_path).name,

@@ -50,6 +50,6 @@ def _half(interval: tuple[float, float]) -> float:
 def sample_lines(samples: tuple[Sample, ...]) -> list[str]:
     """The ladder for the terminal."""
     return [
-        f"  {one.name:27} {one.n:4d} samples leave ±{one.half_width:.3f}, {one.next_n} would ±{one.next_half_width:.3f}"
-        for one in samples
+        f"  {s.name:27} {s.n:4d} samples leave ±{s.half_width:.3f}, {s.next_n} would ±{s.next_half_width:.3f}"
+        for s in samples
     ]

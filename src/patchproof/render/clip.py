@@ -31,12 +31,11 @@ def _cut(triangles: Tensor, owner: Tensor, distance: Tensor) -> tuple[Tensor, Te
     order = (odd[:, None] + torch.arange(3, device=odd.device)) % 3
     turned = triangles.gather(1, order[..., None].expand(-1, -1, 3))
     d = distance.gather(1, order)
-    one, two = count == 1, count == 2
-    tip = torch.stack([turned[one, 0], _crossing(turned, d, one, 0, 1), _crossing(turned, d, one, 0, 2)], 1)
-    p, q = _crossing(turned, d, two, 1, 0), _crossing(turned, d, two, 2, 0)
-    quad = [torch.stack([p, turned[two, 1], turned[two, 2]], 1), torch.stack([p, turned[two, 2], q], 1)]
-    whole = count == 3
-    return torch.cat([triangles[whole], tip, *quad]), torch.cat([owner[whole], owner[one], owner[two], owner[two]])
+    tips, quads, whole = count == 1, count == 2, count == 3
+    tip = torch.stack([turned[tips, 0], _crossing(turned, d, tips, 0, 1), _crossing(turned, d, tips, 0, 2)], 1)
+    p, q = _crossing(turned, d, quads, 1, 0), _crossing(turned, d, quads, 2, 0)
+    quad = [torch.stack([p, turned[quads, 1], turned[quads, 2]], 1), torch.stack([p, turned[quads, 2], q], 1)]
+    return torch.cat([triangles[whole], tip, *quad]), torch.cat([owner[m] for m in (whole, tips, quads, quads)])
 
 
 def _crossing(turned: Tensor, d: Tensor, which: Tensor, inside: int, outside: int) -> Tensor:

@@ -68,8 +68,8 @@ class LearnedTextures:
     def filled(self, design: Tensor) -> list[Tensor]:
         """H×W×3 per material."""
         parts = design[:, 0].T.split(self._counts)
-        both = zip(self._originals, self.masks, parts, strict=True)
-        return [original.masked_scatter(mask[..., None], part) for original, mask, part in both]
+        filled = zip(self._originals, self.masks, parts, strict=True)
+        return [original.masked_scatter(mask[..., None], part) for original, mask, part in filled]
 
     def images(self, design: Tensor) -> list[Tensor]:
         """3×H×W per material, 0 where nothing may change."""
@@ -86,13 +86,11 @@ class LearnedTextures:
 
     def textures(self, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
         """Whole uint8 textures with a design's pixels 1×M×3 in them."""
-        result, first = [], 0
-        for original, mask in zip(self._textures_srgb8, self.canvas.mask, strict=True):
-            texture, count = original.copy(), int(mask.sum())
-            texture[mask] = pixels[0, first : first + count]
-            result.append(texture)
-            first += count
-        return tuple(result)
+        textures = tuple(original.copy() for original in self._textures_srgb8)
+        parts = np.split(pixels[0], np.cumsum(self._counts)[:-1])
+        for texture, mask, part in zip(textures, self.canvas.mask, parts, strict=True):
+            texture[mask] = part
+        return textures
 
     @cached_property
     def masks(self) -> tuple[Tensor, ...]:

@@ -28,7 +28,7 @@ class Fragments:
     """What P covered pixels see. `pixel` is (view·H + y)·W + x, ascending; `view` and `face` are indices.
 
     `barycentric` P×3 and `depth` P (camera z, mm) are float32. `front` tells whether the face shows its outside.
-    `seen` P (into Q) and `slopes` 6×Q are what the derivatives of the barycentrics are computed from when asked for.
+    `rank` P (into Q) and `slopes` 6×Q are what the derivatives of the barycentrics are computed from when asked for.
     """
 
     pixel: Tensor
@@ -36,7 +36,7 @@ class Fragments:
     barycentric: Tensor
     depth: Tensor
     front: Tensor
-    seen: Tensor
+    rank: Tensor
     slopes: Tensor
     shape: tuple[int, int, int]  # views, height, width
 
@@ -65,7 +65,7 @@ class Fragments:
 
     def _derivative(self, axis: int) -> Tensor:
         # d(e_i / t) = (de_i - e_i/t · dt) / t
-        first, second, total = (self.slopes[2 * i + axis].index_select(0, self.seen) for i in range(3))
+        first, second, total = (self.slopes[2 * i + axis].index_select(0, self.rank) for i in range(3))
         b, z = self.barycentric, self.depth
         first.addcmul_(b[:, 1], total, value=-1).mul_(z)
         second.addcmul_(b[:, 2], total, value=-1).mul_(z)
@@ -74,7 +74,7 @@ class Fragments:
     def where(self, keep: Tensor) -> Fragments:
         """The fragments where `keep` (P, bool) is true."""
         index = keep.nonzero()[:, 0]
-        names = ("pixel", "face", "barycentric", "depth", "front", "seen")
+        names = ("pixel", "face", "barycentric", "depth", "front", "rank")
         return replace(self, **{name: getattr(self, name).index_select(0, index) for name in names})
 
 

@@ -111,7 +111,7 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     footprints, srgb = piece.texels, [picture.srgb]
     if drawn.misregistration_mm.any():
         footprints, srgb = _misregistered(views, picture)
-    table = torch.cat([texel_table([one if views.reduced else linear_from_srgb(one)], wrap=False) for one in srgb])
+    table = torch.cat([texel_table([s if views.reduced else linear_from_srgb(s)], wrap=False) for s in srgb])
     reflectance = look_up(footprints, table)
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)

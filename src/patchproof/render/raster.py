@@ -65,7 +65,7 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float)
         for start in range(first, last, CHUNK):
             part = slice(start, min(start + CHUNK, last))
             slopes.append(_resolve(fragments, part, points, faces, view, near_mm))
-            fragments.seen[part] += sum(s.shape[1] for s in slopes[:-1])
+            fragments.rank[part] += sum(s.shape[1] for s in slopes[:-1])
     return replace(fragments, slopes=torch.cat(slopes, 1))
 
 
@@ -252,18 +252,18 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     view = (row / height).floor_()
     x, y = at.sub_(row, alpha=width).add_(0.5), row.sub_(view, alpha=height).add_(0.5)
     pair = view.long().sub_(view0).mul_(len(faces)).add_(fragments.face[part])
-    owner, seen = _ranked(pair, points.shape[1] * len(faces))
+    owner, rank = _ranked(pair, points.shape[1] * len(faces))
     corners = _taken(points, [i.index_select(0, owner) for i in _corner_index(points, faces)])
     planes, volume = _planes(corners, near)
-    second, third, inverse = (_at_center(plane, seen, x, y) for plane in planes)
+    second, third, inverse = (_at_center(plane, rank, x, y) for plane in planes)
     # a center may lie up to 1/362 pixel outside of the unsnapped face, which near its horizon is far away
     deepest = max(float(corner[2].max()) for corner in corners)
     z = inverse.clamp_(0.5 / deepest, 1 / near).reciprocal_()
     second, third = second.mul_(z), third.mul_(z)
     fragments.barycentric[part] = columns(1 - second - third, second, third)
     fragments.depth[part] = z
-    fragments.front[part] = (volume < 0).index_select(0, seen)
-    fragments.seen[part] = seen
+    fragments.front[part] = (volume < 0).index_select(0, rank)
+    fragments.rank[part] = rank
     return torch.stack([t for plane in planes for t in plane[:2]]).float()
 
 
@@ -276,8 +276,8 @@ def _ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
     return distinct, rank.index_select(0, values)
 
 
-def _at_center(plane: list[Tensor], seen: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    a, b, c = (t.index_select(0, seen) for t in plane)
+def _at_center(plane: list[Tensor], rank: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    a, b, c = (t.index_select(0, rank) for t in plane)
     return c.addcmul_(a, x).addcmul_(b, y)
 
 

@@ -11,6 +11,7 @@ The object's edges take one sample per pixel, or `supersample`² on demand; thos
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +22,7 @@ from torch import Tensor
 from patchproof.channel.camera import encoded, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.color import LIGHT_OF_CODE, linear_from_srgb, srgb_from_linear
 from patchproof.render.fragments import Cameras, Fragments
 from patchproof.render.pixels import (
     OBJECT_LEARNED_TAPS,
@@ -116,8 +117,7 @@ class Views:
     @cached_property
     def _behind(self) -> Tensor:
         """The background's light before exposure, N·H·W × 3."""
-        codes = np.arange(256) / 255
-        tables = np.broadcast_to(linear_from_srgb(codes)[:, None], (len(self.background), 256, 3))
+        tables = np.broadcast_to(LIGHT_OF_CODE[:, None], (len(self.background), 256, 3))
         return _looked_up(self.background, tables, self.stage.device)
 
     @cached_property
@@ -126,7 +126,7 @@ class Views:
         if self.object is not None and self.object.samples > 1:
             return encoded((self.bare.view(len(self.conditions), -1, 3) * self.gains[:, None]).view(-1, 3))
         # the background has 256 codes per view and channel, which are exposed as a table
-        light = linear_from_srgb(np.arange(256) / 255)[:, None] * self.gains[:, None].cpu().double().numpy()
+        light = LIGHT_OF_CODE[:, None] * self.gains[:, None].cpu().double().numpy()
         image = _looked_up(self.background, srgb_from_linear(light.clip(0, 1)), self.stage.device)
         if self.object is None:
             return image
@@ -162,9 +162,7 @@ def see(stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, 
     if not stage.scene.HAS_OBJECT:
         return _see_pictures(stage, piece, conditions, size_px)
     scene = needs_mesh(stage.scene)
-    frame = Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
-    if stage.camera is not None:
-        frame = pinhole_frame(stage.camera, size_px)
+    frame = lens_frame(stage, scene, size_px)
     poses = scene.camera_from_world(conditions)
     light = _light(scene, stage.device, conditions)
     eye = torch.as_tensor(-(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], dtype=torch.float32)
@@ -183,7 +181,8 @@ def see(stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, 
         surface = drawn(stage.piece_surface, printed, 1)
         covering = surface if supersample == 1 else drawn(stage.piece_surface, printed, supersample)
         hidden = _hidden_share(surface, covering, fine, supersample)
-        parts = piece_pixels(stage.piece_surface, piece, surface, hidden, needs_position=_local(light))
+        needs_position = light.lamp is not None or light.gloss is not None
+        parts = piece_pixels(stage.piece_surface, piece, surface, hidden, needs_position)
     pixel, local = _coarse_pixel(fine, supersample), light.lamp is not None
     return Views(
         stage,
@@ -192,7 +191,7 @@ def see(stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, 
         frame.size_px,
         light,
         eye.to(stage.device),
-        _background(scene, conditions, size_px, frame),
+        backgrounds(scene, conditions, size_px, frame),
         object_pixels(stage.object_surface, fine, pixel, supersample, local, taps),
         parts,
     )
@@ -221,11 +220,6 @@ def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Li
     return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, scene.middle_mm, device)
 
 
-def _local(light: Lighting) -> bool:
-    """Whether the light on the piece depends on where one is and where one looks from."""
-    return light.lamp is not None or light.gloss is not None
-
-
 def _coarse_pixel(fine: Fragments, samples: int) -> Tensor:
     """The pixel that each fragment lies in of a picture with `samples`² of them to the pixel."""
     if samples == 1:
@@ -238,15 +232,13 @@ def _coarse_pixel(fine: Fragments, samples: int) -> Tensor:
 
 def _hidden_share(piece: Fragments, covering: Fragments, front: Fragments, samples: int) -> Tensor:
     """Per fragment of the piece, the share of the piece's samples in its pixel that the object lies in front of."""
-    nearest = torch.full(
-        (covering.shape[0] * covering.shape[1] * covering.shape[2],), torch.inf, device=piece.depth.device
-    )
+    nearest = torch.full((math.prod(covering.shape),), torch.inf, device=piece.depth.device)
     nearest[front.pixel] = front.depth
     hidden = (nearest.index_select(0, covering.pixel) < covering.depth).float()
     if samples == 1:
         return hidden
-    pixel, count = _coarse_pixel(covering, samples), piece.shape[0] * piece.shape[1] * piece.shape[2]
-    sums = torch.zeros(2, count, device=hidden.device)
+    pixel = _coarse_pixel(covering, samples)
+    sums = torch.zeros(2, math.prod(piece.shape), device=hidden.device)
     sums[0].index_add_(0, pixel, hidden)
     sums[1].index_add_(0, pixel, torch.ones_like(hidden))
     return (sums[0] / sums[1].clamp_min(1)).index_select(0, piece.pixel)
@@ -264,7 +256,14 @@ def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditio
     return Views(stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts)
 
 
-def _background(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
+def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:
+    """The frame to render for pictures of `size_px`, with what a calibrated lens will bring into them."""
+    if stage.camera is None:
+        return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
+    return pinhole_frame(stage.camera, size_px)
+
+
+def backgrounds(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
     """What lies behind N views, uint8 N×H×W×3 before exposure; its edge goes on in a lens's margin."""
     photo_px = scene.settings.camera.photo_px
     pictures = [scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.pose.background]

@@ -6,10 +6,16 @@ running share of the nearest photographs, and is drawn only where there are enou
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+from patchproof.report.tables import drawn
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _INK = "#010203"  # stands for the page's own text color and is replaced in the SVG
 _YES, _NO = "#2a9d6f", "#d1495b"
@@ -115,24 +121,16 @@ def _running_share(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.convolve(x, window, "valid"), np.convolve(y, window, "valid")
 
 
-def _svg(draw) -> str:
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    # text stays text in the page's own font; ids follow from a fixed salt, so that reports have the same bytes
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "patchproof", "font.size": 9}):
-        figure = Figure(figsize=(4.2, 2.3), layout="constrained")
-        FigureCanvasSVG(figure)
+def _svg(draw: Callable[[Axes], None]) -> str:
+    def fill(figure: Figure) -> None:
         axes = figure.add_subplot()
         draw(axes)
         axes.spines[["top", "right"]].set_visible(False)
-        for spine in axes.spines.values():
-            spine.set_color(_INK)
+        axes.spines[:].set_color(_INK)
         axes.tick_params(colors=_INK)
         axes.xaxis.label.set_color(_INK)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
+
+    metadata = {"Date": None, "Creator": None}
+    text = drawn(fill, (4.2, 2.3), "svg", transparent=True, metadata=metadata).decode()
     text = text[text.index("<svg") :]
     return text.replace(_INK, "currentColor").replace("font-family: 'DejaVu Sans', sans-serif", "font-family: inherit")

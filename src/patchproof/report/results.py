@@ -14,10 +14,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from patchproof.claims import Estimate
 from patchproof.output import write_whole
 from patchproof.report.images import data_uri
-from patchproof.report.tables import Drawing, Table, csv_text, png, shown
+from patchproof.report.page import page
+from patchproof.report.tables import Drawing, Table, csv_text, png
 
 _LIBRARIES = ("patchproof", "torch", "numpy")
 
@@ -41,13 +41,24 @@ class Results:
 
 def write_results(folder: Path, results: Results) -> None:
     """Write all of it into the folder."""
+<<<<<<< HEAD
     versions = versions_of(_LIBRARIES)
     pictures = [(drawing, png(drawing)) for drawing in results.figures]
+=======
+    versions, pictures = _versions(), [(drawing, png(drawing)) for drawing in results.figures]
+>>>>>>> pb2
     for table in results.tables:
-        _write(folder / f"{results.name}_{table.name}.csv", csv_text(table).encode())
+        write_whole(folder / f"{results.name}_{table.name}.csv", csv_text(table))
     for drawing, content in pictures:
-        _write(folder / f"{results.name}_{drawing.name}.png", content)
-    _write(folder / f"{results.name}.html", _page(results, pictures, versions).encode())
+        write_whole(folder / f"{results.name}_{drawing.name}.png", content)
+    text = page(
+        "results.html.j2",
+        results=results,
+        pictures=[(drawing, data_uri(content)) for drawing, content in pictures],
+        settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
+        versions=versions,
+    )
+    write_whole(folder / f"{results.name}.html", text)
     data = {
         results.kind: results.name,
         "settings": results.settings,
@@ -61,28 +72,7 @@ def write_results(folder: Path, results: Results) -> None:
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """The data as a JSON file, written whole."""
-    _write(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
-
-
-def _write(path: Path, content: bytes) -> None:
-    write_whole(path, lambda part: part.write_bytes(content))
-
-
-def _page(results: Results, pictures: Sequence[tuple[Drawing, bytes]], versions: Mapping[str, str]) -> str:
-    import jinja2
-
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["shown"] = shown
-    environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
-    return environment.get_template("results.html.j2").render(
-        results=results,
-        pictures=[(drawing, data_uri(content)) for drawing, content in pictures],
-        settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
-        versions=versions,
-    )
+    write_whole(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def versions_of(libraries: Iterable[str]) -> dict[str, str]:

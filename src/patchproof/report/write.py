@@ -16,6 +16,7 @@ from typing import Any
 from patchproof.goal import Goal
 from patchproof.output import make_folder, write_whole
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
+from patchproof.report.page import page
 from patchproof.report.photo_table import photos_csv
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 
@@ -43,14 +44,13 @@ def write_report(
     out = Path(out_dir)
     make_folder(out)
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
-    page = render(report, manifest, pictures, ledger)
     texts = {
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "report.csv": photos_csv(report["photos"]),
-        "report.html": page,
+        "report.html": render(report, manifest, pictures, ledger),
     }
     for name, text in texts.items():
-        write_whole(out / name, lambda path, text=text: path.write_text(text, encoding="utf-8"))
+        write_whole(out / name, text)
     return out / "report.html"
 
 
@@ -58,13 +58,6 @@ def render(
     report: Mapping, manifest: Mapping, encoded: Mapping[str, Mapping[str, bytes]], ledger: Mapping | None
 ) -> str:
     """The page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
-    import jinja2
-
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters |= {"percent": _percent, "figure": _figure}
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
     plots, primary, deceived = [scale_plot(judged)], None, False
@@ -73,7 +66,8 @@ def render(
         plots[:0] = [recognition_plot(judged, primary, name, label, promise["conditions"]) for name, label in _PLOTS]
     headline, plain = _WORDS[summary["verdict"]]
     pictures = [encoded.get(photo["file"], {}) for photo in photos]
-    return environment.get_template("page.html.j2").render(
+    return page(
+        "page.html.j2",
         report=report,
         summary=summary,
         manifest=manifest,
@@ -118,11 +112,3 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
     for name, claim in (promise["controls"] if promise else {}).items():
         rows.append((f"Promised control: {name}", claim["rate"], claim["interval"], "control"))
     return [dict(zip(("name", "rate", "interval", "kind"), row, strict=True)) for row in rows]
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.0f} %"
-
-
-def _figure(value: float | None, digits: int = 2) -> str:
-    return "not measured" if value is None else f"{value:.{digits}f}"

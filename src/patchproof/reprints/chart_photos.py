@@ -101,7 +101,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     at_middle, brightest = (_falling(at - page_mm / 2, sources) for at in (corners.mean(0)[None], corners))
     exposure = rng.uniform(0.5, 0.85) / (brightest.max() * white_balance.max())
     light = _light_in_picture(px_from_mm, page_mm / 2, sources)
-    seen = _warped(page, px_from_mm) * light[..., None]
+    raw = _warped(page, px_from_mm) * light[..., None]
     sensor = Sensor(
         vignetting=np.array([rng.uniform(0, 0.2)]),
         blur_px=np.array([rng.uniform(0, 1)]),
@@ -111,7 +111,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
         noise_seed=np.array([seed]),
         jpeg=np.array([rng.uniform(60, 95)]),
     )
-    picture = torch.tensor(seen.transpose(2, 0, 1)[None], dtype=torch.float32)
+    picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     picture = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
     codes = codes_of_light(linear_from_srgb(picture), camera)
     file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})

@@ -25,13 +25,14 @@ from torch import Tensor
 from patchproof import geometry
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light, Print
-from patchproof.channel.lens import Frame, distorted, pinhole_frame
+from patchproof.channel.lens import Frame, distorted
 from patchproof.channel.printer import misregistered, vary
-from patchproof.color import linear_from_srgb
+from patchproof.color import LIGHT_OF_CODE, linear_from_srgb
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage
+from patchproof.render.views import backgrounds, lens_frame
 from patchproof.reprints.traced_light import lights
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
@@ -77,7 +78,8 @@ def photograph_traced(
 def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
     """1×3×H×W linear light before lens distortion and sensor, of the size of the lens's frame."""
     scene, mi = _traceable(stage), mitsuba()
-    frame = _frame(stage, scene)
+    photo_px = scene.settings.camera.photo_px
+    frame = lens_frame(stage, scene, photo_px)
     box = _box(scene, conditions, frame, optics.aperture_mm)
     parts = {
         "type": "scene",
@@ -93,7 +95,7 @@ def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Condition
     for i in range(PASSES):  # seeds of one view are its own
         seed = (int(conditions.sensor.noise_seed[0]) * PASSES + i) % 2**32
         total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
-    whole = linear_from_srgb(_background(scene, conditions, frame) / 255.0)
+    whole = LIGHT_OF_CODE[backgrounds(scene, conditions, photo_px, frame)[0]]
     inside = whole[top : top + height, left : left + width]
     inside *= 1 - total[..., 3:].clip(0, 1)
     inside += total[..., :3] / PAPER_REFLECTANCE
@@ -130,30 +132,17 @@ def _traceable(stage: Stage) -> MeshScene:
     return scene
 
 
-def _frame(stage: Stage, scene: MeshScene) -> Frame:
-    size_px = scene.settings.camera.photo_px
-    if stage.camera is not None:
-        return pinhole_frame(stage.camera, size_px)
-    return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
-
-
-def _background(scene: MeshScene, conditions: Conditions, frame: Frame) -> np.ndarray:
-    photo_px = scene.settings.camera.photo_px
-    picture = scene.backgrounds.picture(conditions.pose.background[0], photo_px, photo_px)
-    return np.pad(picture, ((frame.top, frame.bottom), (frame.left, frame.right), (0, 0)), mode="edge")
-
-
 def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
     """The part of the frame that shows anything but background: left, top, width and height, 1 at least."""
     points = [scene.mesh.vertices, needs_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
-    seen = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
-    if not np.isfinite(seen).all():  # some of it lies behind the camera
+    px = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
+    if not np.isfinite(px).all():  # some of it lies behind the camera
         return 0, 0, *frame.size_px
     # out of focus and printed larger it reaches farther
-    margin = 8 + 0.05 * np.ptp(seen, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.pose.distance_mm[0]
+    margin = 8 + 0.05 * np.ptp(px, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.pose.distance_mm[0]
     size = np.array(frame.size_px)
-    low = np.clip(np.floor(seen.min(0) - margin), 0, size - 1).astype(int)
-    high = np.clip(np.ceil(seen.max(0) + margin), low + 1, size).astype(int)
+    low = np.clip(np.floor(px.min(0) - margin), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(px.max(0) + margin), low + 1, size).astype(int)
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
@@ -224,7 +213,7 @@ def _glossy(diffuse: dict, light: Light) -> dict:
 
 def _object(mi: ModuleType, mesh: Mesh) -> list:
     """One Mitsuba mesh per material, its corners apart: they have normals and texture coordinates of their own."""
-    found = []
+    shapes = []
     for number, material in enumerate(mesh.materials):
         faces = mesh.face_material == number
         count = int(faces.sum())
@@ -237,15 +226,15 @@ def _object(mi: ModuleType, mesh: Mesh) -> list:
                 raise Refused(
                     "objects whose textures are not colored by corners, too", material.name, "bake the colors in"
                 )
-            color = _texture(mi, linear_from_srgb(material.texture_srgb / 255.0) * colors[0], "repeat")
+            color = _texture(mi, LIGHT_OF_CODE[material.texture_srgb] * colors[0], "repeat")
         corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
         normals, uv = mesh.corner_normal[faces].reshape(-1, 3), mesh.corner_uv[faces].reshape(-1, 2)
         bsdf = {"type": "twosided", "both": _diffuse(color)}
         paint = (colors * PAPER_REFLECTANCE).clip(0, 1)
-        found.append(
+        shapes.append(
             _mesh(mi, f"object{number}", corners, np.arange(3 * count).reshape(-1, 3), normals, uv, bsdf, paint)
         )
-    return found
+    return shapes
 
 
 def _diffuse(reflectance: dict) -> dict:

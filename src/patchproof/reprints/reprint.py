@@ -54,14 +54,14 @@ def reprint(
         if jobs > 1 or cluster is not None:
             take = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
         conditions = sheet.scene.draw("reprint", n, seed)
-        each, done = [conditions[i : i + 1] for i in range(n)], 0
+        views, done = [conditions[i : i + 1] for i in range(n)], 0
         names = [f"photo_{i + 1:04d}.jpg" for i in range(n)]
         with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
-            for i, photo in workers.completed(take, each):
+            for i, photo in workers.completed(take, views):
                 (folder / names[i]).write_bytes(result_of(photo))
                 done += 1
                 on_photo(done, n)
-            return _write_truth(folder, dict(zip(names, map(sheet.truth, each), strict=True)))
+            return _write_truth(folder, dict(zip(names, map(sheet.truth, views), strict=True)))
 
 
 @contextmanager
@@ -126,11 +126,11 @@ def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scal
     import cv2
 
     with torch.no_grad():
-        seen = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
+        light = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
     # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
     (x, y), (width, height) = print_scale, (round(side * dpi / MM_PER_INCH) for side in page_mm)
     matrix = np.array([[x / 2, 0, x / 4 - 0.5], [0, y / 2, y / 4 - 0.5]])
-    blurred = cv2.GaussianBlur(seen, (0, 0), SCAN_BLUR_PX)
+    blurred = cv2.GaussianBlur(light, (0, 0), SCAN_BLUR_PX)
     return cv2.warpAffine(blurred, matrix, (width, height), borderValue=(1.0, 1.0, 1.0))
 
 

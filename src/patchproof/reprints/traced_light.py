@@ -31,7 +31,7 @@ def lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) ->
 
     An outgoing radiance of 1 is white: paper of reflectance ρ gives ρ·E/π, so that E is π where our light is 1.
     """
-    found = {"sky": _sky(mi, light)}
+    emitters = {"sky": _sky(mi, light)}
     frame, middle = scene.frame, scene.middle_mm
     if light.directional[0] > 0:
         toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)[0]
@@ -39,7 +39,7 @@ def lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) ->
         place = mi.ScalarTransform4f().look_at(
             (middle + far * toward).tolist(), middle.tolist(), _across(toward).tolist()
         )
-        found["sun"] = {
+        emitters["sun"] = {
             "type": "disk",
             "to_world": place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle))),
             "emitter": _emitter(light.directional[0] / np.sin(angle) ** 2),
@@ -48,13 +48,13 @@ def lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) ->
         away = geometry.orbit(light.point_azimuth_deg, light.point_elevation_deg, frame.normal, frame.up)[0]
         distance = float(light.point_distance_mm[0])
         radius = min(LAMP_RADIUS_MM, distance / 4)
-        found["lamp"] = {
+        emitters["lamp"] = {
             "type": "sphere",
             "center": (middle + distance * away).tolist(),
             "radius": radius,
             "emitter": _emitter(light.point[0] * (distance / radius) ** 2),
         }
-    return found
+    return emitters
 
 
 def _emitter(radiance: float) -> dict:

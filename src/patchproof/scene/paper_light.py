@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.color import linear_from_srgb
+from patchproof.color import LIGHT_OF_CODE
 from patchproof.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import CLIPPED_CODE
@@ -46,7 +46,7 @@ def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_
     if clipped.mean() > _MOST_CLIPPED:
         raise CannotJudge("clipped", float(clipped.mean()), _MOST_CLIPPED, "the paper is overexposed: expose less")
     codes, mm = codes[~clipped], mm[~clipped]
-    light, terms = linear_from_srgb(codes / 255.0), quadratic_terms(mm, piece.size_mm)
+    light, terms = LIGHT_OF_CODE[codes], quadratic_terms(mm, piece.size_mm)
     coefficients, weight = _robust_fit(terms, light)
     left = light - terms @ coefficients.T
     white = light.mean(0)
@@ -119,7 +119,6 @@ def _noise(left: np.ndarray, white: np.ndarray) -> float:
 
     Shot noise has a variance in proportion to the light (EMVA 1288), hence the division.
     """
-    code = linear_from_srgb(np.arange(256) / 255)
-    step = np.interp(white, code[:-1], np.diff(code))
+    step = np.interp(white, LIGHT_OF_CODE[:-1], np.diff(LIGHT_OF_CODE))
     variance = (left**2).mean(0) - step**2 / 12
     return float(np.sqrt(np.maximum(variance / np.maximum(white, 1e-3), 0).mean()))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
 from patchproof.mesh.mesh import Material, Mesh
 from patchproof.mesh.texels import coverage, face_counts
 from patchproof.mesh.unwrap import has_place, unwrap
@@ -143,9 +143,7 @@ def _whole_colors(mesh: Mesh, chosen: np.ndarray, texels: int) -> Mesh:
     """`mesh` with each material's color in its texture; one-colored ones get `texels`² where they may change."""
 
     def whole(index: int, material: Material) -> Material:
-        codes = np.arange(256)[:, None] / 255
-        table = srgb_from_linear((linear_from_srgb(codes) * material.base_color_linear).clip(0, 1))
-        table = codes_of(table)
+        table = codes_of(srgb_from_linear((LIGHT_OF_CODE[:, None] * material.base_color_linear).clip(0, 1)))
         texture = np.full((1, 1, 3), 255, np.uint8) if material.texture_srgb is None else material.texture_srgb
         texture = np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1)
         if texture.shape[:2] == (1, 1) and (chosen & (mesh.face_material == index)).any():

@@ -1,0 +1,29 @@
+"""One HTML page from a template of this folder; values in it are escaped, an unknown one is an error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from patchproof.claims import Estimate
+from patchproof.report.tables import shown
+
+
+def page(template: str, **values: object) -> str:
+    """The template with its values."""
+    import jinja2
+
+    loader, strict = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=strict
+    )
+    environment.filters |= {"percent": _percent, "figure": _figure, "shown": shown}
+    environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
+    return environment.get_template(template).render(values)
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.0f} %"
+
+
+def _figure(value: float | None, digits: int = 2) -> str:
+    return "not measured" if value is None else f"{value:.{digits}f}"
