@@ -15,11 +15,7 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-<<<<<<< HEAD
 from patchproof.color import ciede2000, lab_from_linear, photo_codes_of, srgb_from_linear
-=======
-from patchproof.color import LIGHT_OF_CODE, ciede2000, lab_from_linear, photo_codes_of, srgb_from_linear
->>>>>>> pb2
 from patchproof.evidence.results import Color, Geometry, SwatchSeen
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
@@ -29,10 +25,6 @@ from patchproof.photo.edges import GRID, sample
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
 from patchproof.photo.rectify import crop, rectify
 
-<<<<<<< HEAD
-=======
-LINEAR = LIGHT_OF_CODE.astype(np.float32)  # light by code value
->>>>>>> pb2
 _CELLS = (6, 48)  # least and most along the design's shorter side
 MOST_CLIPPED = 0.5  # share of the design at full white, where color is unknown
 _MOST_CLIPPED_PAPER = 0.2

@@ -23,7 +23,7 @@ from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.rectify import part_around, reduced
 
 DICTIONARY = "DICT_5X5_1000"
-LIGHT = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # linear, by code value
+LIGHT = LIGHT_OF_CODE.astype(np.float32)
 COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # of what one level looks at: a second of work and 0.3 GB; sharper pictures are halved
@@ -210,12 +210,8 @@ def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borde
 
 def luminance(srgb: np.ndarray) -> np.ndarray:
     """Linear luminance H×W float32 of uint8 sRGB."""
-<<<<<<< HEAD
-    table, weights = np.repeat(LIGHT[None, :, None], 3, 2), np.array([LUMINANCE], np.float32)
-=======
-    table = np.repeat(LIGHT_OF_CODE.astype(np.float32)[None, :, None], 3, 2)
+    table = np.repeat(LIGHT[None, :, None], 3, 2)
     weights = np.array([LUMINANCE], np.float32)
->>>>>>> pb2
     out = np.empty(srgb.shape[:2], np.float32)
     for rows in _strips(srgb):  # the table makes 12 bytes of each pixel
         cv2.transform(cv2.LUT(srgb[rows], table), weights, out[rows])

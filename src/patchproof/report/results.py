@@ -41,12 +41,8 @@ class Results:
 
 def write_results(folder: Path, results: Results) -> None:
     """Write all of it into the folder."""
-<<<<<<< HEAD
     versions = versions_of(_LIBRARIES)
     pictures = [(drawing, png(drawing)) for drawing in results.figures]
-=======
-    versions, pictures = _versions(), [(drawing, png(drawing)) for drawing in results.figures]
->>>>>>> pb2
     for table in results.tables:
         write_whole(folder / f"{results.name}_{table.name}.csv", csv_text(table))
     for drawing, content in pictures:
