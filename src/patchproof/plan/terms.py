@@ -15,8 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from patchproof import geometry
-from patchproof.channel.effect import Effect
-from patchproof.channel.effects import EFFECT, EFFECTS
+from patchproof.channel.effects import EFFECT, EFFECTS, Effect
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.problem import Problem
