@@ -22,6 +22,7 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import detector_settings, luminance, printed_markers
 from patchproof.photo.read import list_photos, read_photo, readable_formats
 from patchproof.sheets.board import Board
+from patchproof.sheets.piece import DICTIONARY
 from patchproof.strict import Refused
 
 FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
@@ -92,8 +93,8 @@ def see_boards(
 
 def corner_places_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
     """Inner corners M×2 by id, from the board's top-left corner; scaled as the rulers came out of the printer."""
-    column, row = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
-    nominal = np.column_stack([column.ravel(), row.ravel()]) * board.square_mm
+    column, row = np.meshgrid(np.arange(1, board.grid.columns), np.arange(1, board.grid.rows))
+    nominal = np.column_stack([column.ravel(), row.ravel()]) * board.grid.square_mm
     return nominal if ruler_mm is None else nominal * (np.array(ruler_mm) / board.ruler_mm)
 
 
@@ -112,14 +113,14 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
 
     Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
     """
-    dictionary = printed_markers(board.dictionary)
+    dictionary = printed_markers(DICTIONARY)
     light = photo_codes_of(luminance(srgb))
     quads, names, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings()).detectMarkers(light)
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none
-    size = (board.columns, board.rows)
-    pattern = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, np.array(board.ids, np.int32))
+    grid = board.grid
+    pattern = cv2.aruco.CharucoBoard((grid.columns, grid.rows), grid.square_mm, grid.marker_mm, dictionary)
     gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(gray, None, None, quads, names)
     if ids is None or len(ids) == 0:

@@ -25,7 +25,7 @@ from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
 from patchproof.sheets.swatches import frame_swatches
-from patchproof.strict import Refused, nearest
+from patchproof.strict import Refused, Strict, nearest
 
 DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
@@ -72,6 +72,11 @@ def sheet_id(settings: dict[str, Any], seed: int) -> str:
     text = json.dumps({"settings": settings, "seed": seed}, sort_keys=True, separators=(",", ":"), allow_nan=False)
     number = int.from_bytes(hashlib.sha256(text.encode()).digest(), "big")
     return "".join("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"[number // 36**i % 36] for i in range(10))
+
+
+def template_id(template: Strict) -> str:
+    """The sheet id of a page that is made of its template alone."""
+    return sheet_id({"template": template.model_dump(mode="json")}, 0)
 
 
 def marker_ids(sheet_id: str, kind: str, count: int) -> list[int]:
@@ -136,7 +141,8 @@ def lay_out_piece(design_mm: tuple[float, float], marker_mm: float, sheet_id: st
 def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
     """The same piece with the marker ids of another sheet or kind."""
     ids = marker_ids(sheet_id, kind, len(piece.markers))
-    return replace(piece, markers=tuple(replace(one, id=id_) for id_, one in zip(ids, piece.markers, strict=True)))
+    markers = tuple(replace(marker, id=id_) for id_, marker in zip(ids, piece.markers, strict=True))
+    return replace(piece, markers=markers)
 
 
 def marker_at(id_: int, corner_mm: tuple[float, float], size_mm: float) -> PieceMarker:

@@ -140,16 +140,9 @@ def _hung(scene_path: str, seed: int) -> tuple[HungSheet, MeshScene]:
     blank = np.zeros((240, round(240 * piece.design_rect_mm[2] / piece.design_rect_mm[3]), 3), np.uint8)
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"
-        manifest = write_sheet(
-            pdf,
-            template=load_template(scene.settings.sheet.template),
-            piece=piece,
-            sheet_id=scene.sheet_id,
-            kind="design",
-            design_srgb8=control_design("noise", blank, scene.sheet_id),
-            promise=None,
-            settings={},
-        )
+        noise = control_design("noise", blank, scene.sheet_id)
+        content = PrintedPiece(piece, scene.sheet_id, "design", noise)
+        manifest = write_sheet(pdf, load_template(scene.settings.sheet.template), content)
         sent = sent_pixels(pdf, manifest, scene)
     return HungSheet(set_stage(scene), manifest, sent, AS_MADE.printer_for(scene)), scene
 
