@@ -41,7 +41,7 @@ class PrintedPiece:
 
     @property
     def code(self) -> str:
-        """What its page's QR code says: the sheet's id and 16 digits of the design's SHA-256, or the kind without one."""
+        """What the QR code says: the sheet's id and 16 digits of the design's SHA-256, or the kind without one."""
         content = self.kind if self.design_srgb8 is None else design_sha256(self.design_srgb8)[:16]
         return f"patchproof:{self.sheet_id}:{content}"
 

@@ -39,7 +39,9 @@ def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tup
     numbered = list(enumerate(tiles, FIRST_TILE_PAGE))
     markers = [printed(marker, number) for number, tile in numbered for marker in own_markers(tile, piece)]
     markers += [printed(marker) for marker in first.markers]
-    markers += [printed(marker, number) for number, page in enumerate(layouts, FIRST_TILE_PAGE) for marker in page.markers]
+    markers += [
+        printed(marker, number) for number, page in enumerate(layouts, FIRST_TILE_PAGE) for marker in page.markers
+    ]
     swatches = [(swatch, 1) for swatch in first.swatches]
     swatches += [(swatch, number) for number, tile in numbered for swatch in own_swatches(tile, piece)]
     cut_mm = moved((0.0, 0.0, *piece.size_mm), tiles[0].page_from_piece_mm)

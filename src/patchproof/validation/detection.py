@@ -36,6 +36,7 @@ from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pix
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import load_scene, piece_of
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import control_design
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
