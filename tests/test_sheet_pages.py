@@ -179,6 +179,14 @@ def test_assembled_tiles_are_the_design_and_its_whole_frame(tiled):
     assert measured.counted and measured.entry.markers_found == 8  # glued together it is no page check
 
 
+def test_a_blank_piece_in_tiles_is_put_together_as_one_with_a_design_is(tmp_path):
+    pixels = {}
+    for name, design in (("blank", None), ("white", np.full((8, 8, 3), 255, np.uint8))):
+        path = tmp_path / f"{name}.pdf"
+        pixels[name] = piece_pixels(path, write(path, "a4_tiles", design=design), 50)
+    np.testing.assert_array_equal(pixels["blank"], pixels["white"])
+
+
 def test_a_scan_of_the_first_page_is_a_page_check(tiled):
     path, manifest = tiled
     page = page_pixels(path, 1, 75)

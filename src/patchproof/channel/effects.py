@@ -136,7 +136,7 @@ class Effect:
     columns: Mapping[str, str | tuple[float, float]]
     first: int | None = None
     into: tuple[str, ...] = ()
-    made: Callable[..., tuple[np.ndarray, ...]] = lambda *columns: columns
+    made: Callable[..., np.ndarray | tuple[np.ndarray, ...]] = lambda *columns: columns
     switch: bool = True
     instead: Callable[[Any, Facing], Rows] | None = None
     whole: bool = False  # whether it takes whole photographs to be seen as it is
@@ -168,7 +168,8 @@ class Effect:
         """Its fields for N views with numbers N×columns in [0, 1); without columns, the views' own `number` N."""
         ends = (self.range(settings, name) for name in self.columns)
         columns = [low + (high - low) * column for (low, high), column in zip(ends, unit.T, strict=True)]
-        return dict(zip(self.fields, self.made(*columns) if columns else (number,), strict=True))
+        values = self.made(*columns) if columns else number
+        return dict(zip(self.fields, values if isinstance(values, tuple) else (values,), strict=True))
 
     def off(self, record: Rows, facing: Facing) -> Rows | None:
         """The record without the effect; None where it is off in all views."""
@@ -181,8 +182,8 @@ class Effect:
         return replace(record, **{strength: np.full_like(drawn, at_rest)})
 
 
-def _stacked(*columns: np.ndarray) -> tuple[np.ndarray]:
-    return (np.stack(columns, 1),)
+def _stacked(*columns: np.ndarray) -> np.ndarray:
+    return np.stack(columns, 1)
 
 
 def _view(azimuth, elevation, distance, roll, *offset: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -195,22 +196,18 @@ def _uneven(sh2: np.ndarray, *coefficients: np.ndarray) -> tuple[np.ndarray, ...
     return sh2, ndtri(_NORMAL_MARGIN + (1 - 2 * _NORMAL_MARGIN) * np.stack(coefficients, 1))
 
 
-def _white(light: np.ndarray, b: np.ndarray) -> tuple[np.ndarray]:
-    return (tinted_white(light, b),)
-
-
-def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> tuple[np.ndarray]:
+def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> np.ndarray:
     """Both planes as far, each in its own direction."""
     angles = np.stack(turns, 1) * 2 * np.pi
-    return (length_mm[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1),)
+    return length_mm[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
 
 
-def _gains(red: np.ndarray, blue: np.ndarray) -> tuple[np.ndarray]:
-    return (np.exp(np.stack([red, np.zeros_like(red), blue], 1)),)
+def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
+    return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
 
 
-def _whole(quality: np.ndarray) -> tuple[np.ndarray]:
-    return (np.round(quality).astype(np.int64),)
+def _whole(quality: np.ndarray) -> np.ndarray:
+    return np.round(quality).astype(np.int64)
 
 
 def _even_for_sun(light: Light, facing: Facing) -> Light:
@@ -260,7 +257,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
     Effect("ink density", {"density": "printer.density"}, 23),
     Effect("printed black", {"black": "printer.black"}, 24),
-    Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), _white),
+    Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), tinted_white),
     Effect("misregistration", _SHIFT, 45, ("misregistration_mm",), _shifts),
     Effect("print scale", {"printed_scale": "printer.scale"}, 48),
     Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16),
