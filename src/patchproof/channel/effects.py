@@ -239,7 +239,7 @@ def _units(*names: str) -> dict[str, tuple[float, float]]:
 
 _VIEW = {name: f"view.{name}" for name in ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg")}
 _JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
-_BALANCE = dict.fromkeys(("red", "blue"), "camera.white_balance")
+_BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
 _SUN = {"light_azimuth_deg": _AZIMUTH_DEG, "light_elevation_deg": _ELEVATION_DEG}
 _LAMP = {"point": "light.point", "point_azimuth_deg": _AZIMUTH_DEG, "point_elevation_deg": _ELEVATION_DEG}
 _LAMP_MM = {"point_distance_mm": "light.point_distance_mm"}

@@ -135,7 +135,7 @@ class _Reader:
         with np.errstate(invalid="ignore", over="ignore"):
             placed = vertices @ rotation.T + transform[:, 3]
             normals = raw.get("vertex_normals")
-            usable = np.shape(normals) == vertices.shape
+            usable = normals is not None and np.shape(normals) == vertices.shape
             normals = np.asarray(normals, float) @ _normal_transform(rotation).T if usable else None
         uv = self._uv(raw.get("visual"), len(vertices))
         colors = self._corner_colors(raw, len(vertices), len(faces))

@@ -43,8 +43,7 @@ def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
     page = lay_out_parts(template, [], ids, f"patchproof:{identity}:{CHART}", words)
     pitch = grid.swatch_mm + grid.gap_mm
     width, height = (round(count * pitch - grid.gap_mm, 6) for count in (grid.columns, grid.rows))
-    settings = {CHART: grid.model_dump(mode="json")}
-    return write_page(pdf_path, page, template, (*grid.corner_mm, width, height), identity, CHART, settings)
+    return write_page(pdf_path, page, template, (*grid.corner_mm, width, height), CHART, grid)
 
 
 def blank_piece_mm(manifest: Manifest) -> tuple[tuple[float, float], float]:

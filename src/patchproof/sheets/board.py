@@ -40,8 +40,7 @@ def is_board(template: str | Path) -> bool:
 def board_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     """Write the board's page and its manifest beside it."""
     page = _load(template)
-    identity, settings = template_id(page), {KIND: page.board.model_dump(mode="json")}
-    return write_page(pdf_path, _lay_out(page, identity), page, _rect(page.board), identity, KIND, settings)
+    return write_page(pdf_path, _lay_out(page, template_id(page)), page, _rect(page.board), KIND, page.board)
 
 
 def load_board(name_or_file: str | Path) -> Board:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from patchproof.output import write_together
 from patchproof.sheets.content import PrintedPiece, page_manifest
@@ -19,12 +18,13 @@ from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
+from patchproof.sheets.piece import template_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm, holds
 from patchproof.sheets.swatches import FRAME_COLORS
 from patchproof.sheets.template import BoardTemplate, Template
 from patchproof.sheets.tile_pages import tile_pages
-from patchproof.strict import Refused
+from patchproof.strict import Refused, Strict
 
 
 def write_sheet(
@@ -51,17 +51,12 @@ def write_sheet(
 
 
 def write_page(
-    pdf_path: str | Path,
-    page: PageLayout,
-    template: Template | BoardTemplate,
-    cut_mm: RectMm,
-    sheet_id: str,
-    kind: str,
-    settings: dict[str, Any],
+    pdf_path: str | Path, page: PageLayout, template: Template | BoardTemplate, cut_mm: RectMm, kind: str, grid: Strict
 ) -> Manifest:
-    """Write a page without a piece, and its manifest beside it."""
+    """Write a page without a piece, and its manifest beside it, in which `grid` is kept under the page's kind."""
     pdf_path = pdf_name(pdf_path)
-    manifest = page_manifest(page, template, cut_mm, sheet_id, kind, settings)
+    settings = {kind: grid.model_dump(mode="json")}
+    manifest = page_manifest(page, template, cut_mm, template_id(template), kind, settings)
     save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
