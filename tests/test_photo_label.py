@@ -14,24 +14,18 @@ from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo.label import Label, label_of, parsed, read_label
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.raster import page_pixels
-from patchproof.sheets.several import OneDesign, write_several
+from patchproof.sheets.several import write_several
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
 
 def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):
-    return write_sheet(
-        path,
-        template=load_template("a4"),
-        piece=lay_out_piece((90, 90), 16.0, identity, kind),
-        sheet_id=identity,
-        kind=kind,
-        design_srgb8=np.random.default_rng(seed).integers(0, 256, (16, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1),
-        promise=None,
-        settings={},
-    )
+    design = np.random.default_rng(seed).integers(0, 256, (16, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    content = PrintedPiece(lay_out_piece((90, 90), 16.0, identity, kind), identity, kind, design)
+    return write_sheet(path, load_template("a4"), content)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +109,7 @@ def test_a_page_of_several_designs_is_each_ones_own_and_nobody_elses(tmp_path):
 
     def page(name, *designs):
         each = [
-            OneDesign(lay_out_piece((40, 40), 8, identity, "design"), identity, "design", pixels, None, {})
+            PrintedPiece(lay_out_piece((40, 40), 8, identity, "design"), identity, "design", pixels, None, {})
             for identity, pixels in designs
         ]
         manifests = write_several(tmp_path / f"{name}.pdf", template, each)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.page import largest_piece_mm, lay_out_page, qr_rects_mm
 from patchproof.sheets.piece import KINDS, lay_out_piece, marker_size_mm
@@ -12,12 +13,13 @@ from patchproof.sheets.template import TextLine, load_template
 from patchproof.strict import Refused, shipped
 
 ID = "WWWWWWWWWW"  # the widest id there can be
+WHITE = np.full((4, 4, 3), 255, np.uint8)
 PAGE, MARGIN = (210.0, 297.0), 7.0
 
 
 def page_of(template, design_mm, needed_mm=20.0, kind="design"):
     marker = marker_size_mm(needed_mm, design_mm, largest_piece_mm(template))
-    return lay_out_page(template, lay_out_piece(design_mm, marker, ID, kind), ID, kind, f"patchproof:{ID}:{16 * '0'}")
+    return lay_out_page(template, PrintedPiece(lay_out_piece(design_mm, marker, ID, kind), ID, kind, WHITE))
 
 
 @pytest.mark.parametrize("design_mm", [(110, 110), (40, 40), (60, 140), (140, 50), (142, 155), (10, 10)])
@@ -104,7 +106,7 @@ def test_a_design_too_large_is_refused_with_the_largest_that_fits():
     template = load_template("a4")
     piece = lay_out_piece((120, 110), 20, ID, "design")
     with pytest.raises(Refused) as refusal:
-        lay_out_page(template, piece, ID, "design", "x")
+        lay_out_page(template, PrintedPiece(piece, ID, "design", WHITE))
     # 166.6 - 2 (20 × 9/7 + 2) = 111.17; 179.6 - 55.43 = 124.17; with 8 mm: 166.6 - 24.571 = 142.03, 155.03
     assert "at most 111 × 124 mm with 20 mm markers or 142 × 155 mm with 8 mm markers" in str(refusal.value)
     assert "got 175.4 × 165.4 mm" in str(refusal.value)

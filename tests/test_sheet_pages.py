@@ -19,13 +19,14 @@ from patchproof.photo.label import label_of, read_label
 from patchproof.photo.read import Photo
 from patchproof.sheets.blank import chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.page import largest_piece_mm
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
-from patchproof.sheets.several import OneDesign, write_several
+from patchproof.sheets.several import write_several
 from patchproof.sheets.template import load_template, template_names
 from patchproof.sheets.tiles import plan_tiles
 from patchproof.sheets.write import check_sheet, write_sheet
@@ -44,17 +45,7 @@ def write(path, name, design_mm=None, marker_mm=None, design=DESIGN, **more):
         return chart_sheet(template, path)
     design_mm = design_mm or ((300, 300) if template.tiles else (70, 70))
     piece = lay_out_piece(design_mm, marker_mm or (20 if template.tiles else 8), ID, "design")
-    return write_sheet(
-        path,
-        template=template,
-        piece=piece,
-        sheet_id=ID,
-        kind="design",
-        design_srgb8=design,
-        promise=None,
-        settings={},
-        **more,
-    )
+    return write_sheet(path, template, PrintedPiece(piece, ID, "design", design), **more)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -188,6 +179,14 @@ def test_assembled_tiles_are_the_design_and_its_whole_frame(tiled):
     assert measured.counted and measured.entry.markers_found == 8  # glued together it is no page check
 
 
+def test_a_blank_piece_in_tiles_is_put_together_as_one_with_a_design_is(tmp_path):
+    pixels = {}
+    for name, design in (("blank", None), ("white", np.full((8, 8, 3), 255, np.uint8))):
+        path = tmp_path / f"{name}.pdf"
+        pixels[name] = piece_pixels(path, write(path, "a4_tiles", design=design), 50)
+    np.testing.assert_array_equal(pixels["blank"], pixels["white"])
+
+
 def test_a_scan_of_the_first_page_is_a_page_check(tiled):
     path, manifest = tiled
     page = page_pixels(path, 1, 75)
@@ -216,7 +215,7 @@ def test_copies_are_pages_of_the_same(tmp_path):
 
 def designs(*ids, design_mm=(60, 60)):
     return [
-        OneDesign(lay_out_piece(design_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
+        PrintedPiece(lay_out_piece(design_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
         for n, i in enumerate(ids)
     ]
 

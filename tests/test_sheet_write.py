@@ -13,6 +13,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from patchproof.color import linear_from_srgb
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.pdf import srgb_profile
 from patchproof.sheets.piece import control_design, frame_image, lay_out_piece
@@ -35,16 +36,9 @@ def sample_design(width=96, height=96):
 def write(path, design_mm=(110, 110), marker_mm=19.0, kind="design", design="sample"):
     if isinstance(design, str):
         design = control_design(kind, sample_design(), ID)
-    return write_sheet(
-        path,
-        template=load_template("a4"),
-        piece=lay_out_piece(design_mm, marker_mm, ID, kind),
-        sheet_id=ID,
-        kind=kind,
-        design_srgb8=design,
-        promise=None,
-        settings={"patch": {"width_mm": design_mm[0], "height_mm": design_mm[1]}, "seed": 0},
-    )
+    settings = {"patch": {"width_mm": design_mm[0], "height_mm": design_mm[1]}, "seed": 0}
+    content = PrintedPiece(lay_out_piece(design_mm, marker_mm, ID, kind), ID, kind, design, settings=settings)
+    return write_sheet(path, load_template("a4"), content)
 
 
 @pytest.fixture(scope="module")

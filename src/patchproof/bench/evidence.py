@@ -43,9 +43,9 @@ def lens_chart(cameras: int, on_stage: OnStage) -> Chart:
     series, chosen = {}, []
     for i, (name, terms) in enumerate(LENSES.items()):
         ladders = [climb(board_views(np.array(terms), BOARD_VIEWS, seed)) for seed in range(cameras)]
-        names = Counter(ladder.fit.rung for ladder in ladders)
+        names = Counter(fit.rung for _, fit in ladders)
         default = names.most_common(1)[0][0]
-        rungs = zip(*(ladder.rungs for ladder in ladders), strict=True)
+        rungs = zip(*(rungs for rungs, _ in ladders), strict=True)
         series[name] = [_point(rung, default) for rung in rungs]
         chosen.append((name, ", ".join(f"{rung} {count}" for rung, count in names.most_common())))
         on_stage("lenses", i + 1, len(LENSES))

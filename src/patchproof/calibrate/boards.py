@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +22,7 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import detector_settings, luminance, printed_markers
 from patchproof.photo.read import list_photos, read_photo, readable_formats
 from patchproof.sheets.board import Board
+from patchproof.sheets.piece import DICTIONARY
 from patchproof.strict import Refused
 
 FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
@@ -40,24 +41,7 @@ class View:
 
     def only(self, keep: np.ndarray) -> View:
         """The view with these of its corners."""
-        return View(self.file, self.ids[keep], self.board_mm[keep], self.px[keep], self.size_px)
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A photograph that is left out, and why."""
-
-    file: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class BoardViews:
-    """All photographs: views, those left out, and what the files say of the camera ("" where they say nothing)."""
-
-    views: tuple[View, ...]
-    left: tuple[LeftOut, ...]
-    camera: str
+        return replace(self, ids=self.ids[keep], board_mm=self.board_mm[keep], px=self.px[keep])
 
 
 def see_boards(
@@ -65,9 +49,12 @@ def see_boards(
     board: Board,
     ruler_mm: tuple[float, float] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> BoardViews:
-    """The board's corners in every picture of the folder; `ruler_mm` are the printed rulers (x, y) as measured."""
-    paths, views, left, states = list_photos(photos), [], [], []
+) -> tuple[list[View], dict[str, str], str]:
+    """(views, reasons by the names of photographs left out, what the files call the camera) of a folder's pictures.
+
+    `ruler_mm` are the printed rulers (x, y) as measured.
+    """
+    paths, views, left, states = list_photos(photos), [], {}, []
     places = corner_places_mm(board, ruler_mm)
     for number, path in enumerate(paths, 1):
         try:
@@ -75,25 +62,21 @@ def see_boards(
             views.append(view)
             states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
         except CannotJudge as cannot:
-            left.append(LeftOut(path.name, cannot.advice))
+            left[path.name] = cannot.advice
         progress(number, len(paths))
     if not views:
         got = f"{len(paths)} without it"
         raise Refused(f"photographs of the board {board.sheet_id}", got, "name the board with --board")
     common = Counter(states).most_common(1)[0][0]
-    kept = []
-    for view, state in zip(views, states, strict=True):
-        if state == common:
-            kept.append(view)
-        else:
-            left.append(LeftOut(view.file, _other_state(state, common)))
-    return BoardViews(tuple(kept), tuple(left), common[1][1])
+    pairs = list(zip(views, states, strict=True))
+    left |= {view.file: _other_state(state, common) for view, state in pairs if state != common}
+    return [view for view, state in pairs if state == common], left, common[1][1]
 
 
 def corner_places_mm(board: Board, ruler_mm: tuple[float, float] | None = None) -> np.ndarray:
     """Inner corners M×2 by id, from the board's top-left corner; scaled as the rulers came out of the printer."""
-    column, row = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
-    nominal = np.column_stack([column.ravel(), row.ravel()]) * board.square_mm
+    column, row = np.meshgrid(np.arange(1, board.grid.columns), np.arange(1, board.grid.rows))
+    nominal = np.column_stack([column.ravel(), row.ravel()]) * board.grid.square_mm
     return nominal if ruler_mm is None else nominal * (np.array(ruler_mm) / board.ruler_mm)
 
 
@@ -112,14 +95,14 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
 
     Markers are looked for in linear light, where blurred paper does not grow over ink; corners need no such care.
     """
-    dictionary = printed_markers(board.dictionary)
+    dictionary = printed_markers(DICTIONARY)
     light = photo_codes_of(luminance(srgb))
     quads, names, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings()).detectMarkers(light)
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none
-    size = (board.columns, board.rows)
-    pattern = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, np.array(board.ids, np.int32))
+    grid = board.grid
+    pattern = cv2.aruco.CharucoBoard((grid.columns, grid.rows), grid.square_mm, grid.marker_mm, dictionary)
     gray = cv2.cvtColor(srgb, cv2.COLOR_RGB2GRAY)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(gray, None, None, quads, names)
     if ids is None or len(ids) == 0:

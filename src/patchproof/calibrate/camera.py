@@ -11,16 +11,19 @@ Left out on purpose: fisheye lenses, and how flat the board is: that shows as a 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from patchproof.calibrate.boards import FEWEST_CORNERS, LeftOut, View, see_boards
+from patchproof.calibrate.boards import FEWEST_CORNERS, View, see_boards
 from patchproof.calibrate.camera_picture import residual_picture
-from patchproof.calibrate.lens_ladder import NUMBERS, Climbed, Fit, climb, fit_rung
+from patchproof.calibrate.ladder import Rung
+from patchproof.calibrate.lens_ladder import NUMBERS, Fit, climb, fit_rung
 from patchproof.channel.lens import Camera, check_camera
 from patchproof.output import check_file, write_together
 from patchproof.sheets.board import Board, load_board
@@ -37,12 +40,13 @@ _ODD_PHOTO, _ODD_CORNER, _ODD_PX = 3.0, 5.0, 0.5  # times the median error, and 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A camera, the ladder with the fit it comes from, the views used, those left out, and the board."""
+    """A camera, the ladder with the fit it comes from, the views used, why photographs were left out, and the board."""
 
     camera: Camera
-    climbed: Climbed
+    rungs: tuple[Rung, ...]
+    fit: Fit
     views: tuple[View, ...]
-    left: tuple[LeftOut, ...]
+    left: Mapping[str, str]
     board: Board
 
     @property
@@ -69,17 +73,16 @@ def calibrate_camera(
     for path in (out, figures, picture):
         check_file(path, overwrite)
     printed = load_board(board)
-    boards = see_boards(photos, printed, ruler_mm, lambda done, total: progress("find corners", done, total))
-    on_rung = lambda done, total: progress("lens models", done, total)  # noqa: E731
-    result = solve(boards.views, boards.left, printed, out.stem, boards.camera, on_rung)
-    shown = residual_picture(result.views, result.climbed)
-    write_together({figures: _text(fit_figures(result)), picture: shown, out: _text(result.camera.model_dump())})
+    views, left, camera = see_boards(photos, printed, ruler_mm, partial(progress, "find corners"))
+    result = solve(views, left, printed, out.stem, camera, partial(progress, "lens models"))
+    residuals = residual_picture(result.views, result.rungs, result.fit)
+    write_together({figures: _text(fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())})
     return result
 
 
 def solve(
     views: Sequence[View],
-    left: Sequence[LeftOut],
+    left: Mapping[str, str],
     board: Board,
     name: str,
     camera: str = "",
@@ -88,32 +91,32 @@ def solve(
     """The camera that took these views; refused where they cannot tell. `camera` is what it calls itself."""
     _enough(views, left)
     views, odd = _without_odd(views)
-    left = (*left, *odd)
+    left = {**left, **odd}
     _enough(views, left)
     size_px = views[0].size_px
-    climbed = climb(views, lambda fit: _is_usable(fit, size_px), progress)
-    _refuse_blind(climbed.fit)
+    rungs, fit = climb(views, lambda fit: _is_usable(fit, size_px), progress)
+    _refuse_blind(fit)
     about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
-    made = _camera(climbed.fit, name, size_px, about, _uncertainty(climbed.fit))
+    made = _camera(fit, name, size_px, about, _uncertainty(fit))
     check_camera(made, "this calibration")
-    return Calibrated(made, climbed, tuple(views), tuple(left), board)
+    return Calibrated(made, rungs, fit, tuple(views), left, board)
 
 
 def fit_figures(result: Calibrated) -> dict:
     """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
-    fit = result.climbed.fit
+    fit = result.fit
     figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
-    photos = [
+    photos: list[dict[str, Any]] = [
         {
             "file": view.file,
             "status": "used",
             "corners": len(view.ids),
-            "rms_px": figure(np.sqrt((residual**2).sum(1).mean())),
+            "rms_px": figure(rms),
             "tilt_deg": round(float(tilt), 2),
         }
-        for view, residual, tilt in zip(result.views, fit.residuals_px, fit.tilts_deg, strict=True)
+        for view, rms, tilt in zip(result.views, fit.photo_rms_px, fit.tilts_deg, strict=True)
     ]
-    photos += [{"file": left.file, "status": "left out", "reason": left.reason} for left in result.left]
+    photos += [{"file": file, "status": "left out", "reason": reason} for file, reason in result.left.items()]
     return {
         "board": result.board.sheet_id,
         "rung": fit.rung,
@@ -124,7 +127,7 @@ def fit_figures(result: Calibrated) -> dict:
                 "worse_by_px": figure(rung.worse_by),
                 "standard_error_px": figure(rung.standard_error),
             }
-            for rung in result.climbed.rungs
+            for rung in result.rungs
         ],
         "numbers": {
             n: {"value": float(v), "standard_deviation": float(s)}
@@ -138,8 +141,8 @@ def fit_figures(result: Calibrated) -> dict:
 
 def calibration_lines(result: Calibrated) -> list[str]:
     """What a user wants to know of it, in a few lines."""
-    fit, camera = result.climbed.fit, result.camera
-    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.climbed.rungs if np.isfinite(rung.error))
+    fit, camera = result.fit, result.camera
+    steps = ", ".join(f"{rung.name} {rung.error:.3f}" for rung in result.rungs if np.isfinite(rung.error))
     lines = [
         f"lens: {fit.rung} (held-out error in px: {steps})",
         f"focal length {camera.fx:.1f} ± {fit.sd[0]:.1f} × {camera.fy:.1f} ± {fit.sd[1]:.1f} px "
@@ -148,7 +151,7 @@ def calibration_lines(result: Calibrated) -> list[str]:
         f"{len(result.views)} photographs leave {fit.rms_px:.3f} px rms; tilts {fit.tilts_deg.min():.0f} to "
         f"{fit.tilts_deg.max():.0f}°",
     ]
-    lines += [f"left out: {left.file}: {left.reason}" for left in result.left]
+    lines += [f"left out: {file}: {reason}" for file, reason in result.left.items()]
     if result.coverage < WELL_COVERED:
         lines.append(
             f"warning: the board's corners reach {result.coverage:.0%} of the way to the picture's corners; "
@@ -157,9 +160,9 @@ def calibration_lines(result: Calibrated) -> list[str]:
     return lines
 
 
-def _enough(views: Sequence[View], left: Sequence[LeftOut]) -> None:
+def _enough(views: Sequence[View], left: Mapping[str, str]) -> None:
     if len(views) < FEWEST_PHOTOS:
-        why = f" ({left[0].file}: {left[0].reason})" if left else ""
+        why = f" ({': '.join(next(iter(left.items())))})" if left else ""
         raise Refused(
             f"at least {FEWEST_PHOTOS} photographs that show {FEWEST_CORNERS} corners of the board",
             f"{len(views)} of {len(views) + len(left)}{why}",
@@ -167,26 +170,24 @@ def _enough(views: Sequence[View], left: Sequence[LeftOut]) -> None:
         )
 
 
-def _without_odd(views: Sequence[View]) -> tuple[list[View], list[LeftOut]]:
+def _without_odd(views: Sequence[View]) -> tuple[list[View], dict[str, str]]:
     """Views without the photographs, then without the corners, that lie far off: moved, of a bent board, occluded."""
-    kept, odd = list(views), []
+    kept, odd = list(views), {}
     while len(kept) >= FEWEST_PHOTOS and (fit := fit_rung(kept, _TRIAL_RUNG)) is not None:
         errors = [np.linalg.norm(residual, axis=1) for residual in fit.residuals_px]
         typical = np.array([np.median(error) for error in errors])
         usual, worst = float(np.median(typical)), int(typical.argmax())
         if typical[worst] > max(_ODD_PHOTO * usual, _ODD_PX):
             # the worst alone: an odd photograph drags the others along until it is gone, and so does a corner
-            reason = (
-                f"its corners miss by {typical[worst]:.2f} px where most miss by {usual:.2f}: moved, or a bent board"
-            )
-            odd.append(LeftOut(kept.pop(worst).file, reason))
+            miss = f"its corners miss by {typical[worst]:.2f} px where most miss by {usual:.2f}"
+            odd[kept.pop(worst).file] = f"{miss}: moved, or a bent board"
             continue
         farthest = max(float(error.max()) for error in errors)
         if farthest <= max(_ODD_CORNER * usual, _ODD_PX):
             break
         kept = [view.only(error < farthest / 2) for view, error in zip(kept, errors, strict=True)]
         few = "too few of its corners agree with the others: show more of the board, sharp"
-        odd += [LeftOut(view.file, few) for view in kept if len(view.ids) < FEWEST_CORNERS]
+        odd |= {view.file: few for view in kept if len(view.ids) < FEWEST_CORNERS}
         kept = [view for view in kept if len(view.ids) >= FEWEST_CORNERS]
     return kept, odd
 

@@ -189,30 +189,28 @@ def print_variation(prints: Sequence[np.ndarray]) -> dict[str, Any] | None:
 
 def ladder_table(choice: Choice) -> list[dict[str, Any]]:
     """Each rung's figures as stored; those that had too few colors have none."""
-    rows: list[dict[str, Any]] = []
-    for rung in choice.rungs:
-        figures = {"delta_e00": rung.error, "worse_by": rung.worse_by, "standard_error": rung.standard_error}
-        rows.append({"rung": rung.name, **{key: round(value, 3) for key, value in figures.items()}})
+    figures = {"delta_e00": "error", "worse_by": "worse_by", "standard_error": "standard_error"}
+    rows: list[dict[str, Any]] = [
+        {"rung": rung.name} | {key: round(getattr(rung, name), 3) for key, name in figures.items()}
+        for rung in choice.rungs
+    ]
     reason = "swatches too few or too much alike"
     return rows + [{"rung": name, "delta_e00": None, "reason": reason} for name in choice.left_out]
 
 
 def summary_lines(calibration: Calibration) -> list[str]:
     """The choice with every rung's figure, for the terminal."""
-    choice, told = calibration.choice, calibration.printer.provenance
-    lines = [f"{told['source']}; {told['model_of']}"]
-    for row in told["ladder"]:
-        mark = (
-            "  <- chosen: the simplest within one standard error of the best"
-            if row["rung"] == choice.chosen.name
-            else ""
-        )
+    choice, provenance = calibration.choice, calibration.printer.provenance
+    lines = [f"{provenance['source']}; {provenance['model_of']}"]
+    chosen = "  <- chosen: the simplest within one standard error of the best"
+    for row in provenance["ladder"]:
+        mark = chosen if row["rung"] == choice.chosen.name else ""
         figure = row.get("reason")
         if figure is None:
             figure = f"ΔE00 {row['delta_e00']:5.2f}  (+{row['worse_by']:.2f} ± {row['standard_error']:.2f})"
         lines.append(f"  {row['rung']:20s} {figure}{mark}")
     lines.append(f"held out: {choice.held_out} of {choice.colors} colors in turn")
-    varied = told["print_to_print"]
+    varied = provenance["print_to_print"]
     if varied is not None:
         lines.append(f"prints differ from their mean by ΔE00 {varied['delta_e00']:.2f} ({varied['prints']} prints)")
     return lines
@@ -244,9 +242,9 @@ def _agreement(readings: Sequence[Reading], by_print: Sequence[np.ndarray]) -> l
     means = dict(zip(sorted(set(numbers)), by_print, strict=True))
     errors = []
     for reading in readings:
-        both = np.isfinite(reading.chart.light).all(1)
-        alone = numbers.count(reading.of_print) == 1 or not both.any()
-        own, mean = (srgb_from_linear(light[both]) for light in (reading.chart.light, means[reading.of_print]))
+        known = np.isfinite(reading.chart.light).all(1)
+        alone = numbers.count(reading.of_print) == 1 or not known.any()
+        own, mean = (srgb_from_linear(light[known]) for light in (reading.chart.light, means[reading.of_print]))
         errors.append(None if alone else float(difference(own, mean).mean()))
     return errors
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -62,21 +63,21 @@ class Choice:
 def kinds_of_maps(priors: Mapping[str, Map]) -> tuple[Kind, ...]:
     """All kinds, simplest first; those of priors are left out where there are none."""
     free = (
-        Kind("identity", lambda sent, seen: lambda colors: colors, 0, True),
+        Kind("identity", lambda sent, shown: lambda colors: colors, 0, True),
         Kind("white_black", fit_white_black, 2, True),
         Kind("affine", fit_affine, 12),
     )
     known = (
-        Kind("prior", lambda sent, seen: _best(priors, sent, seen), 0, True),
-        Kind("prior+affine", lambda sent, seen: fit_prior_affine(priors, sent, seen), 12),
-        Kind("prior+affine+spline", lambda sent, seen: fit_prior_spline(priors, sent, seen), 24),
+        Kind("prior", partial(_best, priors), 0, True),
+        Kind("prior+affine", partial(fit_prior_affine, priors), 12),
+        Kind("prior+affine+spline", partial(fit_prior_spline, priors), 24),
     )
     return free + (known if priors else ()) + (Kind("spline", fit_spline, 24),)
 
 
-def choose(kinds: Sequence[Kind], sent: Colors, seen: Colors) -> Choice:
+def choose(kinds: Sequence[Kind], sent: Colors, shown: Colors) -> Choice:
     """The simplest kind that is no worse than the best; colors sent twice are averaged first."""
-    sent, seen = distinct(sent, seen)
+    sent, shown = distinct(sent, shown)
     corners, width = np.isin(sent, (0.0, 1.0)).all(1), color_width(sent)
     tried = [kind for kind in kinds if len(sent) >= kind.least and (kind.endpoints or width >= FLAT)]
     folds = _folds(np.flatnonzero(~corners))
@@ -84,11 +85,11 @@ def choose(kinds: Sequence[Kind], sent: Colors, seen: Colors) -> Choice:
         ends = (sent == 1).all(1) | (sent.sum(1) == sent.sum(1).min())
         tried, folds = [kind for kind in tried if kind.endpoints], [np.flatnonzero(~ends if not ends.all() else ends)]
     names = [kind.name for kind in tried]
-    errors, seconds = zip(*(_held_out(kind, sent, seen, folds) for kind in tried), strict=True)
+    errors, seconds = zip(*(_held_out(kind, sent, shown, folds) for kind in tried), strict=True)
     rungs = compared(names, np.array(errors))
     chosen = simplest(rungs)
     left_out = tuple(kind.name for kind in kinds if kind not in tried)
-    fitted, times = tried[chosen].fit(sent, seen), dict(zip(names, seconds, strict=True))
+    fitted, times = tried[chosen].fit(sent, shown), dict(zip(names, seconds, strict=True))
     return Choice(rungs[chosen], fitted, rungs, times, len(sent), len(errors[0]), left_out, width)
 
 
@@ -97,61 +98,58 @@ def color_width(colors: Colors) -> float:
     return float(np.linalg.svd(colors - colors.mean(0), compute_uv=False)[-1] / np.sqrt(len(colors)))
 
 
-def distinct(sent: Colors, seen: Colors) -> tuple[Colors, Colors]:
-    """Each color sent once, with the mean light of how it was seen."""
+def distinct(sent: Colors, shown: Colors) -> tuple[Colors, Colors]:
+    """Each color sent once, with the mean light of how it was shown."""
     colors, index = np.unique(np.asarray(sent, float), axis=0, return_inverse=True)
-    light, index = linear_from_srgb(np.asarray(seen, float)), index.reshape(-1)
+    light, index = linear_from_srgb(np.asarray(shown, float)), index.reshape(-1)
     total = np.stack([np.bincount(index, light[:, c]) for c in range(3)], 1)
     return colors, srgb_from_linear(total / np.bincount(index)[:, None])
 
 
-def difference(seen: Colors, expected: Colors) -> np.ndarray:
+def difference(shown: Colors, expected: Colors) -> np.ndarray:
     """ΔE00 N of sRGB colors; what lies outside of [0, 1] counts as clipped."""
-    return ciede2000(lab_from_srgb(np.clip(seen, 0, 1)), lab_from_srgb(np.clip(expected, 0, 1)))
+    return ciede2000(lab_from_srgb(np.clip(shown, 0, 1)), lab_from_srgb(np.clip(expected, 0, 1)))
 
 
-def fit_white_black(sent: Colors, seen: Colors) -> Map:
-    """Per channel an affine map in light: white stays, and the darkest color sent becomes the one seen."""
-    light, shown = linear_from_srgb(sent), linear_from_srgb(seen)
+def fit_white_black(sent: Colors, shown: Colors) -> Map:
+    """Per channel an affine map in light: white stays, and the darkest color sent becomes the one shown."""
+    light, lit = linear_from_srgb(sent), linear_from_srgb(shown)
     dark = light.sum(1).argmin()
-    lift = np.clip((shown[dark] - light[dark]) / np.maximum(1 - light[dark], 1e-6), 0, 0.99)
+    lift = np.clip((lit[dark] - light[dark]) / np.maximum(1 - light[dark], 1e-6), 0, 0.99)
     return lambda colors: srgb_from_linear(lift + (1 - lift) * linear_from_srgb(colors))
 
 
-def fit_affine(sent: Colors, seen: Colors) -> Map:
+def fit_affine(sent: Colors, shown: Colors) -> Map:
     """Least squares in sRGB's code values: 12 numbers. In light it was twice as far off (ΔE00 8 instead of 5)."""
-    matrix = np.linalg.lstsq(_with_ones(sent), seen, rcond=None)[0]
+    matrix = np.linalg.lstsq(_with_ones(sent), shown, rcond=None)[0]
     return lambda colors: _with_ones(colors) @ matrix
 
 
-def fit_spline(sent: Colors, seen: Colors) -> Map:
+def fit_spline(sent: Colors, shown: Colors) -> Map:
     """A thin-plate spline with an affine part."""
     from scipy.interpolate import RBFInterpolator
 
-    spline = RBFInterpolator(_features(sent), seen, kernel="thin_plate_spline", smoothing=SMOOTHING, degree=1)
+    spline = RBFInterpolator(_features(sent), shown, kernel="thin_plate_spline", smoothing=SMOOTHING, degree=1)
     return lambda colors: spline(_features(colors))
 
 
-def fit_prior_affine(priors: Mapping[str, Map], sent: Colors, seen: Colors) -> Map:
+def fit_prior_affine(priors: Mapping[str, Map], sent: Colors, shown: Colors) -> Map:
     """An affine map after the prior for which that leaves least."""
-    corrected = (_after(prior, fit_affine(prior(sent), seen)) for prior in priors.values())
-    return min(corrected, key=lambda model: difference(model(sent), seen).mean())
+    fits = {name: fit_affine(prior(sent), shown) for name, prior in priors.items()}
+    best = min(fits, key=lambda name: difference(fits[name](priors[name](sent)), shown).mean())
+    return lambda colors: fits[best](priors[best](colors))
 
 
-def fit_prior_spline(priors: Mapping[str, Map], sent: Colors, seen: Colors) -> Map:
+def fit_prior_spline(priors: Mapping[str, Map], sent: Colors, shown: Colors) -> Map:
     """The corrected prior, and a spline of what it leaves."""
-    start = fit_prior_affine(priors, sent, seen)
-    rest = fit_spline(sent, seen - start(sent))
+    start = fit_prior_affine(priors, sent, shown)
+    rest = fit_spline(sent, shown - start(sent))
     return lambda colors: start(colors) + rest(colors)
 
 
-def _best(priors: Mapping[str, Map], sent: Colors, seen: Colors) -> Map:
+def _best(priors: Mapping[str, Map], sent: Colors, shown: Colors) -> Map:
     """The prior that shows these colors best."""
-    return min(priors.values(), key=lambda prior: difference(prior(sent), seen).mean())
-
-
-def _after(first: Map, then: Map) -> Map:
-    return lambda colors: then(first(colors))
+    return min(priors.values(), key=lambda prior: difference(prior(sent), shown).mean())
 
 
 def _features(colors: Colors) -> np.ndarray:
@@ -168,10 +166,10 @@ def _folds(held_out: np.ndarray) -> list[np.ndarray]:
     return [fold for fold in np.array_split(mixed, FOLDS) if len(fold)]
 
 
-def _held_out(kind: Kind, sent: Colors, seen: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def _held_out(kind: Kind, sent: Colors, shown: Colors, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """ΔE00 of each held-out color, fold by fold, and the mean seconds of a fit."""
     errors, begin = [], time.perf_counter()
     for fold in folds:
         train = np.setdiff1d(np.arange(len(sent)), fold)
-        errors.append(difference(kind.fit(sent[train], seen[train])(sent[fold]), seen[fold]))
+        errors.append(difference(kind.fit(sent[train], shown[train])(sent[fold]), shown[fold]))
     return np.concatenate(errors), (time.perf_counter() - begin) / len(folds)

@@ -127,7 +127,7 @@ def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> 
     """How far the interpolated table is from the chain itself on random colors."""
     sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
     exact = lab_from_srgb(show(sent) / 255)
-    seen = printer.apply(torch.tensor(sent / 255).T[None, :, :, None])[0, :, :, 0].T.numpy()
-    error = ciede2000(exact, lab_from_srgb(seen))
+    shown = printer.apply(torch.tensor(sent / 255).T[None, :, :, None])[0, :, :, 0].T.numpy()
+    error = ciede2000(exact, lab_from_srgb(shown))
     figures = {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()}
     return {"colors": _CHECKED_COLORS, **{key: round(float(value), 3) for key, value in figures.items()}}

@@ -54,6 +54,11 @@ class Fit:
         return float(np.sqrt((np.concatenate(self.residuals_px) ** 2).sum(1).mean()))
 
     @property
+    def photo_rms_px(self) -> list[float]:
+        """The same of each view alone."""
+        return [float(np.sqrt((residual**2).sum(1).mean())) for residual in self.residuals_px]
+
+    @property
     def tilts_deg(self) -> np.ndarray:
         """How far each board is turned away from facing the camera."""
         return np.degrees(np.arccos(np.clip(np.abs(self.normals[:, 2]), 0, 1)))
@@ -64,20 +69,15 @@ class Fit:
         return np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation, _ in self.poses])
 
 
-@dataclass(frozen=True)
-class Climbed:
-    """All rungs, their errors the photographs' RMS in px, and the chosen one's fit to all photographs."""
-
-    rungs: tuple[Rung, ...]
-    fit: Fit
-
-
 def climb(
     views: Sequence[View],
     usable: Callable[[Fit], bool] = lambda fit: True,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Climbed:
-    """The ladder on these views; a rung whose fit is not `usable` is passed over."""
+) -> tuple[tuple[Rung, ...], Fit]:
+    """All rungs, their errors the photographs' RMS in px, and the chosen one's fit to all photographs.
+
+    A rung whose fit is not `usable` is passed over.
+    """
     folds = [np.arange(len(views)) % min(FOLDS, len(views)) == k for k in range(min(FOLDS, len(views)))]
     errors, fits, start = np.full((len(RUNGS), len(views)), np.inf), {}, None
     for number, name in enumerate(RUNGS):
@@ -93,7 +93,7 @@ def climb(
             "photograph the board, glued to something flat, from more directions",
         )
     rungs = compared(list(RUNGS), errors)
-    return Climbed(rungs, fits[rungs[simplest(rungs)].name])
+    return rungs, fits[rungs[simplest(rungs)].name]
 
 
 def fit_rung(views: Sequence[View], name: str, start: Fit | None = None) -> Fit | None:

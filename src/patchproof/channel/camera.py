@@ -35,15 +35,16 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, dia
     `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     `diagonal_share` is what vignetting needs to know, from `diagonal_share_of`.
     """
-    linear = vignetted(linear, torch.as_tensor(sensor.vignetting).to(linear), diagonal_share)
-    linear = blurred(linear, torch.as_tensor(sensor.blur_px * scale).to(linear))
-    linear = moved(linear, torch.as_tensor(sensor.motion_px * scale).to(linear), sensor.motion_deg)
-    linear = linear * gains(sensor, linear)[:, :, None, None]
-    linear = noisy(linear, torch.as_tensor(sensor.noise * scale).to(linear), sensor.noise_seed)
-    picture = encoded(linear)
-    if _is_stored(sensor, scale, jpeg):
-        picture = compressed(picture, torch.as_tensor(sensor.jpeg).to(linear))
-    return picture
+
+    def on(values) -> Tensor:
+        return torch.as_tensor(values).to(linear)
+
+    light = vignetted(linear, on(sensor.vignetting), diagonal_share)
+    light = blurred(light, on(sensor.blur_px * scale))
+    light = moved(light, on(sensor.motion_px * scale), sensor.motion_deg)
+    light = light * gains(sensor, linear)[:, :, None, None]
+    picture = encoded(noisy(light, on(sensor.noise * scale), sensor.noise_seed))
+    return compressed(picture, on(sensor.jpeg)) if _is_stored(sensor, scale, jpeg) else picture
 
 
 def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
@@ -137,7 +138,9 @@ def noisy(linear: Tensor, noise: Tensor, seeds) -> Tensor:
     """Shot and read noise in linear light (EMVA 1288: variance linear in the signal); each picture has its own seed."""
     if float(noise.max()) < SMALLEST_NOISE:
         return linear
-    grain = torch.stack([_grain(int(seed), linear.shape[1:]) for seed in seeds]).to(linear)
+    # made on the CPU whatever the device, so that a GPU sees the same noise
+    generators = (torch.Generator().manual_seed(int(seed)) for seed in seeds)
+    grain = torch.stack([torch.randn(linear.shape[1:], generator=generator) for generator in generators]).to(linear)
     deviation = noise[:, None, None, None] * (linear.detach().clamp_min(0) + READ_SHARE**2).sqrt()
     return linear + deviation * grain
 
@@ -149,8 +152,3 @@ def compressed(picture: Tensor, quality: Tensor) -> Tensor:
     height, width = picture.shape[-2:]
     padded = torch.nn.functional.pad(picture, (0, -width % 16, 0, -height % 16), mode="replicate")
     return jpeg_codec_differentiable(padded, quality)[..., :height, :width].clamp(0, 1)
-
-
-def _grain(seed: int, shape) -> Tensor:
-    # made on the CPU whatever the device, so that a GPU sees the same noise
-    return torch.randn(tuple(shape), generator=torch.Generator().manual_seed(seed))

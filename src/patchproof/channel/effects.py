@@ -11,12 +11,15 @@ that applies it. Its numbers come from a generator of its own, keyed by its name
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
-from patchproof.channel.effect import Effect, Facing, Rows, Setting, off
 from patchproof.color import tinted_white
+from patchproof.settings import SceneSettings
 
 # The sun and lamps stand within these angles of the patch's side: from behind, nothing on the patch could be seen.
 _AZIMUTH_DEG, _ELEVATION_DEG = (-90.0, 90.0), (10.0, 80.0)
@@ -24,6 +27,37 @@ _UNIT = (0.0, 1.0)
 # Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
 _NORMAL_MARGIN = 1e-3
 _LEAST_COSINE = 0.2  # the sun is made five times as strong at most where it has to light the patch alone
+# Settings of one number; the range is ± what this makes of it.
+_ENDS: dict[str, Callable[[float], float]] = {"view.look_at_jitter": float, "camera.white_balance": np.log1p}
+
+Facing = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""N cosines, 0 from behind, between the patch's normal and directions (azimuths, elevations)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rows:
+    """N draws: every field has N rows. A field of one row is repeated; other numbers of rows are a ValueError."""
+
+    def __post_init__(self):
+        counts = {len(values) for values in vars(self).values()} - {1}
+        if len(counts) > 1:
+            raise ValueError(f"fields of one record have {sorted(counts)} rows")
+        every = np.zeros(counts.pop() if counts else 1, int)
+        for name, values in vars(self).items():
+            if len(values) != len(every):
+                object.__setattr__(self, name, values[every])
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, rows: slice | np.ndarray | list[int]) -> Self:
+        """The draws at a slice or index array."""
+        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
+
+
+def off(value: Any = 0.0) -> Any:
+    """A field that is off at this value, its default in one row."""
+    return field(default_factory=lambda: np.array([value]), metadata={"off": value})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -89,8 +123,67 @@ RECORDS: dict[str, type[Rows]] = {"pose": Pose, "light": Light, "print": Print, 
 RECORD_OF = {part.name: record for record, kind in RECORDS.items() for part in fields(kind)}
 
 
-def _stacked(*columns: np.ndarray) -> tuple[np.ndarray]:
-    return (np.stack(columns, 1),)
+@dataclass(frozen=True)
+class Effect:
+    """One thing that views differ by. `columns` are the numbers it takes, each with its range or the setting
+    "table.name" that has it; they fill the fields of the same names, or are `made` into the fields `into`. `first` is
+    where they stand in the draws that the oldest effects share.
+
+    `switch` is False of what no picture can be without. `instead` makes the light that stands in for a light left out.
+    """
+
+    name: str
+    columns: Mapping[str, str | tuple[float, float]]
+    first: int | None = None
+    into: tuple[str, ...] = ()
+    made: Callable[..., np.ndarray | tuple[np.ndarray, ...]] = lambda *columns: columns
+    switch: bool = True
+    instead: Callable[[Any, Facing], Rows] | None = None
+    whole: bool = False  # whether it takes whole photographs to be seen as it is
+    only_paper: bool = False  # whether nothing but paper shows it
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields it fills; the first is its strength."""
+        return self.into or tuple(self.columns)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The settings it reads; the first turns it on and off."""
+        return tuple(source for source in self.columns.values() if isinstance(source, str))
+
+    def range(self, settings: SceneSettings, column: str) -> tuple[float, float]:
+        """The (low, high) of one of its columns."""
+        source = self.columns[column]
+        if isinstance(source, tuple):
+            return source
+        table, name = source.split(".")
+        value = getattr(getattr(settings, table), name)
+        if source not in _ENDS:
+            return value
+        end = _ENDS[source](value)
+        return -end, end
+
+    def sample(self, settings: SceneSettings, unit: np.ndarray, number: np.ndarray) -> dict[str, np.ndarray]:
+        """Its fields for N views with numbers N×columns in [0, 1); without columns, the views' own `number` N."""
+        ends = (self.range(settings, name) for name in self.columns)
+        columns = [low + (high - low) * column for (low, high), column in zip(ends, unit.T, strict=True)]
+        values = self.made(*columns) if columns else number
+        return dict(zip(self.fields, values if isinstance(values, tuple) else (values,), strict=True))
+
+    def off(self, record: Rows, facing: Facing) -> Rows | None:
+        """The record without the effect; None where it is off in all views."""
+        strength = self.fields[0]
+        drawn, at_rest = getattr(record, strength), record.__dataclass_fields__[strength].metadata["off"]
+        if (drawn == at_rest).all():
+            return None
+        if self.instead is not None:
+            return self.instead(record, facing)
+        return replace(record, **{strength: np.full_like(drawn, at_rest)})
+
+
+def _stacked(*columns: np.ndarray) -> np.ndarray:
+    return np.stack(columns, 1)
 
 
 def _view(azimuth, elevation, distance, roll, *offset: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -103,22 +196,18 @@ def _uneven(sh2: np.ndarray, *coefficients: np.ndarray) -> tuple[np.ndarray, ...
     return sh2, ndtri(_NORMAL_MARGIN + (1 - 2 * _NORMAL_MARGIN) * np.stack(coefficients, 1))
 
 
-def _white(light: np.ndarray, b: np.ndarray) -> tuple[np.ndarray]:
-    return (tinted_white(light, b),)
-
-
-def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> tuple[np.ndarray]:
+def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> np.ndarray:
     """Both planes as far, each in its own direction."""
     angles = np.stack(turns, 1) * 2 * np.pi
-    return (length_mm[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1),)
+    return length_mm[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
 
 
-def _gains(red: np.ndarray, blue: np.ndarray) -> tuple[np.ndarray]:
-    return (np.exp(np.stack([red, np.zeros_like(red), blue], 1)),)
+def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
+    return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
 
 
-def _whole(quality: np.ndarray) -> tuple[np.ndarray]:
-    return (np.round(quality).astype(np.int64),)
+def _whole(quality: np.ndarray) -> np.ndarray:
+    return np.round(quality).astype(np.int64)
 
 
 def _even_for_sun(light: Light, facing: Facing) -> Light:
@@ -149,43 +238,39 @@ def _units(*names: str) -> dict[str, tuple[float, float]]:
 
 
 _VIEW = {name: f"view.{name}" for name in ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg")}
-_JITTER = Setting("view.look_at_jitter", lambda share: (-share, share))
-_BALANCE = Setting("camera.white_balance", lambda share: (-np.log1p(share), np.log1p(share)))
+_JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
+_BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
 _SUN = {"light_azimuth_deg": _AZIMUTH_DEG, "light_elevation_deg": _ELEVATION_DEG}
-_LAMP = {"point_azimuth_deg": _AZIMUTH_DEG, "point_elevation_deg": _ELEVATION_DEG}
+_LAMP = {"point": "light.point", "point_azimuth_deg": _AZIMUTH_DEG, "point_elevation_deg": _ELEVATION_DEG}
 _LAMP_MM = {"point_distance_mm": "light.point_distance_mm"}
 _SHIFT = {"length": "printer.misregistration_mm"} | _units("red", "blue")
 _SH2 = {"sh2": "light.sh2"} | _units(*(f"coefficient {i}" for i in range(8)))
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("viewpoint", _VIEW | dict.fromkeys("xyz", _JITTER), 0, (*_VIEW, "look_at_offset"), _view, switch=False),
+    Effect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, switch=False),
     Effect("background", _units("picture", "size", "x", "y", "mirrored"), 11, ("background",), _stacked, switch=False),
     Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
     Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
-    Effect("lamp", {"point": "light.point"} | _LAMP | _LAMP_MM, 25, instead=_even_for_lamp, slows=True),
-    Effect("uneven ambient", _SH2, 29, ("sh2", "sh2_coefficients"), _uneven, slows=True),
-    Effect("gloss", {"gloss": "light.gloss", "shininess": "light.shininess"}, 38, slows=True, only_paper=True),
+    Effect("lamp", _LAMP | _LAMP_MM, 25, instead=_even_for_lamp),
+    Effect("uneven ambient", _SH2, 29, ("sh2", "sh2_coefficients"), _uneven),
+    Effect("gloss", {"gloss": "light.gloss", "shininess": "light.shininess"}, 38, only_paper=True),
     Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
     Effect("ink density", {"density": "printer.density"}, 23),
     Effect("printed black", {"black": "printer.black"}, 24),
-    Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), _white),
-    Effect("misregistration", _SHIFT, 45, ("misregistration_mm",), _shifts, slows=True),
+    Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), tinted_white),
+    Effect("misregistration", _SHIFT, 45, ("misregistration_mm",), _shifts),
     Effect("print scale", {"printed_scale": "printer.scale"}, 48),
     Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16),
-    Effect("white balance", {"red": _BALANCE, "blue": _BALANCE}, 17, ("white_balance",), _gains),
-    Effect("vignetting", {"vignetting": "camera.vignetting"}, 42, slows=True),
-    Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, slows=True, whole=True),
-    Effect("blur", {"blur_px": "camera.blur_px"}, 19, slows=True, whole=True),
-    Effect("noise", {"noise": "camera.noise"}, 20, slows=True, whole=True),
+    Effect("white balance", _BALANCE, 17, ("white_balance",), _gains),
+    Effect("vignetting", {"vignetting": "camera.vignetting"}, 42),
+    Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, whole=True),
+    Effect("blur", {"blur_px": "camera.blur_px"}, 19, whole=True),
+    Effect("noise", {"noise": "camera.noise"}, 20, whole=True),
     Effect("grain", {}, 25, ("noise_seed",), switch=False),
-    Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, ("jpeg",), _whole, slows=True, whole=True),
+    Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, ("jpeg",), _whole, whole=True),
 )
 EFFECT = {effect.name: effect for effect in EFFECTS}
 
-
-def _place(effect: Effect) -> tuple[float, int]:
-    return np.inf if effect.first is None else effect.first, len(effect.columns)
-
-
 # Fields in the order in which files have them: as they were drawn when all effects shared one sequence.
-FIELDS = tuple(name for effect in sorted(EFFECTS, key=_place) for name in effect.fields)
+_DRAWN = sorted(EFFECTS, key=lambda effect: (np.inf if effect.first is None else effect.first, len(effect.columns)))
+FIELDS = tuple(name for effect in _DRAWN for name in effect.fields)

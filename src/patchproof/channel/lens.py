@@ -83,17 +83,33 @@ def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int
         raise Refused("a camera file (JSON)", f"{path} that cannot be read", "calibrate again") from error
     camera = validated(Camera, data, str(path))
     check_camera(camera, str(path))
-    if photo_px is not None:
-        _refuse_aspect(camera, photo_px, path)
+    width, height = camera.image_px
+    if photo_px is not None and abs(photo_px[0] * height / (photo_px[1] * width) - 1) > ASPECT_TOLERANCE:
+        raise Refused(
+            f"photographs with the aspect of {path} ({width} × {height} px)",
+            f"photo_px = [{photo_px[0]}, {photo_px[1]}]",
+            "set camera.photo_px to that aspect or calibrate the camera as it is held",
+        )
     return camera
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a camera whose middle lies outside of its picture, or whose distortion cannot be undone; `where` is said
-    of it.
+    """Refuse a camera whose middle lies outside of its picture, whose tone curve does not grow, or whose distortion
+    cannot be undone; `where` names it.
     """
-    _refuse_outside(camera, where)
-    _refuse_tone(camera, where)
+    (width, height), light = camera.image_px, camera.tone_light
+    if not (0 < camera.cx < width and 0 < camera.cy < height):
+        raise Refused(
+            f"a principal point inside the picture of {width} × {height} px in {where}",
+            f"({camera.cx:g}, {camera.cy:g})",
+            "give cx, cy and image_px in the same pixels",
+        )
+    if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
+        raise Refused(
+            f"a tone_light in {where} that grows from 0 to 1 at every step",
+            f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not",
+            "give the light at evenly spaced code values, or leave it out for sRGB's curve",
+        )
     _refuse_folded(camera, where)
 
 
@@ -123,10 +139,10 @@ def pinhole_frame(camera: Camera, size_px: tuple[int, int]) -> Frame:
     matrix = matrix_px(camera, size_px)
     if not camera.bends:
         return Frame(size_px, matrix, 0, 0, 0, 0)
-    seen = undistort_points(_edge_px(size_px), camera, size_px)
+    edge = undistort_points(_edge_px(size_px), camera, size_px)
     # a bilinear sample reads no padding where it lies between the centers of the outermost pixels
-    left, top = (max(0, math.ceil(0.5 - low)) for low in seen.min(0))
-    right, bottom = (max(0, math.ceil(high + 0.5 - size)) for high, size in zip(seen.max(0), size_px, strict=True))
+    left, top = (max(0, math.ceil(0.5 - low)) for low in edge.min(0))
+    right, bottom = (max(0, math.ceil(high + 0.5 - size)) for high, size in zip(edge.max(0), size_px, strict=True))
     matrix = matrix + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
     return Frame((size_px[0] + left + right, size_px[1] + top + bottom), matrix, left, top, right, bottom)
 
@@ -163,13 +179,9 @@ def _bent(camera: Camera, points: np.ndarray) -> np.ndarray:
     x, y = points.T
     r2 = x * x + y * y
     radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
-    return np.stack(
-        [
-            x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x),
-            y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y,
-        ],
-        1,
-    )
+    bent_x = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
+    bent_y = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
+    return np.stack([bent_x, bent_y], 1)
 
 
 def _straight(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -214,47 +226,17 @@ def _path(name_or_file: str, base: Path | None) -> Path:
     return shipped("calibration", "cameras", f"{name_or_file}.json")
 
 
-def _refuse_outside(camera: Camera, path: str) -> None:
-    width, height = camera.image_px
-    if not (0 < camera.cx < width and 0 < camera.cy < height):
-        raise Refused(
-            f"a principal point inside the picture of {width} × {height} px in {path}",
-            f"({camera.cx:g}, {camera.cy:g})",
-            "give cx, cy and image_px in the same pixels",
-        )
-
-
-def _refuse_tone(camera: Camera, path: str) -> None:
-    light = camera.tone_light
-    if light is not None and not (light[0] == 0 and light[-1] == 1 and (np.diff(light) > 0).all()):
-        raise Refused(
-            f"a tone_light in {path} that grows from 0 to 1 at every step",
-            f"{len(light)} values from {light[0]:g} to {light[-1]:g} that do not",
-            "give the light at evenly spaced code values, or leave it out for sRGB's curve",
-        )
-
-
-def _refuse_folded(camera: Camera, path: str) -> None:
+def _refuse_folded(camera: Camera, where: str) -> None:
     """Where undistorting closes, neighbors keep their order and stay within twice their distance: no direction is seen
     twice.
     """
     x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
-    seen = _to_unit(matrix_px(camera, camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
+    points = _to_unit(matrix_px(camera, camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
     with np.errstate(over="ignore", invalid="ignore"):
-        missed_px = np.abs((_bent(camera, _straight(camera, seen)) - seen) * [camera.fx, camera.fy]).max()
+        missed_px = np.abs((_bent(camera, _straight(camera, points)) - points) * [camera.fx, camera.fy]).max()
     if not missed_px < _CLOSED_PX:  # nor where it is not a number
         raise Refused(
-            f"distortion that can be undone in the whole picture in {path}",
+            f"distortion that can be undone in the whole picture in {where}",
             f"k1 k2 k3 = {camera.k1:g} {camera.k2:g} {camera.k3:g}, p1 p2 = {camera.p1:g} {camera.p2:g}",
             "calibrate again with the board in the picture's corners, or with fewer terms",
-        )
-
-
-def _refuse_aspect(camera: Camera, photo_px: tuple[int, int], path: Path) -> None:
-    width, height = camera.image_px
-    if abs(photo_px[0] * height / (photo_px[1] * width) - 1) > ASPECT_TOLERANCE:
-        raise Refused(
-            f"photographs with the aspect of {path} ({width} × {height} px)",
-            f"photo_px = [{photo_px[0]}, {photo_px[1]}]",
-            "set camera.photo_px to that aspect or calibrate the camera as it is held",
         )

@@ -1,7 +1,7 @@
-"""What a printer makes of sRGB: a table from the colours sent to the colours seen on paper, differentiable.
+"""What a printer makes of sRGB: a table from the colors sent to the colors seen on paper, differentiable.
 
 In: sRGB as sent, N×3×H×W in [0, 1]. Out: sRGB as seen by an eye adapted to the paper (media-relative: bare paper is 1),
-so that light and camera are applied once, elsewhere. A second table holds how far each colour is out of gamut (ΔE00 of
+so that light and camera are applied once, elsewhere. A second table holds how far each color is out of gamut (ΔE00 of
 the round trip). A printer is a name, two tables and where they come from; on disk NAME.npz and NAME.json.
 Out-of-gamut inks (offset cyan and green lie outside sRGB) are clipped to [0, 1] when the table is made: cameras that
 deliver sRGB clip them too. Print-to-print variation is a small function on top, `vary`.
@@ -33,6 +33,7 @@ SIZE = len(NODES_8BIT)
 # are missed by up to 2.2 (coated) and 3.9 (uncoated) when they are sent, in 99 of 100: the round trip's own error.
 IN_GAMUT = 3.0
 _HALVINGS = 10
+Method = Literal["measured", "icc", "assumed"]
 GAMUT_STEPS = 8  # the gamut table is stored in eighths of a ΔE00, up to 31.9
 
 
@@ -45,7 +46,7 @@ class Paper(Strict):
 
 class _Head(Strict):
     name: str
-    method: Literal["measured", "icc", "assumed"]
+    method: Method
     paper: Paper = Paper()
     provenance: dict[str, Any] = Field(default_factory=dict)
 
@@ -55,7 +56,7 @@ class Printer:
     """Tables on the nodes `NODES_8BIT` of red, green, blue (in this order); `provenance` says where they come from."""
 
     name: str
-    method: Literal["measured", "icc", "assumed"]
+    method: Method
     lut: Tensor  # float32 33×33×33×3, seen sRGB in [0, 1]
     gamut: Tensor  # float32 33×33×33, ΔE00 between sent and seen
     paper: Paper = field(default_factory=Paper)
@@ -66,7 +67,7 @@ class Printer:
         return _look_up(self._colors, srgb)
 
     def gamut_distance(self, srgb: Tensor) -> Tensor:
-        """N×1×H×W: ΔE00 by which the printer misses each colour; differentiable, and so a penalty."""
+        """N×1×H×W: ΔE00 by which the printer misses each color; differentiable, and so a penalty."""
         return _look_up(self._distances, srgb)
 
     def into_gamut(self, srgb: Tensor) -> Tensor:
@@ -75,16 +76,17 @@ class Printer:
         """
         with torch.no_grad():
             srgb = srgb.clamp(0, 1)
-            nearest = torch.where(self.gamut_distance(srgb) > IN_GAMUT, self.apply(srgb), srgb)
-            missed = self.gamut_distance(nearest) > IN_GAMUT
+            shown = torch.where(self.gamut_distance(srgb) > IN_GAMUT, self.apply(srgb), srgb)
+            missed = self.gamut_distance(shown) > IN_GAMUT
             if not missed.any():
-                return nearest
-            low, high = torch.zeros_like(nearest[:, :1]), torch.ones_like(nearest[:, :1])  # share of the color itself
+                return shown
+            gray = torch.full_like(shown, 0.5)
+            low, high = torch.zeros_like(shown[:, :1]), torch.ones_like(shown[:, :1])  # share of the color itself
             for _ in range(_HALVINGS):
                 middle = (low + high) / 2
-                good = self.gamut_distance(torch.lerp(_gray(nearest), nearest, middle)) <= IN_GAMUT
+                good = self.gamut_distance(torch.lerp(gray, shown, middle)) <= IN_GAMUT
                 low, high = torch.where(good, middle, low), torch.where(good, high, middle)
-            return torch.where(missed, torch.lerp(_gray(nearest), nearest, low), nearest)
+            return torch.where(missed, torch.lerp(gray, shown, low), shown)
 
     @property
     def holds_gray(self) -> bool:
@@ -101,7 +103,7 @@ class Printer:
 
 
 def node_colors() -> np.ndarray:
-    """float64 33×33×33×3: the sRGB colours at which the tables are known, red slowest."""
+    """float64 33×33×33×3: the sRGB colors at which the tables are known, red slowest."""
     nodes = np.array(NODES_8BIT) / 255
     return np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1)
 
@@ -114,7 +116,7 @@ def identity_printer() -> Printer:
 
 
 def printer_from_table(
-    name: str, method: Literal["measured", "icc", "assumed"], lut: np.ndarray, gamut: np.ndarray, white_lab, provenance
+    name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, white_lab, provenance: dict[str, Any]
 ) -> Printer:
     """A printer from arrays 33×33×33×3 (clipped to [0, 1], see the module's head) and 33×33×33; black is read off."""
     lut = np.clip(np.asarray(lut, np.float64), 0, 1)
@@ -124,7 +126,7 @@ def printer_from_table(
 
 
 def vary(seen_linear: Tensor, change: Tensor) -> Tensor:
-    """Light `... × 3` of colours as seen, as of another print of the same file; channels last, unlike an image.
+    """Light `... × 3` of colors as seen, as of another print of the same file; channels last, unlike an image.
 
     `change` `... × 3` broadcasts against it: dot gain g, ink density d, black b; 0 changes nothing. Bare paper stays 1.
     With reflectance R: coverage 1 - R (Murray-Davies) grows by 4·g·R·(1 - R); density makes R^(1+d); the surface's own
@@ -218,16 +220,11 @@ def _bordered(table: Tensor) -> Tensor:
     return table.contiguous()
 
 
-def _gray(like: Tensor) -> Tensor:
-    return torch.full_like(like, 0.5)
-
-
 def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     colors = srgb if srgb.dtype == torch.float64 else srgb.float()  # half precision cannot address 33 nodes finely
     levels = 255 * colors.clamp(0, 1)
     position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
     grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
-    seen = torch.nn.functional.grid_sample(
-        table.to(colors), grid[None], mode="bilinear", padding_mode="border", align_corners=True
-    )
-    return seen[0].movedim(0, 1).to(srgb.dtype)
+    sample = torch.nn.functional.grid_sample
+    looked_up = sample(table.to(colors), grid[None], mode="bilinear", padding_mode="border", align_corners=True)
+    return looked_up[0].movedim(0, 1).to(srgb.dtype)

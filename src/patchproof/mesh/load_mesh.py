@@ -61,17 +61,15 @@ def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
     """The parts with textures of at most LARGEST_TEXTURE_PX a side, and warnings about those that were larger."""
     import cv2
 
-    known: dict[int, Material] = {}
+    kept: dict[Material, Material] = {}
     warnings = []
-    for material in (part.material for part in parts):
-        texture = material.texture_srgb
-        if id(material) in known or texture is None or max(texture.shape[:2]) <= LARGEST_TEXTURE_PX:
-            known.setdefault(id(material), material)
+    for material in dict.fromkeys(part.material for part in parts):
+        kept[material], texture = material, material.texture_srgb
+        if texture is None or max(texture.shape[:2]) <= LARGEST_TEXTURE_PX:
             continue
         height, width = texture.shape[:2]
         scale = LARGEST_TEXTURE_PX / max(width, height)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        reduced = cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
-        known[id(material)] = replace(material, texture_srgb=reduced)
+        kept[material] = replace(material, texture_srgb=cv2.resize(texture, size, interpolation=cv2.INTER_AREA))
         warnings.append(f"the texture of {width} × {height} of {material.name} is reduced to {size[0]} × {size[1]}")
-    return [replace(part, material=known[id(part.material)]) for part in parts], warnings
+    return [replace(part, material=kept[part.material]) for part in parts], warnings

@@ -16,7 +16,7 @@ import numpy as np
 from patchproof.strict import Refused
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Material:
     """A base color in linear light and, where there is one, a texture as uint8 H×W×3 sRGB; they multiply as light."""
 
@@ -74,20 +74,19 @@ def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] 
         warnings.append(f"{np.count_nonzero(whole & ~has_area)} faces without area are left out")
     corners = [_corners(part, normals[owner == i]) for i, part in enumerate(parts)]
     uv, corner_normals, colors = (np.concatenate(array)[keep] for array in zip(*corners, strict=True))
-    used, kept_faces = _compact(faces[keep], len(unit))
+    used, kept_faces = np.unique(faces[keep], return_inverse=True)
     placed = unit[used]
     low, high = placed.min(0), placed.max(0)
-    known: dict[int, int] = {}
-    index = np.array([known.setdefault(id(part.material), len(known)) for part in parts])
-    by_id = {id(part.material): part.material for part in parts}
+    materials = tuple(dict.fromkeys(part.material for part in parts))
+    index = np.array([materials.index(part.material) for part in parts])
     return Mesh(
         vertices=(placed - (low + high) / 2) * (length_mm / (high - low).max()),
-        faces=kept_faces,
+        faces=kept_faces.reshape(-1, 3),
         corner_uv=uv,
         corner_normal=corner_normals,
         corner_color_linear=colors,
         face_material=index[owner[keep]],
-        materials=tuple(by_id[key] for key in known),
+        materials=materials,
         warnings=tuple(warnings),
     )
 
@@ -131,13 +130,6 @@ def _corners(part: Part, face_normals: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if part.colors_linear is not None:
         colors[:] = part.colors_linear[part.faces]
     return uv, normals, colors
-
-
-def _compact(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(indices of the vertices that faces use, faces into those)."""
-    used = np.zeros(count, bool)
-    used[faces] = True
-    return np.flatnonzero(used), (np.cumsum(used) - 1)[faces]
 
 
 def normal_transform(rotation: np.ndarray) -> np.ndarray:

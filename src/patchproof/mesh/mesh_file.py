@@ -76,6 +76,8 @@ class _Reader:
     """One file while it is read: what trimesh found in it, materials already made, and the warnings so far."""
 
     def __init__(self, path: Path):
+        from trimesh.exchange.load import mesh_loaders
+
         self.path, self.assets, self.warnings = path, _Assets(path), []
         self.kind = path.suffix.lower()[1:]
         self.is_gltf = self.kind in {"glb", "gltf"}
@@ -85,7 +87,9 @@ class _Reader:
             self.header = _gltf_header(path) if self.is_gltf else {}
             if self.kind == "obj":
                 _check_obj(path)
-            self.loaded = self._load()
+            with open(path, "rb") as file, python_warnings.catch_warnings():
+                python_warnings.simplefilter("ignore")  # about numpy's parsers, not about the mesh
+                self.loaded: dict[str, Any] = mesh_loaders[self.kind](file, file_type=self.kind, resolver=self.assets)
         except Refused:
             raise
         except Exception as error:  # the parsers raise whatever they stumble over
@@ -93,7 +97,11 @@ class _Reader:
             got = f"{path.name} that cannot be read ({f'{type(error).__name__}: {error}'[:120]})"
             raise Refused(f"a mesh as {self.kind.upper()}", got, "export it again") from error
         self._refuse_missing()
-        self._warn_about_gltf()
+        used = set(self.header.get("extensionsUsed", ())) | set(self.header.get("extensionsRequired", ()))
+        for name in sorted(used & {"KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"}):
+            self.warnings.append(f"the glTF extension {name} is not read; textures or shapes may be wrong")
+        if any(m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in self.header.get("materials", ())):
+            self.warnings.append("transparent materials are drawn opaque")
 
     def placed(self) -> list[tuple[np.ndarray, dict, dict]]:
         """(world_from_part 4×4, trimesh's arrays, the glTF primitive) of each placed geometry."""
@@ -140,13 +148,6 @@ class _Reader:
         own = np.arange(len(corners)).reshape(-1, 3)
         return Part(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
 
-    def _load(self) -> dict[str, Any]:
-        from trimesh.exchange.load import mesh_loaders
-
-        with open(self.path, "rb") as file, python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore")  # about numpy's parsers, not about the mesh
-            return mesh_loaders[self.kind](file, file_type=self.kind, resolver=self.assets)
-
     def _refuse_missing(self):
         for name in dict.fromkeys(self.assets.missing):
             if not name.lower().endswith(".mtl"):
@@ -155,13 +156,6 @@ class _Reader:
             self.warnings.append(f"the material file {name} is missing")
         for name in self.assets.broken:
             raise Refused(f"the texture {name} of {self.path.name}", "no picture that can be read", "export it again")
-
-    def _warn_about_gltf(self):
-        used = set(self.header.get("extensionsUsed", ())) | set(self.header.get("extensionsRequired", ()))
-        for name in sorted(used & {"KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"}):
-            self.warnings.append(f"the glTF extension {name} is not read; textures or shapes may be wrong")
-        if any(m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in self.header.get("materials", ())):
-            self.warnings.append("transparent materials are drawn opaque")
 
     def _uv(self, visual, count: int) -> np.ndarray | None:
         """Coordinates with v down, or None; trimesh's run up, whatever the file's do."""

@@ -57,8 +57,8 @@ def spans(corners: np.ndarray, grow: float) -> Iterator[tuple[np.ndarray, np.nda
         row = last[face] - upto[face] + number
         left, right = _extent(corners[face], row + 0.5, grow)
         start, stop = _center_at_or_after(left - grow), _center_at_or_after(right + grow)
-        some = stop > start
-        yield face[some], row[some], start[some], stop[some]
+        covered = stop > start
+        yield face[covered], row[covered], start[covered], stop[covered]
 
 
 def _extent(corners: np.ndarray, y: np.ndarray, grow: float) -> tuple[np.ndarray, np.ndarray]:

@@ -136,12 +136,12 @@ def _corner_look(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
     look = mesh.corner_color_linear[faces].astype(float)
     owner, uv = mesh.face_material[faces], np.nan_to_num(mesh.corner_uv[faces], nan=0.0, posinf=0.0, neginf=0.0)
     for index in np.unique(owner):
-        material, mine = mesh.materials[index], owner == index
-        look[mine] *= material.base_color_linear
+        material, own = mesh.materials[index], owner == index
+        look[own] *= material.base_color_linear
         if material.texture_srgb is not None:
             height, width, _ = material.texture_srgb.shape
-            x, y = (np.floor(uv[mine] * [width, height]).astype(np.int64) % [width, height]).transpose(2, 0, 1)
-            look[mine] *= linear_from_srgb(material.texture_srgb[y, x] / 255)
+            x, y = (np.floor(uv[own] * [width, height]).astype(np.int64) % [width, height]).transpose(2, 0, 1)
+            look[own] *= linear_from_srgb(material.texture_srgb[y, x] / 255)
     return look
 
 

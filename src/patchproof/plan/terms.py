@@ -13,8 +13,7 @@ from functools import partial
 
 from torch import Tensor
 
-from patchproof.channel.effect import Effect
-from patchproof.channel.effects import EFFECT, EFFECTS
+from patchproof.channel.effects import EFFECT, EFFECTS, Effect
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.problem import Problem
 from patchproof.render.pixels import Shown

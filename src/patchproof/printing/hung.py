@@ -1,4 +1,4 @@
-"""Where the piece goes on the object: a picture of the object's side, and millimetres to its edges.
+"""Where the piece goes on the object: a picture of the object's side, and millimeters to its edges.
 
 In: a scene with a mesh and its piece. Out: a `Hung` for the sheet's last page. The picture is rendered by the project's
 own rasterizer from so far away that it is a plan: at 60 times the object's length perspective moves nothing by more
@@ -35,13 +35,15 @@ ROOM = 1.06  # of the object's extent
 def hang(scene: PatchScene, template: Template) -> Hung:
     """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
     frame, placement = scene.frame, scene.placement
-    axes = np.stack([frame.right, -frame.up])  # millimetres right and down, from the middle of the object
+    axes = np.stack([frame.right, -frame.up])  # millimeters right and down, from the middle of the object
 
     def flat(points: np.ndarray) -> np.ndarray:
         return np.asarray(points) @ axes.T
 
     low, high = flat(scene.mesh.vertices).min(0), flat(scene.mesh.vertices).max(0)
-    border = np.concatenate([_edge(a, b) for a, b in _sides(rect_corners((0, 0, *placement.size_mm)))])
+    corners = rect_corners((0, 0, *placement.size_mm))
+    steps = np.linspace(0, 1, 16, endpoint=False)[:, None]  # bent paper has bent edges
+    border = np.concatenate([a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
     outline = flat(placement.world(border))
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
@@ -83,12 +85,3 @@ def _picture(scene: MeshScene, half_mm: np.ndarray) -> np.ndarray:
         light = see(set_stage(plain), None, conditions, (width, height), supersample=2).bare
     picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
     return photo_codes_of(picture)
-
-
-def _sides(corners: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    return [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
-
-
-def _edge(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Points from start up to end: bent paper has bent edges."""
-    return start + np.linspace(0, 1, 16, endpoint=False)[:, None] * (end - start)

@@ -11,6 +11,7 @@ charts and boards.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from patchproof.optimizer.problem import set_problem
@@ -21,11 +22,12 @@ from patchproof.printing.shots import shot_sections
 from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
 from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.sheets.piece import MODULES, control_design, lay_out_piece
 from patchproof.sheets.plan_page import PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.several import OneDesign, write_several
+from patchproof.sheets.several import write_several
 from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet
 from patchproof.strict import Refused
@@ -37,19 +39,12 @@ def sheet_of(
     """Write the run's sheet; `control` is mean, gray, noise, shuffled or blank, `template` a name or file in place of
     the scene's.
     """
-    one, scene, page = _design(run, template, control)
-    return write_sheet(
-        pdf_path,
-        template=page,
-        piece=one.piece,
-        sheet_id=one.sheet_id,
-        kind=one.kind,
-        design_srgb8=None if one.kind == "blank" else one.design_srgb8,
-        promise=one.promise,
-        settings=one.settings,
-        plan=_plan(scene, page, one.promise) if page.plan_page else None,
-        copies=copies,
-    )
+    content, scene = _content(run, template, control)
+    page = load_template(scene.settings.sheet.template)
+    plan = _plan(scene, page, content.promise) if page.plan_page else None
+    if control == "blank":
+        content = replace(content, design_srgb8=None)
+    return write_sheet(pdf_path, page, content, plan, copies)
 
 
 def sheet_of_several(
@@ -59,27 +54,22 @@ def sheet_of_several(
     another is named.
     """
     name = template or runs[0].scene.settings.sheet.template
-    return write_several(pdf_path, load_template(name), [_design(run, name, control)[0] for run in runs])
+    return write_several(pdf_path, load_template(name), [_content(run, name, control)[0] for run in runs])
 
 
-def _design(run: Run, template: str | None, control: str | None) -> tuple[OneDesign, PieceScene, Template]:
+def _content(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
     """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
-    own, promise = needs_piece(run.scene), run.promise
+    own = needs_piece(run.scene)
     scene = own if template is None else own.with_template(template)
-    piece, kind = scene.piece, control or "design"
-    if piece.size_mm != own.piece.size_mm and control is None:
-        promise = make_promise(set_problem(scene), run.design, scene.draw("promise", PROMISE_VIEWS))
+    settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
+    piece, promise = scene.piece, run.promise
     if control is not None:
-        piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, scene.sheet_id, kind)
-    one = OneDesign(
-        piece=piece,
-        sheet_id=scene.sheet_id,
-        kind=kind,
-        design_srgb8=run.design if control is None else control_design(kind, run.design, scene.sheet_id),
-        promise=promise if control is None else None,
-        settings=scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]},
-    )
-    return one, scene, load_template(scene.settings.sheet.template)
+        piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, scene.sheet_id, control)
+        design = control_design(control, run.design, scene.sheet_id)
+        return PrintedPiece(piece, scene.sheet_id, control, design, settings=settings), scene
+    if piece.size_mm != own.piece.size_mm:
+        promise = make_promise(set_problem(scene), run.design, scene.draw("promise", PROMISE_VIEWS))
+    return PrintedPiece(piece, scene.sheet_id, "design", run.design, promise, settings), scene
 
 
 def _plan(scene: PieceScene, template: Template, promise: Promise | None) -> PlanPage | None:

@@ -41,17 +41,16 @@ def plan_shots(promise: Promise) -> ShotPlan:
     rates = (promise.rate, promise.controls[best].rate)
     better, worse = rates[::sign]
     return ShotPlan(
-        verdict=fewest(lambda n: _can_tell(promise, n)),
+        verdict=fewest(lambda n: _is_kept(promise, n)),
         control=best,
         paired=fewest(lambda n: paired_power(better, worse, n) >= POWER),
         unpaired=fewest(lambda n: unpaired_power(better, worse, n) >= POWER),
     )
 
 
-def _can_tell(promise: Promise, n: int) -> bool:
+def _is_kept(promise: Promise, n: int) -> bool:
     """Whether n photographs, recognized as often as promised, keep the promise."""
-    likely = round(promise.rate * n)
-    return judge(likely, n, promise.rate, promise.n, promise.target.goal, 0).verdict == "kept"
+    return judge(round(promise.rate * n), n, promise.rate, promise.n, promise.target.goal, 0).verdict == "kept"
 
 
 def fewest(enough: Callable[[int], bool]) -> int | None:
@@ -72,12 +71,10 @@ def paired_power(better: float, worse: float, n: int) -> float:
     differing = only_better + only_worse
     if differing <= 0:
         return 0.0
-    power = 0.0
-    for count in range(1, n + 1):
-        # the smallest number of pairs in favor that is significant, both tails
-        needed = binom.isf((1 - CONFIDENCE) / 2, count, 0.5) + 1
-        power += binom.pmf(count, n, differing) * binom.sf(needed - 1, count, only_better / differing)
-    return float(power)
+    counts = np.arange(1, n + 1)
+    # more pairs in favor than this are significant, both tails
+    insignificant = binom.isf((1 - CONFIDENCE) / 2, counts, 0.5)
+    return float(binom.pmf(counts, n, differing) @ binom.sf(insignificant, counts, only_better / differing))
 
 
 def unpaired_power(better: float, worse: float, n: int) -> float:

@@ -20,8 +20,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from patchproof.channel.effect import Effect, Facing, Rows
-from patchproof.channel.effects import EFFECTS, FIELDS, RECORD_OF, RECORDS, Light, Pose, Print, Sensor
+from patchproof.channel.effects import (
+    EFFECTS,
+    FIELDS,
+    RECORD_OF,
+    RECORDS,
+    Effect,
+    Facing,
+    Light,
+    Pose,
+    Print,
+    Rows,
+    Sensor,
+)
 from patchproof.settings import SceneSettings
 
 Stream = Literal["train", "select", "promise", "reprint", "evaluate"]

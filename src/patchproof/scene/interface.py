@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from typing_extensions import Self
 
-from patchproof.channel.effect import Effect
+from patchproof.channel.effects import Effect
 from patchproof.channel.lens import Camera
 from patchproof.geometry import apply_homography, local_scale
 from patchproof.scene.conditions import Conditions, draw

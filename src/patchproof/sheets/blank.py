@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.page import lay_out_parts
-from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import frame_mm, lay_out_piece, marker_ids, page_id
 from patchproof.sheets.template import Template, load_template, template_names
-from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets, write_sheet
+from patchproof.sheets.write import write_page, write_sheet
 from patchproof.strict import Refused
 
 BLANK, CHART = "blank", "chart"
@@ -29,32 +29,21 @@ def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
         do = f"use one of: {', '.join(template_names(BLANK))}, or name the run whose design belongs on the page"
         raise Refused("a template with a [blank] table for a page without a design", f"{template}", do)
     identity = page_id(page)
-    return write_sheet(
-        pdf_path,
-        template=page,
-        piece=lay_out_piece(page.blank.design_mm, page.blank.marker_mm, identity, BLANK),
-        sheet_id=identity,
-        kind=BLANK,
-        design_srgb8=None,
-        promise=None,
-        settings={BLANK: page.blank.model_dump(mode="json")},
-    )
+    piece = lay_out_piece(page.blank.design_mm, page.blank.marker_mm, identity, BLANK)
+    settings = {BLANK: page.blank.model_dump(mode="json")}
+    return write_sheet(pdf_path, page, PrintedPiece(piece, identity, BLANK, None, settings=settings))
 
 
 def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
     """Write the chart's page and its manifest beside it."""
-    pdf_path = pdf_name(pdf_path)
     identity = page_id(template)
     ids = marker_ids(identity, BLANK, len(template.marker.corners_mm))  # a chart has an id of its own, so no kind
     grid = template.chart
     words = {"sheet_id": identity, "kind": CHART, "swatches": str(grid.columns * grid.rows)}
-    page = lay_out_parts(template, [], ids, qr_text(identity, CHART, None), words)
+    page = lay_out_parts(template, [], ids, f"patchproof:{identity}:{CHART}", words)
     pitch = grid.swatch_mm + grid.gap_mm
     width, height = (round(count * pitch - grid.gap_mm, 6) for count in (grid.columns, grid.rows))
-    cut_mm = (*grid.corner_mm, width, height)
-    manifest = page_manifest(page, template, cut_mm, identity, CHART, {CHART: grid.model_dump(mode="json")})
-    save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
-    return manifest
+    return write_page(pdf_path, page, template, (*grid.corner_mm, width, height), CHART, grid)
 
 
 def blank_piece_mm(manifest: Manifest) -> tuple[tuple[float, float], float]:

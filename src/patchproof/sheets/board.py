@@ -11,16 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.page import furnished
-from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import DICTIONARY, MODULES, marker_at, page_id
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardGrid, BoardTemplate, template_data, template_names
-from patchproof.sheets.write import page_manifest, pdf_name, qr_text, save_sheets
+from patchproof.sheets.write import write_page
 from patchproof.strict import Refused, validated
 
 KIND = "board"
@@ -28,15 +25,10 @@ KIND = "board"
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board: what OpenCV's CharucoBoard needs to know, in millimeters as intended."""
+    """A printed board, in millimeters as intended; its markers are the first of DICTIONARY."""
 
     sheet_id: str
-    dictionary: str
-    ids: tuple[int, ...]
-    columns: int
-    rows: int
-    square_mm: float
-    marker_mm: float
+    grid: BoardGrid
     ruler_mm: tuple[float, float]
 
 
@@ -47,40 +39,28 @@ def is_board(template: str | Path) -> bool:
 
 def board_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
     """Write the board's page and its manifest beside it."""
-    pdf_path = pdf_name(pdf_path)
-    board, identity = _load(template)
-    page = _lay_out(board, identity)
-    settings = {KIND: board.board.model_dump(mode="json")}
-    manifest = page_manifest(page, board, _rect(board.board), identity, KIND, settings)
-    save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
-    return manifest
+    page = _load(template)
+    return write_page(pdf_path, _lay_out(page, page_id(page)), page, _rect(page.board), KIND, page.board)
 
 
 def load_board(name_or_file: str | Path) -> Board:
     """The board of a template's name or file, or of the manifest of a printed one (BOARD.json)."""
     if Path(name_or_file).suffix.lower() != ".json":
-        template, identity = _load(name_or_file)
-        return _board(template.board, identity, (template.ruler.length_mm, template.ruler.length_mm))
+        template = _load(name_or_file)
+        return Board(page_id(template), template.board, (template.ruler.length_mm, template.ruler.length_mm))
     manifest = load_manifest(name_or_file)
     if manifest.kind != KIND:
         raise Refused("the manifest of a board", f'one of kind "{manifest.kind}"', "name the JSON beside BOARD.pdf")
     grid = validated(BoardGrid, manifest.settings.get(KIND), "the board's manifest")
-    return _board(grid, manifest.sheet_id, manifest.ruler_mm)
+    return Board(manifest.sheet_id, grid, manifest.ruler_mm)
 
 
-def _load(template: str | Path) -> tuple[BoardTemplate, str]:
-    """The template and the sheet id that it gives."""
+def _load(template: str | Path) -> BoardTemplate:
     path, data = template_data(template)
     if KIND not in data:
         do = f"use one of: {', '.join(template_names(KIND))}"
         raise Refused("a template with a [board] table", f"{template}", do)
-    page = validated(BoardTemplate, data, str(path))
-    return page, page_id(page)
-
-
-def _board(grid: BoardGrid, identity: str, ruler_mm: tuple[float, float]) -> Board:
-    ids = tuple(range(len(_white(grid))))
-    return Board(identity, DICTIONARY, ids, grid.columns, grid.rows, grid.square_mm, grid.marker_mm, ruler_mm)
+    return validated(BoardTemplate, data, str(path))
 
 
 def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
@@ -93,8 +73,8 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
             f"{grid.marker_mm:g} in squares of {grid.square_mm:g} mm",
             "make the markers smaller or the squares larger",
         )
-    x, y = grid.corner_mm
-    corners = [(x + column * grid.square_mm + inset, y + row * grid.square_mm + inset) for row, column in _white(grid)]
+    (x, y), side = grid.corner_mm, grid.square_mm
+    corners = [(x + column * side + inset, y + row * side + inset) for row, column in _squares(grid, 1)]
     if len(corners) > 1000:
         raise Refused("at most 1000 markers on a board", f"{len(corners)}", "make the board's squares fewer")
     words = {
@@ -109,20 +89,14 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
         page_mm=template.page_mm,
         markers=tuple(marker_at(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),
         boxes=(Box("board", _rect(grid)),),
-        squares_mm=_black(grid),
+        squares_mm=tuple((x + column * side, y + row * side, side, side) for row, column in _squares(grid, 0)),
     )
-    return furnished(template, page, qr_text(identity, KIND, None), words)
+    return furnished(template, page, f"patchproof:{identity}:{KIND}", words)
 
 
-def _white(grid: BoardGrid) -> list[tuple[int, int]]:
-    """(row, column) of the squares with markers, in the order of their ids."""
-    return [(row, column) for row in range(grid.rows) for column in range(grid.columns) if (row + column) % 2]
-
-
-def _black(grid: BoardGrid) -> tuple[RectMm, ...]:
-    side, (x, y) = grid.square_mm, grid.corner_mm
-    cells = np.argwhere(np.indices((grid.rows, grid.columns)).sum(0) % 2 == 0).tolist()
-    return tuple((x + column * side, y + row * side, side, side) for row, column in cells)
+def _squares(grid: BoardGrid, odd: int) -> list[tuple[int, int]]:
+    """(row, column) of the black squares, or of the odd ones with markers in the order of their ids."""
+    return [(row, column) for row in range(grid.rows) for column in range(grid.columns) if (row + column) % 2 == odd]
 
 
 def _rect(grid: BoardGrid) -> RectMm:

@@ -11,7 +11,7 @@ from itertools import combinations
 
 from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheets.piece import PieceMarker
-from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, holds, meet
+from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet
 from patchproof.sheets.template import Rulers, TextLine
 from patchproof.strict import Refused
 
@@ -71,14 +71,9 @@ class PageLayout:
     window: Window | None = None
 
 
-def within_margins(page_mm: tuple[float, float], margin_mm: float) -> RectMm:
-    """What of the page may carry ink."""
-    return margin_mm, margin_mm, page_mm[0] - 2 * margin_mm, page_mm[1] - 2 * margin_mm
-
-
 def prove_apart(boxes: tuple[Box, ...], page_mm: tuple[float, float], margin_mm: float) -> None:
     """Refuse a page on which two parts overlap, a part leaves the one that holds it, or anything lies in the margin."""
-    within = within_margins(page_mm, margin_mm)
+    within = grown((0.0, 0.0, *page_mm), -margin_mm)
     by_name = {box.name: box.rect_mm for box in boxes}
     for box in boxes:
         if not holds(by_name[box.inside] if box.inside else within, box.rect_mm, SLACK_MM):
@@ -110,34 +105,20 @@ def quiet_box(rect: RectMm, width: float, page_mm: tuple[float, float], margin_m
 
 def ruler_parts(rulers: Rulers) -> Parts:
     """The ruler to the right and the one downwards."""
-    lines, digits, boxes = [], [], []
-    for name, start, down in (("x ruler", rulers.x_start_mm, False), ("y ruler", rulers.y_start_mm, True)):
-        lines += _ticks(rulers.length_mm, start, down)
-        digits += _digits(rulers.length_mm, start, down)
-        along, across = (-2.5, rulers.length_mm + 5.0), (-0.2, 9.5 if down else 7.2)
-        (x, w), (y, h) = (across, along) if down else (along, across)
-        boxes.append(Box(name, (start[0] + x, start[1] + y, w, h)))
+    lines, digits, boxes, length, size = [], [], [], rulers.length_mm, 2.1
+    for name, (x, y), down in (("x ruler", rulers.x_start_mm, False), ("y ruler", rulers.y_start_mm, True)):
+
+        def at(along: float, across: float, x=x, y=y, down=down) -> PointMm:
+            return (x + across, y + along) if down else (x + along, y + across)
+
+        lines.append(Line((*at(0.0, 0.0), *at(length, 0.0)), 0.3))
+        for mm in range(int(length + 1e-6) + 1):
+            depth = 4.0 if mm % 10 == 0 else 3.0 if mm % 5 == 0 else 2.0
+            lines.append(Line((*at(mm, 0.0), *at(mm, depth)), TICK_MM))
+            if mm % 10 == 0:
+                wide, high = text_width_mm(str(mm), size, False), size * CAP_HEIGHT
+                place = (x + 5.0, y + mm + high / 2) if down else (x + mm - wide / 2, y + 4.8 + high)
+                digits.append(TextLine(at_mm=place, size_mm=size, text=str(mm), gray=0.2))
+        left, top = at(-2.5, -0.2)
+        boxes.append(Box(name, (left, top, 9.5, length + 5.0) if down else (left, top, length + 5.0, 7.2)))
     return Parts(tuple(lines), tuple(digits), tuple(boxes))
-
-
-def _ticks(length_mm: float, start: PointMm, down: bool) -> list[Line]:
-    lines = [((0.0, 0.0, length_mm, 0.0), 0.3)]
-    for mm in range(int(length_mm + 1e-6) + 1):
-        depth = 4.0 if mm % 10 == 0 else 3.0 if mm % 5 == 0 else 2.0
-        lines.append(((float(mm), 0.0, float(mm), depth), TICK_MM))
-    ticks, (x, y) = [], start
-    for (a0, b0, a1, b1), width in lines:
-        ends = (x + b0, y + a0, x + b1, y + a1) if down else (x + a0, y + b0, x + a1, y + b1)
-        ticks.append(Line(ends, width))
-    return ticks
-
-
-def _digits(length_mm: float, start: PointMm, down: bool) -> list[TextLine]:
-    digits, size = [], 2.1
-    for mm in range(0, int(length_mm + 1e-6) + 1, 10):
-        if down:
-            at = (start[0] + 5.0, start[1] + mm + size * CAP_HEIGHT / 2)
-        else:
-            at = (start[0] + mm - text_width_mm(str(mm), size, False) / 2, start[1] + 4.8 + size * CAP_HEIGHT)
-        digits.append(TextLine(at_mm=at, size_mm=size, text=str(mm), gray=0.2))
-    return digits

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from patchproof.sheets.chart import chart_swatches
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, PageLayout, Parts, prove_apart, quiet_box, ruler_parts, text_box
 from patchproof.sheets.piece import (
     MODULES,
@@ -50,17 +51,11 @@ def largest_piece_mm(template: Template) -> tuple[float, float]:
     return w - 2 * CUT_LINE_MM, h - 2 * CUT_LINE_MM
 
 
-def lay_out_page(template: Template, piece: Piece, sheet_id: str, kind: str, qr_text: str) -> PageLayout:
+def lay_out_page(template: Template, content: PrintedPiece) -> PageLayout:
     """The page of one piece; refused where that is too large."""
-    placed = place_pieces(template, [piece])
-    ids = marker_ids(sheet_id, kind, len(piece.markers) + len(template.marker.corners_mm))[len(piece.markers) :]
-    return lay_out_parts(template, placed, ids, qr_text, piece_words(piece, sheet_id, kind))
-
-
-def piece_words(piece: Piece, sheet_id: str, kind: str) -> dict[str, str]:
-    """What a template's words stand for on the page of one piece."""
-    design = size_text(piece.design_rect_mm[2:])
-    return {"sheet_id": sheet_id, "kind": kind, "design": design, "piece": size_text(piece.size_mm)}
+    placed, fixed = place_pieces(template, [content.piece]), len(content.piece.markers)
+    ids = marker_ids(content.sheet_id, content.kind, fixed + len(template.marker.corners_mm))[fixed:]
+    return lay_out_parts(template, placed, ids, content.code, content.words)
 
 
 def lay_out_parts(

@@ -107,7 +107,13 @@ def _draw(canvas: Canvas, page: Printed) -> None:
         x0, y0, x1, y1 = line.ends_mm
         canvas.setLineWidth(line.width_mm)
         canvas.line(x0, height - y0, x1, height - y1)
-    _outlines(canvas, layout)
+    canvas.setStrokeGray(0.45)
+    half = CUT_LINE_MM / 2  # just outside of what is cut out
+    for x, y, w, h in layout.cuts_mm:
+        canvas.setLineWidth(CUT_LINE_MM)
+        canvas.setDash(2.0, 1.5)
+        canvas.rect(x - half, height - y - h - half, w + 2 * half, h + 2 * half)
+        canvas.setDash()
     for line in layout.texts:
         canvas.setFillGray(line.gray)
         canvas.setFont(font_name(line.bold), line.size_mm)
@@ -115,33 +121,15 @@ def _draw(canvas: Canvas, page: Printed) -> None:
 
 
 def _draw_parts(canvas: Canvas, pictures, swatches, markers, height: float) -> None:
-    for rect, pixels in pictures:
-        _image(canvas, pixels, rect, height)
-    for rect, srgb in swatches:
-        x, y, w, h = rect
-        _fill(canvas, [(x, y, w / 2, h), (x + w / 2, y, w / 2, h)], srgb, height)
-    for marker in markers:
-        _fill(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
-
-
-def _outlines(canvas: Canvas, layout: PageLayout) -> None:
-    """The cut lines, just outside of what is cut out."""
-    height = layout.page_mm[1]
-    canvas.setStrokeGray(0.45)
-    half = CUT_LINE_MM / 2
-    for x, y, w, h in layout.cuts_mm:
-        canvas.setLineWidth(CUT_LINE_MM)
-        canvas.setDash(2.0, 1.5)
-        canvas.rect(x - half, height - y - h - half, w + 2 * half, h + 2 * half)
-        canvas.setDash()
-
-
-def _image(canvas: Canvas, pixels: np.ndarray, rect: RectMm, height: float) -> None:
     from PIL import Image
     from reportlab.lib.utils import ImageReader
 
-    x, y, w, h = rect
-    canvas.drawImage(ImageReader(Image.fromarray(pixels)), x, height - y - h, w, h, mask=None)
+    for (x, y, w, h), pixels in pictures:
+        canvas.drawImage(ImageReader(Image.fromarray(pixels)), x, height - y - h, w, h, mask=None)
+    for (x, y, w, h), srgb in swatches:
+        _fill(canvas, [(x, y, w / 2, h), (x + w / 2, y, w / 2, h)], srgb, height)
+    for marker in markers:
+        _fill(canvas, marker_rects_mm(marker), (0.0, 0.0, 0.0), height)
 
 
 def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:

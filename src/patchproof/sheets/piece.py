@@ -142,7 +142,8 @@ def lay_out_piece(design_mm: tuple[float, float], marker_mm: float, sheet_id: st
 def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
     """The same piece with the marker ids of another sheet or kind."""
     ids = marker_ids(sheet_id, kind, len(piece.markers))
-    return replace(piece, markers=tuple(replace(one, id=id_) for id_, one in zip(ids, piece.markers, strict=True)))
+    markers = tuple(replace(marker, id=id_) for id_, marker in zip(ids, piece.markers, strict=True))
+    return replace(piece, markers=markers)
 
 
 def marker_at(id_: int, corner_mm: PointMm, size_mm: float) -> PieceMarker:

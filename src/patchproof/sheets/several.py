@@ -13,36 +13,23 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import PageLayout
-from patchproof.sheets.manifest import Manifest, Promise, design_sha256
+from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.page import lay_out_parts, place_pieces
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import Piece, hash_order, moved_marker, sheet_id
+from patchproof.sheets.piece import hash_order, moved_marker, sheet_id
 from patchproof.sheets.rects import PointMm, moved, size_text
 from patchproof.sheets.template import Template
-from patchproof.sheets.write import check_pixels, manifest_paths, page_manifest, pdf_name, printed_design, save_sheets
+from patchproof.sheets.write import manifest_paths, pdf_name, save_sheets
 from patchproof.strict import Refused
 
 
-@dataclass(frozen=True)
-class OneDesign:
-    """A piece and what belongs to it."""
-
-    piece: Piece
-    sheet_id: str
-    kind: str
-    design_srgb8: np.ndarray
-    promise: Promise | None
-    settings: dict[str, Any]
-
-
-def write_several(pdf_path: str | Path, template: Template, designs: Sequence[OneDesign]) -> list[Manifest]:
+def write_several(pdf_path: str | Path, template: Template, designs: Sequence[PrintedPiece]) -> list[Manifest]:
     """Write the page and a manifest for each design; refused where two of them are the same sheet."""
     pdf_path = pdf_name(pdf_path)
     if template.tiles is not None:
@@ -52,33 +39,31 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[On
         raise Refused("several designs", f"{len(designs)}", "use write_sheet for one")
     if same:
         raise Refused("designs of different runs", f"sheet {same[0][0]} twice", "use --copies for more of the same")
-    for design in designs:
-        check_pixels(design.design_srgb8)
     placed = place_pieces(template, [design.piece for design in designs])
     identity = sheet_id({"sheets": [[design.sheet_id, design.kind] for design in designs]}, 0)
     code = _page_code(identity, designs)
     page = lay_out_parts(template, placed, _page_ids(designs, template), code, _words(identity, designs))
     manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
-    pictures = tuple((rect, design.design_srgb8) for rect, design in zip(page.designs_mm, designs, strict=True))
+    pictures = [design.pictures(rect) for rect, design in zip(page.designs_mm, designs, strict=True)]
     paths = manifest_paths(pdf_path, len(designs))
-    save_sheets(pdf_path, [Printed(page, pictures)], dict(zip(paths, manifests, strict=True)))
+    save_sheets(pdf_path, [Printed(page, tuple(chain(*pictures)))], dict(zip(paths, manifests, strict=True)))
     return manifests
 
 
-def _page_ids(designs: Sequence[OneDesign], template: Template) -> list[int]:
+def _page_ids(designs: Sequence[PrintedPiece], template: Template) -> list[int]:
     """Ids for the page's own markers that no piece has."""
     used = {marker.id for design in designs for marker in design.piece.markers}
     order = hash_order(" ".join(design.sheet_id for design in designs), 1000)
     return [i for i in order if i not in used][: len(template.marker.corners_mm)]
 
 
-def _page_code(identity: str, designs: Sequence[OneDesign]) -> str:
+def _page_code(identity: str, designs: Sequence[PrintedPiece]) -> str:
     """The page's id, and 16 digits of a SHA-256 over those of its designs."""
-    hashes = "".join(design_sha256(design.design_srgb8) for design in designs)
-    return f"patchproof:{identity}:{hashlib.sha256(hashes.encode()).hexdigest()[:16]}"
+    hashes = [design_sha256(design.design_srgb8) for design in designs if design.design_srgb8 is not None]
+    return f"patchproof:{identity}:{hashlib.sha256(''.join(hashes).encode()).hexdigest()[:16]}"
 
 
-def _words(identity: str, designs: Sequence[OneDesign]) -> dict[str, str]:
+def _words(identity: str, designs: Sequence[PrintedPiece]) -> dict[str, str]:
     return {
         "sheet_id": identity,
         "kind": f"{len(designs)} designs,",
@@ -88,7 +73,7 @@ def _words(identity: str, designs: Sequence[OneDesign]) -> dict[str, str]:
 
 
 def _manifest(
-    template: Template, page: PageLayout, design: OneDesign, corner: PointMm, index: int, code: str
+    template: Template, page: PageLayout, design: PrintedPiece, corner: PointMm, index: int, code: str
 ) -> Manifest:
     """One design's: its own piece first, then everything else on the page whose id cannot be mistaken."""
     own = [moved_marker(marker, corner) for marker in design.piece.markers]
@@ -96,8 +81,5 @@ def _manifest(
     others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in own]
     frame = [(moved(rect, corner), srgb) for rect, srgb in design.piece.swatches]
     chart = page.swatches[: template.chart.columns * template.chart.rows]
-    mine = replace(page, markers=(*own, *others), swatches=(*chart, *frame))
-    printed = printed_design(design.design_srgb8, page.designs_mm[index])
-    return page_manifest(
-        mine, template, page.cuts_mm[index], design.sheet_id, design.kind, design.settings, printed, design.promise
-    ).changed(page_code=code)
+    own_page = replace(page, markers=(*own, *others), swatches=(*chart, *frame))
+    return design.manifest(own_page, template, page.cuts_mm[index], page.designs_mm[index]).changed(page_code=code)

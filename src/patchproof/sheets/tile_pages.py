@@ -1,71 +1,56 @@
 """All pages of a piece in tiles, and what the manifest says of them.
 
-In: a template with a [tiles] table, a piece and its design. Out: `TiledPages`. Page 1 carries the chart, the rulers and
-a plan of the tiles; each tile follows on a page of its own. The design's page is that of the first tile, and
+In: a template with a [tiles] table, a piece and its design. Out: pages and a manifest. Page 1 carries the chart, the
+rulers and a plan of the tiles; each tile follows on a page of its own. The design's page is that of the first tile, and
 `design.rect_mm` and `cut_mm` lie in its millimeters, reaching beyond its edges; `tiles` carries every other page there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
-from patchproof.sheets.manifest import Marker, Swatch, Tile
-from patchproof.sheets.page import lay_out_parts, piece_words, piece_zone_mm
+from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.manifest import Manifest, Swatch, Tile
+from patchproof.sheets.page import lay_out_parts, piece_zone_mm
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import Piece, PieceMarker, marker_ids, printed
-from patchproof.sheets.rects import RectMm, moved
+from patchproof.sheets.piece import Piece, marker_ids, printed
+from patchproof.sheets.rects import moved
 from patchproof.sheets.template import Template, TileGrid
 from patchproof.sheets.tiles import MARKERS, TilePlan, lay_out_tile, own_markers, own_swatches, plan_tiles, tile_map
 
 FIRST_TILE_PAGE = 2
 
 
-@dataclass(frozen=True)
-class TiledPages:
-    """The pages, and the parts of the manifest that say where everything is on them."""
-
-    pages: tuple[Printed, ...]
-    markers: tuple[Marker, ...]  # the piece's first
-    chart: tuple[Swatch, ...]
-    tiles: tuple[Tile, ...]
-    cut_mm: RectMm
-    design_mm: RectMm
-
-
-def tile_pages(
-    template: Template, grid: TileGrid, piece: Piece, sheet_id: str, kind: str, qr_text: str, design: np.ndarray | None
-) -> TiledPages:
+def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tuple[list[Printed], Manifest]:
     """Page 1 and the tiles' pages, proved apart each; `grid` is the template's own."""
+    piece, sheet_id = content.piece, content.sheet_id
     tiles, fixed = plan_tiles(grid, piece), len(piece.markers)
     own = fixed + len(template.marker.corners_mm)
-    ids = marker_ids(sheet_id, kind, own + MARKERS * len(tiles))
+    ids = marker_ids(sheet_id, content.kind, own + MARKERS * len(tiles))
     more, small = tile_map(piece, tiles, piece_zone_mm(template))
-    words = piece_words(piece, sheet_id, kind) | {"tiles": str(len(tiles))}
-    first = lay_out_parts(template, [], ids[fixed:own], qr_text, words, more)
+    words = content.words | {"tiles": str(len(tiles))}
+    first = lay_out_parts(template, [], ids[fixed:own], content.code, words, more)
     layouts = [
         lay_out_tile(template, grid, piece, tile, ids[own + MARKERS * i : own + MARKERS * (i + 1)], sheet_id)
         for i, tile in enumerate(tiles)
     ]
-    pages = [Printed(first, () if design is None else ((small, _pale(design)),))]
-    pages += [Printed(page, windowed=() if design is None else ((page.designs_mm[0], design),)) for page in layouts]
-    by = tiles[0].page_from_piece_mm
-    chart = [Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in first.swatches]
-    chart += [
-        Swatch(rect_mm=rect, srgb=srgb, page=number)
-        for number, tile in enumerate(tiles, FIRST_TILE_PAGE)
-        for rect, srgb in own_swatches(tile, piece)
+    pages = [Printed(first, tuple((rect, _pale(design)) for rect, design in content.pictures(small)))]
+    pages += [Printed(page, windowed=content.pictures(page.designs_mm[0])) for page in layouts]
+    numbered = list(enumerate(tiles, FIRST_TILE_PAGE))
+    markers = [printed(marker, number) for number, tile in numbered for marker in own_markers(tile, piece)]
+    markers += [printed(marker) for marker in first.markers]
+    markers += [
+        printed(marker, number) for number, page in enumerate(layouts, FIRST_TILE_PAGE) for marker in page.markers
     ]
-    return TiledPages(
-        pages=tuple(pages),
-        markers=tuple(_all_markers(piece, tiles, first.markers, [page.markers for page in layouts])),
-        chart=tuple(chart),
-        tiles=tuple(_tile(tile, piece, number) for number, tile in enumerate(tiles, FIRST_TILE_PAGE)),
-        cut_mm=moved((0.0, 0.0, *piece.size_mm), by),
-        design_mm=moved(piece.design_rect_mm, by),
+    swatches = [(swatch, 1) for swatch in first.swatches]
+    swatches += [(swatch, number) for number, tile in numbered for swatch in own_swatches(tile, piece)]
+    cut_mm = moved((0.0, 0.0, *piece.size_mm), tiles[0].page_from_piece_mm)
+    manifest = content.manifest(first, template, cut_mm, layouts[0].designs_mm[0], FIRST_TILE_PAGE).changed(
+        markers=tuple(markers),
+        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=number) for (rect, srgb), number in swatches),
+        tiles=tuple(_tile(tile, piece, number) for number, tile in numbered),
     )
+    return pages, manifest
 
 
 def _pale(design: np.ndarray) -> np.ndarray:
@@ -74,17 +59,5 @@ def _pale(design: np.ndarray) -> np.ndarray:
 
 
 def _tile(tile: TilePlan, piece: Piece, page: int) -> Tile:
-    (dx, dy), (x, y, *_) = tile.page_from_piece_mm, piece.design_rect_mm
-    return Tile(
-        page=page,
-        page_from_design_mm=((1.0, 0.0, round(dx + x, 6)), (0.0, 1.0, round(dy + y, 6))),
-        cut_mm=tile.page_rect_mm,
-    )
-
-
-def _all_markers(
-    piece: Piece, tiles: Sequence[TilePlan], first: Sequence[PieceMarker], own: Sequence[Sequence[PieceMarker]]
-) -> list[Marker]:
-    of_piece = [(m, n) for n, tile in enumerate(tiles, FIRST_TILE_PAGE) for m in own_markers(tile, piece)]
-    checks = [(m, 1) for m in first] + [(m, n) for n, page in enumerate(own, FIRST_TILE_PAGE) for m in page]
-    return [printed(m, n) for m, n in of_piece + checks]
+    dx, dy, *_ = moved(piece.design_rect_mm, tile.page_from_piece_mm)
+    return Tile(page=page, page_from_design_mm=((1.0, 0.0, dx), (0.0, 1.0, dy)), cut_mm=tile.page_rect_mm)

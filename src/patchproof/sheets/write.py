@@ -1,6 +1,6 @@
 """SHEET.pdf and SHEET.json: both complete, or neither.
 
-In: a piece, a template, the design's pixels, and the promise. Out: two files with the same stem, and the manifest, of
+In: a piece with its design and promise, and a template. Out: two files with the same stem, and the manifest, of
 which the PDF carries the same bytes as an attachment. They are written beside their places first and moved there
 last, so that a full disk or a crash leaves what was there before. `check_sheet` says in plain sentences what whoever
 prints and cuts it needs to know.
@@ -11,63 +11,53 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from patchproof.output import write_together
+from patchproof.sheets.content import PrintedPiece, page_manifest
 from patchproof.sheets.layout import PageLayout
-from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256, dump_manifest, png_base64
+from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
-from patchproof.sheets.piece import Piece, printed
+from patchproof.sheets.piece import template_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm, holds
 from patchproof.sheets.swatches import FRAME_COLORS
 from patchproof.sheets.template import BoardTemplate, Template
-from patchproof.sheets.tile_pages import FIRST_TILE_PAGE, tile_pages
-from patchproof.strict import Refused
+from patchproof.sheets.tile_pages import tile_pages
+from patchproof.strict import Refused, Strict
 
 
 def write_sheet(
-    pdf_path: str | Path,
-    *,
-    template: Template,
-    piece: Piece,
-    sheet_id: str,
-    kind: str,
-    design_srgb8: np.ndarray | None,
-    promise: Promise | None,
-    settings: dict[str, Any],
-    plan: PlanPage | None = None,
-    copies: int = 1,
+    pdf_path: str | Path, template: Template, content: PrintedPiece, plan: PlanPage | None = None, copies: int = 1
 ) -> Manifest:
-    """Write SHEET.pdf and SHEET.json beside it; `design_srgb8` is uint8 H×W×3, or None for white paper.
+    """Write SHEET.pdf and SHEET.json beside it.
 
     A template with tiles makes a page for each. `plan` becomes the last page; `copies` repeats the page with the piece.
     """
     pdf_path = pdf_name(pdf_path)
-    if design_srgb8 is not None:
-        check_pixels(design_srgb8)
-    code = qr_text(sheet_id, kind, design_srgb8)
     if template.tiles is None:
-        page = lay_out_page(template, piece, sheet_id, kind, code)
-        design = None if design_srgb8 is None else printed_design(design_srgb8, page.designs_mm[0])
-        manifest = page_manifest(page, template, page.cuts_mm[0], sheet_id, kind, settings, design, promise)
-        pages = [Printed(page, () if design_srgb8 is None else ((page.designs_mm[0], design_srgb8),))] * copies
+        page = lay_out_page(template, content)
+        pages = [Printed(page, content.pictures(page.designs_mm[0]))] * copies
+        manifest = content.manifest(page, template, page.cuts_mm[0], page.designs_mm[0])
     else:
         if copies > 1:
             raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
-        tiled = tile_pages(template, template.tiles, piece, sheet_id, kind, code, design_srgb8)
-        design = None if design_srgb8 is None else printed_design(design_srgb8, tiled.design_mm, FIRST_TILE_PAGE)
-        pages = list(tiled.pages)
-        manifest = page_manifest(
-            pages[0].layout, template, tiled.cut_mm, sheet_id, kind, settings, design, promise
-        ).changed(markers=tiled.markers, chart=tiled.chart, tiles=tiled.tiles)
+        pages, manifest = tile_pages(template, template.tiles, content)
     if plan is not None:
-        pages.append(lay_out_plan(plan, template, sheet_id))
+        pages.append(lay_out_plan(plan, template, content.sheet_id))
         manifest = manifest.changed(plan_page=len(pages))
     save_sheets(pdf_path, pages, {pdf_path.with_suffix(".json"): manifest})
+    return manifest
+
+
+def write_page(
+    pdf_path: str | Path, page: PageLayout, template: Template | BoardTemplate, cut_mm: RectMm, kind: str, grid: Strict
+) -> Manifest:
+    """Write a page without a piece, and its manifest beside it, in which `grid` is kept under the page's kind."""
+    pdf_path = pdf_name(pdf_path)
+    settings = {kind: grid.model_dump(mode="json")}
+    manifest = page_manifest(page, template, cut_mm, template_id(template), kind, settings)
+    save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
 
@@ -96,11 +86,6 @@ def save_sheets(pdf_path: Path, pages: Sequence[Printed], manifests: dict[Path, 
     write_together({pdf_path: pdf} | {path: text.encode() for path, text in texts.items()})
 
 
-def qr_text(sheet_id: str, kind: str, design_srgb8: np.ndarray | None) -> str:
-    """What the QR code says: the sheet's id and 16 digits of the design's SHA-256 (the kind where there is none)."""
-    return f"patchproof:{sheet_id}:{kind if design_srgb8 is None else design_sha256(design_srgb8)[:16]}"
-
-
 def check_sheet(manifest: Manifest) -> list[str]:
     """What whoever prints this sheet should know of what is on it, in sentences; `shop.shop_lines` reads the PDF."""
     width, height = manifest.page_mm
@@ -114,7 +99,7 @@ def check_sheet(manifest: Manifest) -> list[str]:
         return [*lines, "Glue the uncut page to something flat and stiff."]
     if manifest.kind == "chart":
         return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
-    lines += [*_cutting(manifest)]
+    lines += _cutting(manifest)
     if manifest.plan_page is not None:
         lines.append(
             f"Page {manifest.plan_page} is for people, on any paper: where the piece goes and how to photograph it."
@@ -147,48 +132,6 @@ def _cutting(manifest: Manifest) -> Iterator[str]:
         )
     else:
         yield f"Cut the piece of {size} along the dashed line."
-
-
-def printed_design(design: np.ndarray, rect_mm: RectMm, page: int = 1) -> Design:
-    """The design as the manifest carries it."""
-    return Design(
-        sha256=design_sha256(design),
-        rect_mm=rect_mm,
-        size_px=(design.shape[1], design.shape[0]),
-        page=page,
-        png=png_base64(design),
-    )
-
-
-def page_manifest(
-    page: PageLayout,
-    template: Template | BoardTemplate,
-    cut_mm: RectMm,
-    sheet_id: str,
-    kind: str,
-    settings: dict[str, Any],
-    design: Design | None = None,
-    promise: Promise | None = None,
-) -> Manifest:
-    """The manifest of a sheet's one page."""
-    return Manifest(
-        sheet_id=sheet_id,
-        kind=kind,
-        page_mm=page.page_mm,
-        design=design,
-        markers=tuple(printed(m) for m in page.markers),
-        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=1) for rect, srgb in page.swatches),
-        cut_mm=cut_mm,
-        ruler_mm=(template.ruler.length_mm, template.ruler.length_mm),
-        promise=promise,
-        settings=settings,
-    )
-
-
-def check_pixels(design: np.ndarray) -> None:
-    """Refuse what is no picture of uint8 H×W×3."""
-    if design.dtype != np.uint8 or design.ndim != 3 or design.shape[2] != 3 or design.size == 0:
-        raise Refused("a design of uint8 H×W×3 pixels", f"{design.dtype} {design.shape}", "convert it to 8-bit RGB")
 
 
 def _nearest_ink_mm(manifest: Manifest) -> float:

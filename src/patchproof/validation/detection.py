@@ -36,6 +36,7 @@ from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pix
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import load_scene, needs_patch
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import control_design
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
@@ -140,16 +141,9 @@ def _hung(scene_path: str, seed: int) -> tuple[HungSheet, PatchScene]:
     blank = np.zeros((240, round(240 * piece.design_rect_mm[2] / piece.design_rect_mm[3]), 3), np.uint8)
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"
-        manifest = write_sheet(
-            pdf,
-            template=load_template(scene.settings.sheet.template),
-            piece=piece,
-            sheet_id=scene.sheet_id,
-            kind="design",
-            design_srgb8=control_design("noise", blank, scene.sheet_id),
-            promise=None,
-            settings={},
-        )
+        noise = control_design("noise", blank, scene.sheet_id)
+        content = PrintedPiece(piece, scene.sheet_id, "design", noise)
+        manifest = write_sheet(pdf, load_template(scene.settings.sheet.template), content)
         sent = sent_pixels(pdf, manifest, scene)
     return HungSheet(set_stage(scene), manifest, sent, AS_MADE.printer_for(scene)), scene
 
