@@ -18,7 +18,7 @@ from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
-from patchproof.sheets.piece import template_id
+from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm, holds
 from patchproof.sheets.swatches import FRAME_COLORS
@@ -56,7 +56,7 @@ def write_page(
     """Write a page without a piece, and its manifest beside it, in which `grid` is kept under the page's kind."""
     pdf_path = pdf_name(pdf_path)
     settings = {kind: grid.model_dump(mode="json")}
-    manifest = page_manifest(page, template, cut_mm, template_id(template), kind, settings)
+    manifest = page_manifest(page, template, cut_mm, page_id(template), kind, settings)
     save_sheets(pdf_path, [Printed(page)], {pdf_path.with_suffix(".json"): manifest})
     return manifest
 
