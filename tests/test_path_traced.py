@@ -16,6 +16,7 @@ from patchproof.color import linear_from_srgb
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
+from patchproof.render.views import lens_frame
 from patchproof.reprints import path_traced
 from patchproof.reprints.path_traced import Optics, draw_optics, photograph_traced
 from patchproof.reprints.traced_light import sky_directions, sky_radiance
@@ -61,7 +62,7 @@ def test_surroundings_light_a_surface_as_ours_do(scene):
 def test_what_is_traced_holds_all_of_piece_and_object(scene):
     for i in range(8):
         conditions = scene.draw("reprint", 1, start=i)
-        frame = path_traced._frame(set_stage(scene), scene)
+        frame = lens_frame(set_stage(scene), scene, scene.settings.camera.photo_px)
         x, y, width, height = path_traced._box(scene, conditions, frame, 0.0)
         points = np.concatenate([scene.mesh.vertices, scene.placement.vertices_mm])
         seen = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], points)

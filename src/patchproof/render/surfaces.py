@@ -110,7 +110,7 @@ def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:
     rows, columns = grid.shape[:2]
     corner = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
-    faces = np.concatenate([np.stack(one, -1).reshape(-1, 3) for one in ((a, d, c), (a, c, b))])
+    faces = np.concatenate([np.stack(half, -1).reshape(-1, 3) for half in ((a, d, c), (a, c, b))])
     flat = torch.as_tensor(grid.reshape(-1, 8), device=device)
     faces = torch.as_tensor(faces, device=device)
     at_corners = flat.float()[faces]
