@@ -102,7 +102,8 @@ def _texture(texture_srgb: np.ndarray | None) -> Tensor:
 def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:
     """A scene's piece, gone on straight beyond its border on all sides."""
     vertices, normals, piece_mm = scene.paper()
-    size_mm = scene.piece.size_mm
+    width_mm, height_mm = piece_mm.max(0).tolist()
+    size_mm = width_mm, height_mm
     columns, rows = (len(np.unique(piece_mm[:, i])) for i in range(2))
     grid = np.concatenate([vertices, normals, piece_mm], 1).reshape(rows, columns, 8)
     for axis, (side, count) in enumerate(zip(size_mm[::-1], (rows, columns), strict=True)):

@@ -36,7 +36,7 @@ def window(stage: Stage, conditions: Conditions) -> Frame:
         return everything
     scene = needs_patch(stage.scene)
     edge = np.linspace(0, 1, 9)
-    grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.piece.size_mm
+    grid = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2) * scene.placement.size_mm
     points = scene.piece_px(conditions, grid)
     if not np.isfinite(points).all():
         return everything
