@@ -18,7 +18,7 @@ from patchproof.strict import Refused
 
 
 def made(*meshes, y_up=True):
-    """One mesh of trimesh's, in millimetres; trimesh's axis of revolution is z."""
+    """One mesh of trimesh's, in millimeters; trimesh's axis of revolution is z."""
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) if y_up else np.eye(3)
     parts = [Part(m.vertices @ turn.T, m.faces, Material("one", (1, 1, 1))) for m in meshes]
     size = np.ptp(np.concatenate([part.vertices for part in parts]), axis=0).max()

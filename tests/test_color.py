@@ -1,4 +1,4 @@
-"""Colour maths: inverses, published pairs, an independent oracle, and the same formula in numpy and torch."""
+"""Color maths: inverses, published pairs, an independent oracle, and the same formula in numpy and torch."""
 
 import numpy as np
 import pytest

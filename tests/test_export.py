@@ -42,12 +42,12 @@ def test_our_own_reader_finds_the_same_object(painted):
     assert all(np.array_equal(m.texture_srgb, textures[i]) for m, i in zip(back.materials, which, strict=True))
     written = triangles(mesh.vertices[mesh.faces], mesh.corner_uv, mesh.face_material)
     read = triangles(back.vertices[back.faces], back.corner_uv, np.array(which)[back.face_material])
-    # float32 metres: 300 mm * 6e-8
+    # float32 meters: 300 mm * 6e-8
     assert np.abs(written - read).max() < 1e-4
     assert np.array_equal(back.corner_color_linear, mesh.corner_color_linear[: len(back.faces)])
 
 
-def test_trimesh_alone_reads_metres_and_names(painted):
+def test_trimesh_alone_reads_meters_and_names(painted):
     mesh, textures, path = painted
     scene = trimesh.load_scene(path)
     assert np.allclose(np.sort(scene.extents), np.sort(np.ptp(mesh.vertices, axis=0)) / 1000, rtol=1e-6)

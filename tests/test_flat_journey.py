@@ -171,7 +171,7 @@ def read(path: Path) -> np.ndarray:
 
 
 def true_homography(journey: Journey, i: int) -> np.ndarray:
-    """Photograph i's pixels from piece millimetres."""
+    """Photograph i's pixels from piece millimeters."""
     return journey.world.piece_homographies(journey.conditions[i : i + 1], PHOTO_PX)[0]
 
 

@@ -72,7 +72,7 @@ def test_photographs_are_judged_and_measured(report):
 
 
 def test_design_corners_are_where_the_truth_says(journey, report):
-    """Half a millimetre in the median, 1.5 mm at worst, over the photographs that count as measured."""
+    """Half a millimeter in the median, 1.5 mm at worst, over the photographs that count as measured."""
     truth = json.loads((journey / "photos" / "truth.json").read_text())
     corners = geometry.rect_corners(load_manifest(journey / "sheet.json").design.rect_mm)
     errors = []

@@ -79,7 +79,7 @@ CUBE_FACES = np.array([[int(digit) for digit in face] for face in _CUBE.split()]
 # ------------------------------------------------------------------------------------------------ size and axes
 
 
-def test_longest_extent_is_length_and_the_box_is_centred(tmp_path):
+def test_longest_extent_is_length_and_the_box_is_centered(tmp_path):
     mesh = load_mesh(write(tmp_path, "a.obj", TRIANGLE + "f 1 2 3\n"), 100, "y")
     np.testing.assert_allclose(mesh.vertices, [[-50, -25, 0], [50, -25, 0], [-50, 25, 0]])
 
@@ -150,7 +150,7 @@ def test_quads_and_polygons_become_triangles_of_the_same_area(tmp_path):
     assert np.all(face_normals(quad)[:, 2] == 1) and np.all(face_normals(mixed)[:, 2] == 1)
 
 
-# ------------------------------------------------------------------------------------------------ colours and textures
+# ------------------------------------------------------------------------------------------------ colors and textures
 
 
 def textured_obj(folder: Path, mtl: str = "newmtl red\nKd 1 1 1\nmap_Kd t.png\n") -> Path:
@@ -369,7 +369,7 @@ def test_files_that_are_no_meshes(tmp_path, name, content):
     refused(tmp_path / name)
 
 
-def test_a_text_gltf_does_not_open_its_neighbour(tmp_path):
+def test_a_text_gltf_does_not_open_its_neighbor(tmp_path):
     gltf(tmp_path, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "model.gltf")
     refused(write(tmp_path, "a.gltf", "hello"), "a.gltf")
 

@@ -1,4 +1,4 @@
-"""The homography, its uncertainty, the flattened patch, and the colours fitted on it."""
+"""The homography, its uncertainty, the flattened patch, and the colors fitted on it."""
 
 from __future__ import annotations
 

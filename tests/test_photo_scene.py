@@ -54,7 +54,7 @@ def light_of(view: int, exposure: float) -> np.ndarray:
 
 
 def homography(size_mm, azimuth, elevation, distance, roll) -> np.ndarray:
-    """Pixels from piece millimetres of a camera that looks past the piece's middle."""
+    """Pixels from piece millimeters of a camera that looks past the piece's middle."""
     az, el = np.radians([azimuth, elevation])
     eye = distance * np.array([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)])
     world_from_piece = np.diag([1.0, -1.0, -1.0, 1.0])

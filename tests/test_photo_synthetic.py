@@ -51,7 +51,7 @@ def swatch_rects() -> list[tuple[float, float, float, float]]:
 
 
 def some_design(seed: int = 3) -> np.ndarray:
-    """A smooth colourful design, uint8 128×128×3."""
+    """A smooth colorful design, uint8 128×128×3."""
     rng = np.random.default_rng(seed)
     return cv2.resize(rng.integers(20, 236, (8, 8, 3), np.uint8), (128, 128), interpolation=cv2.INTER_LINEAR)
 
@@ -108,7 +108,7 @@ def _paste(page, pixels, x, y):
 
 
 def view(azimuth_deg=0.0, elevation_deg=0.0, distance_mm=500.0, roll_deg=0.0, size_px=(1200, 900), fov_deg=40.0):
-    """px_from_mm of a camera that looks at the design's centre from the given side."""
+    """px_from_mm of a camera that looks at the design's center from the given side."""
     center = np.array([DESIGN_MM[0] + DESIGN_MM[2] / 2, DESIGN_MM[1] + DESIGN_MM[3] / 2])
     az, el = np.radians([azimuth_deg, elevation_deg])
     eye = distance_mm * np.array([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)])
@@ -153,7 +153,7 @@ def save(srgb: np.ndarray, path: Path, focal_35mm: int | None = None) -> Path:
 
 @pytest.mark.parametrize("azimuth", [0.0, 40.0])
 def test_the_hand_made_page_lies_where_its_homography_says(azimuth):
-    # the design's centre is what the camera looks at: it must fall on the middle of the picture
+    # the design's center is what the camera looks at: it must fall on the middle of the picture
     homography = view(azimuth_deg=azimuth, roll_deg=10)
     center = apply_homography(homography, [[105.0, 130.0]])[0]
     assert center == pytest.approx([600.0, 450.0], abs=1e-6)

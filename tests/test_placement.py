@@ -70,7 +70,7 @@ def test_spin_turns_clockwise_as_one_faces_the_card(box):
     np.testing.assert_allclose(top, [10, 0, 0], atol=1e-9)  # what was up points right
 
 
-def test_lengths_on_the_card_are_millimetres_of_the_sheet(box):
+def test_lengths_on_the_card_are_millimeters_of_the_sheet(box):
     card = card_on(box, side="+z", spin_deg=33)
     corners = card.world(np.array([[0, 0], [50, 0], [50, 40], [0, 40.0]]))
     np.testing.assert_allclose(np.linalg.norm(np.roll(corners, -1, 0) - corners, axis=1), [50, 40, 50, 40])

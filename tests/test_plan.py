@@ -129,7 +129,7 @@ def test_terms_that_are_off_are_named_with_the_key_that_turns_them_on(plan):
     assert all(key in line for key in off.values())
 
 
-def test_pixels_per_millimetre_by_hand(tmp_path):
+def test_pixels_per_millimeter_by_hand(tmp_path):
     """Straight on with 90 degrees across 300 px: the focal length is 150 px, over the distance to the piece."""
     scene = scene_with(tmp_path, **STRAIGHT, view__distance_mm=[500, 500])
     away_mm = 500 - scene.placement.center_mm @ scene.frame.normal

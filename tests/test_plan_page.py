@@ -1,4 +1,4 @@
-"""The page that says where the piece goes: millimetres to named edges, known by hand."""
+"""The page that says where the piece goes: millimeters to named edges, known by hand."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ PROFILES = {"coated": "FOGRA39L_coated.icc", "uncoated": "FOGRA47L_uncoated.icc"
 
 
 def image(colors) -> torch.Tensor:
-    """N×3 colours as 1×3×N×1."""
+    """N×3 colors as 1×3×N×1."""
     return torch.as_tensor(np.asarray(colors)).T[None, :, :, None]
 
 
@@ -137,7 +137,7 @@ def test_gamut_distance_is_the_round_trip():
 @needs_data
 @pytest.mark.parametrize("name", PROFILES)
 def test_the_table_follows_the_exact_chain(name):
-    """Pillow's own proof transform, asked anew, with other colours than those the bake checked itself on."""
+    """Pillow's own proof transform, asked anew, with other colors than those the bake checked itself on."""
     from PIL import Image, ImageCms
 
     srgb, relative = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC

@@ -125,7 +125,7 @@ def test_qr_code_fills_its_square():
     assert rects[:, 1].min() == 20 and rects[:, 3] == pytest.approx(1)  # version 3: 29 modules
 
 
-def test_rulers_have_a_tick_at_each_millimetre():
+def test_rulers_have_a_tick_at_each_millimeter():
     page = page_of(load_template("a4"), (110, 110))
     vertical = sorted(t.ends_mm[0] for t in page.ticks if t.ends_mm[0] == t.ends_mm[2] and t.width_mm < 0.2)
     assert np.diff(vertical) == pytest.approx(np.ones(100)) and len(vertical) == 101

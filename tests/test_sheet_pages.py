@@ -49,7 +49,7 @@ def write(path, name, design_mm=None, marker_mm=None, design=DESIGN, **more):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_page_has_its_markers_within_a_tenth_of_a_millimetre_its_code_and_its_fonts(tmp_path, name):
+def test_every_page_has_its_markers_within_a_tenth_of_a_millimeter_its_code_and_its_fonts(tmp_path, name):
     path, margin = tmp_path / "s.pdf", read_toml(shipped("print_templates", f"{name}.toml"))["margin_mm"]
     manifest = write(path, name)
     with pikepdf.open(path) as pdf:
@@ -145,7 +145,7 @@ def scanned(page, seed):
     return scan, move @ matrix @ np.diag([PX_PER_MM, PX_PER_MM, 1])
 
 
-def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimetre(tiled):
+def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimeter(tiled):
     path, manifest = tiled
     surface, origin, errors = surface_of(manifest), np.array(manifest.design.rect_mm[:2]), []
     assert len(manifest.tiles) >= 12 and len(surface.piece_ids) == 8

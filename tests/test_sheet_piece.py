@@ -113,7 +113,7 @@ def test_mid_edge_markers_come_where_a_side_is_as_long_as_a_marker(design_mm, ma
     assert len(lay_out_piece(design_mm, 20, ID, "design").markers) == markers
 
 
-def test_swatches_are_as_large_as_fit_and_fewer_where_four_millimetres_do_not():
+def test_swatches_are_as_large_as_fit_and_fewer_where_four_millimeters_do_not():
     # 40 mm design, 20 mm markers: runs (40 + 2q - 20 - 2q) / 2 - q with q = 20/7, so 10 - 20/7 = 7.142857; one in each
     small = lay_out_piece((40, 40), 20, ID, "design").swatches
     assert len(small) == 8 and {round(rect[2], 6) for rect, _ in small} == {7.142857}

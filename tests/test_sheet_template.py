@@ -1,4 +1,4 @@
-"""Templates and the colour chart."""
+"""Templates and the color chart."""
 
 from itertools import product
 
@@ -60,7 +60,7 @@ def test_chart_has_corners_gray_ramp_duplicates_and_filling():
 
 
 def test_chart_filling_leaves_no_large_hole_in_the_cube():
-    """The largest distance from any colour to the nearest swatch: below that of a 4 × 4 × 4 lattice's cell, 0.577."""
+    """The largest distance from any color to the nearest swatch: below that of a 4 × 4 × 4 lattice's cell, 0.577."""
     colors = np.array(chart_colors(72))
     everywhere = np.array(list(product(np.linspace(0, 1, 17), repeat=3)))
     nearest = np.linalg.norm(everywhere[:, None] - colors, axis=-1).min(1)

@@ -53,7 +53,7 @@ def page(sheet):
 
 
 def detect(pixels):
-    """{id: 4×2 corners in px, pixel centres at .5}."""
+    """{id: 4×2 corners in px, pixel centers at .5}."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
@@ -67,7 +67,7 @@ def detect(pixels):
 @pytest.mark.parametrize(
     ("design_mm", "marker_mm"), [((110, 110), 19), ((40, 40), 12), ((140, 50), 8.7), ((60, 140), 13)]
 )
-def test_opencv_finds_every_marker_within_a_tenth_of_a_millimetre(tmp_path, design_mm, marker_mm):
+def test_opencv_finds_every_marker_within_a_tenth_of_a_millimeter(tmp_path, design_mm, marker_mm):
     manifest = write(tmp_path / "s.pdf", design_mm, marker_mm)
     found = detect(page_pixels(tmp_path / "s.pdf", 1, DPI))
     assert set(found) == {marker.id for marker in manifest.markers}
@@ -136,12 +136,12 @@ def test_design_is_in_the_pdf_pixel_for_pixel(sheet):
 
 
 def test_design_lies_exactly_where_the_manifest_says(page, sheet):
-    """Each texel's middle, looked up through the manifest's millimetres, has the texel's colour in PDFium's picture."""
+    """Each texel's middle, looked up through the manifest's millimeters, has the texel's color in PDFium's picture."""
     x, y, w, h = sheet[1].design.rect_mm
     columns = ((x + (np.arange(96) + 0.5) * w / 96) * PX_PER_MM).astype(int)
     rows = ((y + (np.arange(96) + 0.5) * h / 96) * PX_PER_MM).astype(int)
     seen = page[np.ix_(rows, columns)].astype(int)
-    # PDFium interpolates between texels 6.8 px wide: the pixel nearest the middle may take a little of a neighbour
+    # PDFium interpolates between texels 6.8 px wide: the pixel nearest the middle may take a little of a neighbor
     assert np.median(np.abs(seen - sample_design())) <= 16
     shifted = np.roll(seen, 1, 1)
     assert np.median(np.abs(shifted - sample_design())) > 60

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+WRITTEN = ("src", "tests", "print_templates", ".readme", ".github")
+BRITISH = re.compile(
+    r"\w*(?:(?:optim|normal|recogn|character|raster|minim|maxim|organ|summar|initial|general|visual|quant)is[ei]|colour"
+    r"|centre|centring|neighbour|behaviour|modell|labell|metre|analyse(?!s\b)|analysing|favour|artefact|grey)\w*",
+    re.IGNORECASE,
+)
+# names of others, and the control's key in files of before
+THEIRS = re.compile(r"colour-science|\bcolour(?:\.\w+| = pytest)|RGB_COLOURSPACES|\"colour\"|\"grey\"")
 
 
 @pytest.mark.parametrize("arguments", [("check",), ("format", "--check")])
@@ -22,3 +31,31 @@ def test_every_dependency_says_what_it_is_for():
     lines = (ROOT / "pyproject.toml").read_text(encoding="utf-8").splitlines()
     named = [line for line in lines if line.startswith('    "') and any(sign in line for sign in (">=", "=="))]
     assert len(named) > 15 and all("#" in line for line in named)
+
+
+def british(text: str) -> list[str]:
+    """The words that are spelled so."""
+    return [match[0] for match in BRITISH.finditer(THEIRS.sub("", text))]
+
+
+def test_the_speller_sees_words_and_lets_names_pass():
+    assert british("Optimise the colours of a grey centre, 3 millimetres wide: `test_neighbours`") == [
+        "Optimise",
+        "colours",
+        "grey",
+        "centre",
+        "millimetres",
+        "test_neighbours",
+    ]
+    fine = "analyses; parameter; center; noise; raster; organism; minimum; quantity"
+    assert not british('colour = pytest.importorskip("colour"); colour.delta_E; start = "grey"')
+    assert not british(fine)
+
+
+def test_spelling_is_american():
+    inside = [path for folder in WRITTEN for path in (ROOT / folder).rglob("*")]
+    kinds = {".py", ".md", ".toml", ".j2"}
+    files = [path for path in [*ROOT.glob("*"), *inside] if path.suffix in kinds and path != Path(__file__)]
+    assert len(files) > 200
+    found = {str(path.relative_to(ROOT)): british(path.read_text(encoding="utf-8")) for path in files}
+    assert not {name: words for name, words in found.items() if words}

@@ -30,7 +30,7 @@ MOST_MS = 333.0  # 12 megapixels, three a second
 
 Corners = dict[int, np.ndarray]
 Find = Callable[[np.ndarray, int], Corners]
-Shot = tuple[np.ndarray, Sheet]  # a photograph, and where its millimetres truly lie
+Shot = tuple[np.ndarray, Sheet]  # a photograph, and where its millimeters truly lie
 
 
 @dataclass(frozen=True)

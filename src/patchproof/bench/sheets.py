@@ -1,6 +1,6 @@
 """How many markers a piece needs, and which model makes its photograph flat.
 
-In: photographs of paper. Out: two charts. Errors are in millimetres of the paper, over the whole design.
+In: photographs of paper. Out: two charts. Errors are in millimeters of the paper, over the whole design.
 """
 
 from __future__ import annotations

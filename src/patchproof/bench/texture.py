@@ -154,7 +154,7 @@ def reference(homography: np.ndarray, piece: Piece, picture: PiecePicture, pixel
 
 
 def _uv(picture: PiecePicture, piece: Piece, mm: np.ndarray) -> np.ndarray:
-    """Where the piece's millimetres lie on its picture, from 0 to 1."""
+    """Where the piece's millimeters lie on its picture, from 0 to 1."""
     height, width, _ = picture.srgb.shape
     box = np.array(picture.box_px, float)
     return (box[:2] + mm / np.array(piece.size_mm) * (box[2:] - box[:2])) / [width, height]

@@ -108,7 +108,7 @@ def class_scene(
 def scene_settings(
     settings: PastedSettings, images_of: ImageClass, classifier: Classifier, images: str, table: str
 ) -> SceneSettings:
-    """A millimetre of the patch is one of its texels; its size in pictures follows from the network's own."""
+    """A millimeter of the patch is one of its texels; its size in pictures follows from the network's own."""
     side = settings.made_px
     low, high = (settings.shown_px * factor / classifier.input_px for factor in settings.scale)
     largest = largest_share((side, side), settings.roll_deg)

@@ -24,7 +24,7 @@ from patchproof.render.pixels import Shown
 @dataclass(frozen=True)
 class Grid:
     """How fine a design is: its pixels, as optimized and as printed (None of textures, which keep their own sizes and
-    are not printed), and how many there are, in all and per millimetre of a side.
+    are not printed), and how many there are, in all and per millimeter of a side.
     """
 
     design_px: tuple[int, int] | None

@@ -158,7 +158,7 @@ class Texture:
 
     @property
     def grid(self) -> Grid:
-        """How fine the textures are, per millimetre of the surface on average."""
+        """How fine the textures are, per millimeter of the surface on average."""
         mesh, masks = self.scene.mesh, self.scene.canvas.mask
         sizes = np.array([mask.shape[1::-1] for mask in masks])
         uv = mesh.corner_uv.astype(float) * sizes[mesh.face_material][:, None]

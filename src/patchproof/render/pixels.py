@@ -1,7 +1,7 @@
 """What a view's pixels look at: the object's fragments, and the piece's with their antialiased share of each pixel.
 
 In: fragments and the surfaces they lie on. Out: `ObjectPixels` and `PiecePixels`: texels with weights, normals, and
-positions where light needs them. The piece's edge is antialiased from its own millimetres: the share of a pixel's
+positions where light needs them. The piece's edge is antialiased from its own millimeters: the share of a pixel's
 extent, along each of the piece's sides, that lies within the cut line.
 """
 

@@ -1,6 +1,6 @@
 """A z-buffer rasterizer in plain torch: which face does each pixel center see, and where on that face.
 
-In: faces in world millimetres and a batch of pinhole cameras. Out: `Fragments`, one per covered pixel, with
+In: faces in world millimeters and a batch of pinhole cameras. Out: `Fragments`, one per covered pixel, with
 perspective-correct barycentrics, camera depth and what texture filtering needs. Visibility is hard and carries no
 gradient: shape is never optimized.
 

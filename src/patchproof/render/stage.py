@@ -1,6 +1,6 @@
 """A stage: a scene's tensors on one device, set up once and photographed many times.
 
-In: a scene of any kind. Out: `Stage`: the piece as a surface of millimetres, for scenes with a mesh the object with its
+In: a scene of any kind. Out: `Stage`: the piece as a surface of millimeters, for scenes with a mesh the object with its
 textures, and how a design looks there. Scenes made of pictures have no object.
 """
 

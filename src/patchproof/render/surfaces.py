@@ -1,4 +1,4 @@
-"""The surfaces that views show: the piece in millimetres, and the object with its textures.
+"""The surfaces that views show: the piece in millimeters, and the object with its textures.
 
 In: a mesh, or a scene with a piece. Out: tensors on a device. The piece reaches a margin beyond its cut line, so that
 pixels cut by its edge are found and can show their share of it.
@@ -24,7 +24,7 @@ MARGIN_SHARE = 0.1
 
 @dataclass(frozen=True)
 class PieceSurface:
-    """The piece in the world: faces over `vertices` V×3, and per face corner F×3 its millimetres and normal."""
+    """The piece in the world: faces over `vertices` V×3, and per face corner F×3 its millimeters and normal."""
 
     vertices: Tensor
     faces: Tensor

@@ -30,7 +30,7 @@ _EFFECTS = {
     "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
     "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
 }
-_PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimetre"))
+_PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
 
 def write_report(

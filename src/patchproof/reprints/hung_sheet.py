@@ -98,7 +98,7 @@ class HungSheet:
         return _stored(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
 
     def truth(self, conditions: Conditions) -> dict[str, Any]:
-        """Where the page's millimetres fall in the photograph of one view, and what it was taken under."""
+        """Where the page's millimeters fall in the photograph of one view, and what it was taken under."""
         drawn: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
         drawn["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
         if self.piece is None:
@@ -118,7 +118,7 @@ class HungSheet:
         }
 
     def px_from_page(self, conditions: Conditions) -> np.ndarray:
-        """3×3 from page millimetres to pixels of one view; of bent paper its tangent plane's, without the lens."""
+        """3×3 from page millimeters to pixels of one view; of bent paper its tangent plane's, without the lens."""
         x, y, *_ = self.manifest.cut_mm
         piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
         photo_px = self.scene.settings.camera.photo_px

@@ -135,7 +135,7 @@ def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scal
 
 
 def _page_from_design(manifest: Manifest, page: int) -> np.ndarray:
-    """3×3 from the millimetres of the design's page to a tile's; pages without a tile keep their own."""
+    """3×3 from the millimeters of the design's page to a tile's; pages without a tile keep their own."""
     square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
     if page not in square:
         return np.eye(3)

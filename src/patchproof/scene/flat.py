@@ -52,7 +52,7 @@ class FlatScene(PieceScene):
         return {"family": "plane", "size_mm": self.piece.size_mm, "reason": reason}
 
     def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As in `PieceScene.paper`: in the plane z = 1 of its own millimetres, which a view's homography projects."""
+        """As in `PieceScene.paper`: in the plane z = 1 of its own millimeters, which a view's homography projects."""
         corners = rect_corners((0, 0, *self.piece.size_mm))[[0, 1, 3, 2]]
         return np.concatenate([corners, np.ones((4, 1))], 1), np.broadcast_to([0.0, 0.0, -1.0], (4, 3)), corners
 
@@ -65,7 +65,7 @@ class FlatScene(PieceScene):
         return self.piece_light(conditions)[:, :, 0].mean(1)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of the piece in the closest view."""
+        """Pixels per millimeter of the piece in the closest view."""
         return float(self.piece_scales(self.draw("select", VIEWS_TRIED, 0), size_px).max())
 
     @property
@@ -140,7 +140,7 @@ def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.n
 
 
 def prints(piece: Piece, conditions: Conditions) -> np.ndarray:
-    """N×3×3 from the sheet's millimetres to those of a print of another size about the same middle."""
+    """N×3×3 from the sheet's millimeters to those of a print of another size about the same middle."""
     middle = np.array(piece.size_mm) / 2
     return np.stack([scaled_about(middle, scale) for scale in conditions.pose.printed_scale])
 

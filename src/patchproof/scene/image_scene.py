@@ -77,7 +77,7 @@ class ImageScene(flat.FlatScene):
         return replace(drawn, pose=replace(drawn.pose, background=background))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimetres to pixels."""
+        """N×3×3 from piece millimeters to pixels."""
         to_size = flat.size_from_photo(self.photo_px, size_px)
         side, photo = min(self.photo_px), np.array(self.photo_px)
         piece_mm = np.array(self.piece.size_mm)

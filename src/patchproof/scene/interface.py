@@ -70,7 +70,7 @@ class Scene(ABC):
 
     @abstractmethod
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of what is optimized in the closest view."""
+        """Pixels per millimeter of what is optimized in the closest view."""
 
     @abstractmethod
     def px_per_mm(self, size_px: tuple[int, int], shorter: bool = False) -> np.ndarray:
@@ -150,7 +150,7 @@ class PieceScene(Scene):
     @abstractmethod
     def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The piece as a grid by rows of vertices V×3 in the world, their normals V×3 out of the printed face, and
-        their millimetres V×2 on the flat piece.
+        their millimeters V×2 on the flat piece.
         """
 
     @property
@@ -160,7 +160,7 @@ class PieceScene(Scene):
 
     @abstractmethod
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimetres to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
+        """N×3×3 from piece millimeters to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
 
     @abstractmethod
     def piece_azimuth_deg(self, conditions: Conditions) -> np.ndarray:
@@ -184,7 +184,7 @@ class PieceScene(Scene):
         return True
 
     def printed_at(self, scale: tuple[float, float]) -> PieceScene:
-        """The scene with a piece printed larger or smaller along x and y, hung up at the same middle; piece millimetres
+        """The scene with a piece printed larger or smaller along x and y, hung up at the same middle; piece millimeters
         stay the sheet's own.
         """
         if scale == (1.0, 1.0):
@@ -201,12 +201,12 @@ class PieceScene(Scene):
         return self.piece_scales(conditions[self.facing(conditions)], size_px, shorter)
 
     def piece_scales(self, conditions: Conditions, size_px: tuple[int, int], shorter: bool = False) -> np.ndarray:
-        """N pixels per millimetre at the piece's middle, along the `shorter` side or the mean of all directions."""
+        """N pixels per millimeter at the piece's middle, along the `shorter` side or the mean of all directions."""
         scales = self.scales_and_tilts(conditions, size_px)
         return np.array([mean * np.sqrt(np.cos(np.radians(tilt))) if shorter else mean for mean, tilt in scales])
 
     def scales_and_tilts(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×2: pixels per millimetre at the piece's middle, and its tilt in degrees."""
+        """N×2: pixels per millimeter at the piece's middle, and its tilt in degrees."""
         middle = np.array(self.piece.size_mm) / 2
         return np.array([local_scale(each, middle) for each in self.piece_homographies(conditions, size_px)])
 

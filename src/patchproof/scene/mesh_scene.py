@@ -109,7 +109,7 @@ class MeshScene(Scene):
         return np.clip(toward @ self.normal, 0, None)
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
-        """Pixels per millimetre of the piece in the closest view."""
+        """Pixels per millimeter of the piece in the closest view."""
         nearest = self.settings.view.distance_mm[0]
         closest_mm = max(nearest - float(np.linalg.norm(self.middle_mm)), nearest / 4)
         return float(self.matrix_px(size_px)[0, 0]) / closest_mm

@@ -62,7 +62,7 @@ def quadratic_terms(mm: np.ndarray, size_mm: tuple[float, float]) -> np.ndarray:
 
 
 def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Codes N×3 and piece millimetres N×2 of pixels that see nothing but white paper."""
+    """Codes N×3 and piece millimeters N×2 of pixels that see nothing but white paper."""
     whole = (0.0, 0.0, *piece.size_mm)
     quad = apply_homography(px_from_piece, rect_corners(whole))
     limit = np.array([srgb.shape[1], srgb.shape[0]])

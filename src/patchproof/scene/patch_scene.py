@@ -79,7 +79,7 @@ class PatchScene(PieceScene, MeshScene):
         return replace(self, piece=piece, placement=placement, unreadable=unreadable, notes=notes)
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimetres to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
+        """N×3×3 from piece millimeters to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
         matrix, plane = self.matrix_px(size_px), self.placement.world_from_piece
         return np.stack([geometry.plane_homography(matrix, pose, plane) for pose in self.camera_from_print(conditions)])
 

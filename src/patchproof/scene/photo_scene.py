@@ -94,7 +94,7 @@ class PhotoScene(flat.FlatScene):
         return replace(self, photos=tuple(replace(p, light=light) for p, light in zip(photos, lights, strict=True)))
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×3×3 from piece millimetres to pixels."""
+        """N×3×3 from piece millimeters to pixels."""
         to_size = flat.size_from_photo(self.photo_px, size_px)
         matrices = self._view_from_photo(conditions)
         printed = flat.prints(self.piece, conditions)
