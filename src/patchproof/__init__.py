@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from patchproof.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer as Printer
     from patchproof.channel.printer import load_printer as load_printer
@@ -95,7 +97,6 @@ __all__ = [
     "sheet",
     "verify",
 ]
-__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
-import patchproof
 from patchproof.output import make_folder, write_whole
+from patchproof.version import __version__
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
@@ -60,7 +60,7 @@ def settings_key(manifest: Manifest, options: Options) -> str:
     A network without a SHA-256 of its own (the user's code) is known by its name alone.
     """
     settings = {
-        "versions": (patchproof.__version__, cv2.__version__, np.__version__),
+        "versions": (__version__, cv2.__version__, np.__version__),
         "manifest": manifest.model_dump(mode="json"),
         "models": [(model.name, model.sha256, model.input_px) for model in options.models],
         "printer": _printer_sha256(options.printer),

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from PIL import Image
 
-import patchproof
 from patchproof.classifier.network import Classifier
 from patchproof.color import codes_of
 from patchproof.optimizer.goals import Loss
@@ -36,6 +35,7 @@ from patchproof.scene.scene import Scene, build_scene, load_scene, needs_texture
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
 from patchproof.strict import Refused, validated
+from patchproof.version import __version__
 
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"
@@ -242,7 +242,7 @@ def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict
         "device": device,
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
-        "versions": {"patchproof": patchproof.__version__} | {name: version(name) for name in packages},
+        "versions": {"patchproof": __version__} | {name: version(name) for name in packages},
         "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
         "settings": _settings(scene, out).model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
