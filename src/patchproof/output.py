@@ -11,7 +11,7 @@ import io
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,8 @@ def write_together(contents: dict[Path, bytes]) -> None:
         raise Refused("a folder that can be written to", f"{path} ({reason})", "choose another --out") from error
     finally:
         for part in waiting.values():
-            part.unlink(missing_ok=True)
+            with suppress(OSError):  # moved to its place, or never written
+                part.unlink()
 
 
 def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None = None) -> bytes:
