@@ -63,6 +63,7 @@ def test_an_own_loss_is_descended_on_and_the_promise_is_an_object(run):
 def test_a_run_of_a_mesh_given_in_python_is_loaded_again_as_the_same_scene(run):
     again = pp.load_run(run.folder)
     assert again.scene.sheet_id == run.scene.sheet_id == scene().sheet_id
+    assert again.scene.with_template("letter").sheet_id == run.scene.with_template("letter").sheet_id
     assert (again.design == run.design).all() and again.promise == run.promise
     longer = pp.make_scene(SETTINGS, trimesh.creation.box(extents=(0.4, 0.2, 0.2)))
     assert longer.sheet_id != run.scene.sheet_id  # another mesh is another scene

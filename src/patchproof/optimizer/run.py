@@ -38,7 +38,7 @@ from patchproof.strict import Refused, validated
 from patchproof.version import __version__
 
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
-_GIVEN = "given.glb"
+_GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *_RESULTS, "evaluate.json", ".*.part")
 
@@ -89,6 +89,8 @@ def optimize_scene(
     design = _loop(problem, state, out, on_step)
     problem.subject.save(design, out)
     promise = _promise(problem, design, controls, on_promise)
+    if scene.given_glb is not None:
+        write_whole(out / _GIVEN, scene.given_glb)
     details = _details(problem, promise, out, device)
     write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
     return Run(out, scene, design, promise, details)
@@ -106,7 +108,8 @@ def load_run(folder: str | Path) -> Run:
         settings = validated(SceneSettings, details["settings"], str(folder / _RUN))
         promise = validated(Promise, details["promise"], str(folder / _RUN))
         base, seed = folder / details["scene_folder"], details["seed"]
-        scene = build_scene(settings, base.resolve(), seed, details["sheet_id"])
+        glb = (folder / _GIVEN).read_bytes() if (folder / _GIVEN).is_file() else None
+        scene = build_scene(settings, base.resolve(), seed, details["sheet_id"], glb)
         design = _design(scene, folder)
     except (OSError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, Refused):
@@ -244,22 +247,13 @@ def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict
         "python": platform.python_version(),
         "versions": {"patchproof": __version__} | {name: version(name) for name in packages},
         "scene_folder": os.path.relpath(scene.base.resolve(), out.resolve()),
-        "settings": _settings(scene, out).model_dump(mode="json"),
+        "settings": scene.settings.model_dump(mode="json"),
         "printer": problem.printer.provenance | {"method": problem.printer.method},
         "placement": scene.record(),
         "warnings": list(scene.warnings),
         "select_after_views": SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }
-
-
-def _settings(scene: Scene, out: Path) -> SceneSettings:
-    """The scene's settings; of a mesh that was given in Python they name the run's own copy."""
-    glb = scene.given_glb
-    if glb is None:
-        return scene.settings
-    write_whole(out / _GIVEN, lambda path: path.write_bytes(glb))
-    return scene.settings.changed(object={"mesh": os.path.relpath(out.resolve() / _GIVEN, scene.base.resolve())})
 
 
 def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:
