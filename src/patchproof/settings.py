@@ -61,7 +61,7 @@ class PatchSettings(Strict):
     covers the object's own UV map or vertices, `masked` only what mask, materials or faces name.
     """
 
-    width_mm: Positive | None = None  # of the design, without its frame
+    width_mm: Positive | None = None  # of the piece that is cut out; the design fills it, but for its markers
     height_mm: Positive | None = None  # likewise
     kind: Literal["patch", "texture", "masked"] = "patch"  # a printed piece, or the object's own texture
     side: Side = "+x"  # of the object, that the patch hangs on
@@ -76,8 +76,8 @@ class PatchSettings(Strict):
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
     @property
-    def design_mm(self) -> tuple[float, float]:
-        """Width and height of the design; a ValueError of textures and of patches as large as a blank's."""
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height of the piece; a ValueError of textures and of patches as large as a blank's."""
         if self.width_mm is None or self.height_mm is None:
             raise ValueError("no size of the patch is given")
         return self.width_mm, self.height_mm
@@ -124,7 +124,7 @@ class ViewSettings(Strict):
     roll_deg: Range = (-5.0, 5.0)  # of the camera about its axis
     fov_deg: Annotated[Positive, Field(lt=170)] = 50.0  # field of view across the picture's shorter side
     zoom: PositiveRange = (0.9, 1.1)  # of a photographed scene's pictures about their middle
-    patch_share: ShareRange = (0.1, 0.3)  # design's longer side over the picture's shorter side, in a folder of images
+    patch_share: ShareRange = (0.1, 0.3)  # piece's longer side over the picture's shorter side, in a folder of images
 
 
 class LightSettings(Strict):

@@ -114,7 +114,7 @@ def look(piece: Piece, picture: PiecePicture, width_px: float, tilt_deg: float) 
     homography = geometry.plane_homography(matrix, pose, np.eye(4))
     truth, inside = reference(homography, piece, picture, fragments.pixel)
     fragments = fragments.where(inside)
-    corner_uv = torch.tensor(_uv(picture, piece, plane[:, :2]), dtype=torch.float32)[faces][fragments.face]
+    corner_uv = torch.tensor(plane[:, :2] / piece.size_mm, dtype=torch.float32)[faces][fragments.face]
     weights = (fragments.barycentric, fragments.barycentric_dx, fragments.barycentric_dy)
     uv, uv_dx, uv_dy = ((weight[..., None] * corner_uv).sum(1) for weight in weights)
     return Look((uv, uv_dx, uv_dy), truth[inside])
@@ -122,7 +122,7 @@ def look(piece: Piece, picture: PiecePicture, width_px: float, tilt_deg: float) 
 
 def _pose(piece: Piece, width_px: float, tilt_deg: float) -> np.ndarray:
     """4×4 from piece to camera: tilted about x, turned and shifted a little, so that nothing lies along the pixels."""
-    distance = PICTURE_PX * piece.design_rect_mm[2] / width_px  # the focal length is the picture's side
+    distance = PICTURE_PX * piece.size_mm[0] / width_px  # the focal length is the picture's side
     (cos_x, cos_z), (sin_x, sin_z) = (f(np.radians([tilt_deg, 11.5])) for f in (np.cos, np.sin))
     tilt = np.array([[1, 0, 0], [0, cos_x, -sin_x], [0, sin_x, cos_x]])
     turn = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
@@ -137,24 +137,16 @@ def _pose(piece: Piece, width_px: float, tilt_deg: float) -> np.ndarray:
 def reference(homography: np.ndarray, piece: Piece, picture: PiecePicture, pixel: Tensor) -> tuple[Tensor, Tensor]:
     """Means P×3 of 16×16 samples in each of P pixels, and whether all of them lie within the design."""
     texture = picture.srgb.detach().permute(2, 0, 1)[None]
-    x, y, width, height = piece.design_rect_mm
     corner = np.stack([pixel % PICTURE_PX, pixel // PICTURE_PX], 1)[:, None]  # P×1×2
     along = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES
     total, inside = torch.zeros(len(pixel), 3), np.ones(len(pixel), bool)
     for down in along:
         at = corner + np.stack([along, np.full(SUBSAMPLES, down)], 1)
         mm = geometry.apply_homography(np.linalg.inv(homography), at.reshape(-1, 2))
-        within = (mm >= [x, y]).all(1) & (mm <= [x + width, y + height]).all(1)
+        within = (mm >= 0).all(1) & (mm <= piece.size_mm).all(1)
         inside &= within.reshape(-1, SUBSAMPLES).all(1)
-        grid = torch.tensor(2 * _uv(picture, piece, mm) - 1, dtype=torch.float32).view(1, 1, -1, 2)
+        grid = torch.tensor(2 * mm / piece.size_mm - 1, dtype=torch.float32).view(1, 1, -1, 2)
         # texels are blocks of one color, as printed
         values = F.grid_sample(texture, grid, mode="nearest", padding_mode="border", align_corners=False)[0, :, 0]
         total += values.view(3, len(pixel), SUBSAMPLES).sum(2).T
     return total / SUBSAMPLES**2, torch.tensor(inside)
-
-
-def _uv(picture: PiecePicture, piece: Piece, mm: np.ndarray) -> np.ndarray:
-    """Where the piece's millimeters lie on its picture, from 0 to 1."""
-    height, width, _ = picture.srgb.shape
-    box = np.array(picture.box_px, float)
-    return (box[:2] + mm / np.array(piece.size_mm) * (box[2:] - box[:2])) / [width, height]

@@ -15,8 +15,8 @@ each photograph borrows light and blur from one of the promise's own conditions,
 
 Gains and a veil that make paper white and marker black what was promised are light and camera, the rest of a color
 difference is print. Ink lighter than promised and a veil of stray light look alike but for one thing: a veil lies over
-the whole photograph, so what exceeds its darkest place is ink; up to there it counts as light. Without readable
-swatches print and light are one step.
+the whole photograph, so what exceeds its darkest place is ink; up to there it counts as light. Where the design's
+colors are too few or too much alike to say what the print made of them, print and light are one step.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from patchproof.evidence.classify import Judges
 from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.reproject import Reference, Shot, Switches, design_fit, light_fit, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
-from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture
+from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture, with_markers
 from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest
 
@@ -69,14 +69,14 @@ def ledger_of(
     if not claims:
         return None
     undo = [light_fit(shot, promised) for shot in shots]
-    relative = [fit.apply(shot.swatches) for fit, shot in zip(undo, shots, strict=True)]
+    relative = [fit.apply(shot.cells) for fit, shot in zip(undo, shots, strict=True)]
     inks = [fit.apply(shot.light.ink) for fit, shot in zip(undo, shots, strict=True)]
-    printed = fit_print(relative, promised.swatches, np.median(inks, axis=0), promised.ink)
+    printed = fit_print(relative, promised.design, np.median(inks, axis=0), promised.ink)
     looks = _looks(manifest.design.pixels(), surface, promised, printed)
     camera = manifest.settings.get("camera", {})
     values = []
     for shot, fit, reference in zip(shots, undo, _references(claims, shots, camera, promised), strict=True):
-        print_light = fit if printed is not None else design_fit(shot, promised, surface)
+        print_light = fit if printed is not None else design_fit(shot, promised)
         squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
         values.append(_confidences(squares, judges))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
@@ -132,8 +132,8 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
 def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[Switches, np.ndarray]:
     """The piece's light by (gamut, print), or by (gamut,) alone where the print is not known."""
     design = reduced(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
-    sent = piece_picture(surface, design, linear_from_srgb(surface.swatches_srgb), np.zeros(3))
-    looks = {False: sent, True: piece_picture(surface, promised.design, promised.swatches, promised.ink)}
+    sent = piece_picture(surface, with_markers(design, surface, np.zeros(3)), np.zeros(3))
+    looks = {False: sent, True: piece_picture(surface, promised.design, promised.ink)}
     if printed is None:
         return {(gamut,): look for gamut, look in looks.items()}
     return {(gamut, on): printed(look) if on else look for on in (False, True) for gamut, look in looks.items()}

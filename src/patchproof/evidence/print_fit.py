@@ -1,10 +1,11 @@
-"""What this print makes of colors beside what the promise's printer would have made of them, from swatches in view.
+"""What this print makes of colors beside what the promise's printer would have made of them, from the design in view.
 
-In: swatches and marker ink of several photographs, media-relative. Out: a map from promised to printed
-light, or None where fewer than eight swatches are readable anywhere. One print hangs in all photographs, so its
-swatches are pooled over them: light and noise differ from photo to photo, ink does not. The map is the promise's
-printer plus an affine map plus a thin-plate spline through what is left, in encoded values, which needs the fewest
-swatches for a given error.
+In: the design's coarse colors in several photographs, media-relative, and the design as promised. Out: a map from
+promised to printed light, or None where the design's colors are too few or too much alike to hold one. One print hangs
+in all photographs, so its cells are pooled over them: light and noise differ from photo to photo, ink does not.
+
+A cell shows the mean of many colors, and print is not linear. Hence a map that is linear in its coefficients: what it
+adds to a color is a quadratic in code values, and what it adds to a cell is the same quadratic's mean over the cell.
 """
 
 from __future__ import annotations
@@ -12,41 +13,55 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 
+import cv2
 import numpy as np
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.photo.colorfit import LEAST_SWATCHES
+from patchproof.color import srgb_from_linear
 
-_SMOOTHING = 1e-3  # keeps reading errors of half a code value from bending the spline
+LEAST_CELLS = 30  # three for each coefficient of a channel
+_RIDGE = 1e-4  # of the mean square of a term: what the cells do not say stays as promised
+_LEAST_SPREAD = 0.02  # smallest over largest singular value of the cells' colors
 
 
 def fit_print(
     relative: Sequence[np.ndarray], promised: np.ndarray, ink_in_photos: np.ndarray, ink: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Linear light `... × 3` as printed from linear light as promised; `relative` N×3 per photo, NaN where unread.
+    """Linear light `... × 3` as printed from linear light as promised. `relative` are the cells h×w×3 of each photo,
+    NaN where unread, `promised` is the design's light H×W×3.
 
-    Paper keeps its light: that it does is how light is told from print. The markers' `ink` became
-    `ink_in_photos`.
+    Paper keeps its light: that it does is how light is told from print. The markers' `ink` became `ink_in_photos`.
     """
-    from scipy.interpolate import RBFInterpolator
-
-    if not len(promised) or not relative:
+    if not relative:
         return None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a swatch that no photograph shows is NaN, and left out
+        warnings.simplefilter("ignore", RuntimeWarning)  # a cell that no photograph shows is NaN, and left out
         pooled = np.nanmedian(np.stack(relative), axis=0)
-    readable = np.isfinite(pooled).all(1)
-    if readable.sum() < LEAST_SWATCHES:
+    cells_px = pooled.shape[1::-1]
+    inner = np.zeros(pooled.shape[:2], bool)  # blur mixes what lies around the piece into the rim
+    inner[1:-1, 1:-1] = np.isfinite(pooled[1:-1, 1:-1]).all(-1)
+    expected = cv2.resize(promised, cells_px, interpolation=cv2.INTER_AREA).astype(float)[inner]
+    if len(expected) < LEAST_CELLS:
         return None
-    sent = srgb_from_linear(np.stack([*promised[readable], np.ones(3), ink]))
-    printed = srgb_from_linear(np.clip(np.stack([*pooled[readable], np.ones(3), ink_in_photos]), 0, 1))
-    try:
-        difference = RBFInterpolator(sent, printed - sent, kernel="thin_plate_spline", degree=1, smoothing=_SMOOTHING)
-    except np.linalg.LinAlgError:  # swatches in one plane of the color cube
+    singular = np.linalg.svd(np.column_stack([expected, np.ones(len(expected))]), compute_uv=False)
+    if singular[-1] < _LEAST_SPREAD * singular[0]:
         return None
+    terms = cv2.resize(_terms(promised), cells_px, interpolation=cv2.INTER_AREA)[inner]
+    ends = np.stack([np.ones(3), ink])
+    rows = np.concatenate([terms, _terms(ends)])
+    added = np.concatenate([pooled[inner] - expected, [np.zeros(3), ink_in_photos - ink]])
+    # errors count as the eye sees them; paper and ink, which all photographs show, as much as all cells
+    weight = np.concatenate([1 / (expected.mean(1) + 0.05) ** 0.6, np.full(2, np.sqrt(len(expected)))])[:, None]
+    square = (rows * weight).T @ (rows * weight)
+    ridge = _RIDGE * np.trace(square) / len(square) * np.eye(len(square))
+    coefficients = np.linalg.solve(square + ridge, (rows * weight).T @ (added * weight))
 
     def as_printed(linear: np.ndarray) -> np.ndarray:
-        colors = srgb_from_linear(np.clip(linear, 0, 1)).reshape(-1, 3)
-        return linear_from_srgb(np.clip(colors + difference(colors), 0, 1)).reshape(linear.shape).astype(np.float32)
+        return np.clip(linear + _terms(linear) @ coefficients, 0, 1).astype(np.float32)
 
     return as_printed
+
+
+def _terms(linear: np.ndarray) -> np.ndarray:
+    """`... × 10`: a quadratic's terms of the code values of linear light."""
+    r, g, b = np.moveaxis(srgb_from_linear(np.clip(linear, 0, 1)), -1, 0)
+    return np.stack([np.ones_like(r), r, g, b, r * r, g * g, b * b, r * g, g * b, b * r], -1).astype(float)

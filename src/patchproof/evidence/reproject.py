@@ -19,20 +19,20 @@ import cv2
 import numpy as np
 
 from patchproof.color import LUMINANCE, srgb_from_linear
-from patchproof.evidence.appearance import piece_only, seen_swatches
+from patchproof.evidence.appearance import cells_fit
 from patchproof.evidence.classify import square_of
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
-from patchproof.photo.colorfit import ColorFit, affine12, inverse, white_black
+from patchproof.photo.colorfit import ColorFit, inverse, white_black
 from patchproof.photo.detect import LIGHT
 from patchproof.photo.pattern_light import pattern_light
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.quality import CLIPPED_CODE, FrameLight
 from patchproof.photo.rectify import part_around, rectify
 
 Switches = tuple[bool, ...]  # which effects are on
 FINER = 3  # times the network's input size
 _READ_SHARE_SQUARE = 1 / 16  # of noise at white, as the camera model has it
-_CELLS = 16  # of the design, along its shorter side, where its own colors stand in for swatches
+_CELLS = 16  # of the design, along its shorter side, in which its colors are read
 _NOT_BLURRED_PX = 0.1
 _LEAST_AGREEMENT = 0.6  # of marker cells with the print, where right homographies reach 0.9 and more
 _LEAST_NOISE = 0.004  # of linear light: code values and JPEG
@@ -44,7 +44,7 @@ _SUPERSAMPLE = 2
 class Shot:
     """One photograph: `square` uint8 W×W×3, millimeters to its pixels, blur in its pixels, noise in linear light.
 
-    `swatches` N×3 are linear light as photographed, NaN where they cannot be read; `scale` is W over the photograph's
+    `cells` h×w×3 are the design's linear light as photographed, NaN where clipped; `scale` is W over the photograph's
     shorter side.
     """
 
@@ -54,7 +54,7 @@ class Shot:
     light: FrameLight
     blur_px: float
     noise: float
-    swatches: np.ndarray
+    cells: np.ndarray
     scale: float
 
 
@@ -86,16 +86,24 @@ def shot_of(
     if scale < 1:
         square = cv2.resize(square, (work, work), interpolation=cv2.INTER_AREA)
     to_square = np.array([[scale, 0, -left * scale], [0, scale, -top * scale], [0, 0, 1.0]])
-    part, part_from_mm = piece_only(srgb, px_from_mm, surface)
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     unmixed = pattern_light(srgb, px_from_mm, on_piece, surface.dictionary, blur_px)
     if unmixed is not None:
         if unmixed.agreement < _LEAST_AGREEMENT:
             return None
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
-    swatches = seen_swatches(part, LIGHT[part], part_from_mm, surface, blur_px, light.paper)
-    square = np.ascontiguousarray(square)
-    return Shot(file, square, to_square @ px_from_mm, light, blur_px * scale, noise_of(square), swatches, scale)
+    square, to_square = np.ascontiguousarray(square), to_square @ px_from_mm
+    cells = _cells(square, to_square, surface)
+    return Shot(file, square, to_square, light, blur_px * scale, noise_of(square), cells, scale)
+
+
+def _cells(square: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> np.ndarray:
+    """The design's coarse colors in linear light, NaN where one is clipped."""
+    cells_per_mm = _CELLS / min(surface.rect_mm[2:])
+    cells = rectify(LIGHT[square], px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
+    full = (square.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)
+    clipped = rectify(full, px_from_mm, surface.rect_mm, cells_per_mm).reshape(cells.shape[:2]) > 0.05
+    return np.where(clipped[..., None], np.nan, cells)
 
 
 def noise_of(srgb: np.ndarray) -> float:
@@ -123,16 +131,14 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
 
-def design_fit(shot: Shot, promised: Promised, surface: Surface) -> ColorFit:
+def design_fit(shot: Shot, promised: Promised) -> ColorFit:
     """Print, light and camera together, from the design's own coarse colors; paper and ink where these do not do."""
-    cells_per_mm = _CELLS / min(surface.rect_mm[2:])
-    cells = rectify(LIGHT[shot.square], shot.px_from_mm, surface.rect_mm, cells_per_mm).astype(float)
-    expected = cv2.resize(promised.design, cells.shape[1::-1], interpolation=cv2.INTER_AREA).astype(float)
-    # the rim has the white of the frame in it, which is put back, too
-    frame = [shot.light.paper, shot.light.ink], [np.ones(3), promised.ink]
-    pairs = zip((cells, expected), frame, strict=True)
-    fit = affine12(*(np.concatenate([c[1:-1, 1:-1].reshape(-1, 3), *[f] * _CELLS]) for c, f in pairs))
-    return fit or light_fit(shot, promised)
+    height, width = shot.cells.shape[:2]
+    expected = cv2.resize(promised.design, (width, height), interpolation=cv2.INTER_AREA).astype(float)
+    inner = np.s_[1:-1, 1:-1]
+    readable = np.isfinite(shot.cells[inner]).all(-1)
+    fit = cells_fit(shot.cells[inner][readable], expected[inner][readable], shot.light, promised.ink)
+    return light_fit(shot, promised) if fit.name == "white_black" else fit
 
 
 def squares_with(

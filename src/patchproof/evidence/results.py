@@ -29,17 +29,8 @@ class Prediction(Strict):
     recognized: bool
 
 
-class SwatchSeen(Strict):
-    """One swatch that was readable: sRGB as sent, as the promise's printer has it and as seen after the color fit."""
-
-    srgb: Row
-    promised: Row
-    seen: Row
-    delta_e00: Finite
-
-
 class Geometry(Strict):
-    """Where the sheet lies in a photograph, how sure that is, and how sharp and bright the print's frame came out."""
+    """Where the sheet lies in a photograph, how sure that is, and how sharp and bright the print's markers came out."""
 
     residual_mm: Finite
     px_per_mm: Finite
@@ -73,7 +64,6 @@ class Color(Strict):
     color_fit: str
     clipped_share: Finite  # of the design
     glossy_share: Finite
-    swatches: tuple[SwatchSeen, ...] = ()
     delta_e00_mean: Finite | None = None
     delta_e00_p95: Finite | None = None
 
@@ -97,7 +87,7 @@ _PARTS = {"geometry": Geometry, "pose": Pose, "scale": Scale, "color": Color, "r
 KEYS = """
     file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
     scale_x_over_y tilt_deg azimuth_deg azimuth_uncertainty_deg distance_mm contrast blur_px corner_uncertainty_mm
-    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share swatches homography_px_from_mm
+    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm
     predictions""".split()
 
 
@@ -141,7 +131,7 @@ class PhotoEntry(Strict):
     def _side_by_side(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         parts = plain(self)
         figures = parts | {key: value for name in _PARTS for key, value in (parts[name] or {}).items()}
-        return {key: [] if key == "swatches" and self.color is None else figures.get(key) for key in KEYS}
+        return {key: figures.get(key) for key in KEYS}
 
 
 class ModelRate(Strict):

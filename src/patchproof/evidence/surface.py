@@ -19,6 +19,7 @@ from patchproof.photo.detect import cells_of
 from patchproof.photo.label import Label, label_of
 from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest, Rect
+from patchproof.sheets.piece import MODULES, Piece, marker_at, marker_image, marker_rect
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
@@ -29,15 +30,13 @@ _LARGEST_PIECE_PX = 1024  # of the piece as it is put back
 
 @dataclass(frozen=True)
 class Surface:
-    """Markers 4×2 mm by id (`piece_ids`: those inside the cut), rectangles in mm, the piece's swatches sRGB N×3."""
+    """Markers 4×2 mm by id (`piece_ids`: those inside the cut), and rectangles in mm."""
 
     dictionary: str
     corners_mm: dict[int, np.ndarray]
     piece_ids: frozenset[int]
     rect_mm: Rect
     piece_mm: Rect
-    swatch_rects_mm: tuple[Rect, ...]
-    swatches_srgb: np.ndarray
     label: Label  # what the page's code says
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
@@ -61,10 +60,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Promised:
-    """Linear light as the printer model has it: design H×W×3, swatches N×3, marker ink (3,)."""
+    """Linear light as the printer model has it: the design with what markers lie on it H×W×3, marker ink (3,)."""
 
     design: np.ndarray
-    swatches: np.ndarray
     ink: np.ndarray
 
 
@@ -75,8 +73,7 @@ def surface_of(manifest: Manifest) -> Surface:
     page = manifest.design.page if manifest.design else min(m.page for m in manifest.markers)
     corners = _corners_by_page(manifest)[page]
     piece = frozenset(i for i, c in corners.items() if _inside(manifest.cut_mm, c))
-    swatches = [s for s in manifest.chart if s.page == page and _inside(manifest.cut_mm, rect_corners(s.rect_mm))]
-    return _surface(manifest, corners, piece, _design_rect(manifest), [(s.rect_mm, s.srgb) for s in swatches])
+    return _surface(manifest, corners, piece, _design_rect(manifest))
 
 
 def _assembled(manifest: Manifest) -> Surface:
@@ -94,19 +91,16 @@ def _assembled(manifest: Manifest) -> Surface:
         points = np.concatenate(list(corners[number].values()))
         x, y, w, h = (float(v) for v in (*points.min(0), *np.ptp(points, axis=0)))
         pages.append(_surface(manifest, corners[number], frozenset(), (x, y, w, h)))
-    swatches = [(_carry_rect(to_page[s.page], s.rect_mm), s.srgb) for s in manifest.chart if s.page in cuts]
-    return _surface(manifest, piece, frozenset(piece), _design_rect(manifest), swatches, tuple(pages))
+    return _surface(manifest, piece, frozenset(piece), _design_rect(manifest), tuple(pages))
 
 
-def _surface(manifest: Manifest, corners, piece_ids, rect_mm, swatches=(), pages=()) -> Surface:
+def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surface:
     return Surface(
         dictionary=manifest.markers[0].dictionary,
         corners_mm=corners,
         piece_ids=piece_ids,
         rect_mm=rect_mm,
         piece_mm=manifest.cut_mm,
-        swatch_rects_mm=tuple(rect for rect, _ in swatches),
-        swatches_srgb=np.array([srgb for _, srgb in swatches]).reshape(-1, 3),
         label=label_of(manifest),
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
@@ -114,7 +108,7 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, swatches=(), pages
 
 
 def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:
-    """How design, swatches and ink should look; None on pages without a design."""
+    """How design and ink should look; None on pages without a design."""
     import torch
 
     def printed(srgb: np.ndarray) -> np.ndarray:
@@ -124,15 +118,29 @@ def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promi
 
     if manifest.design is None:
         return None
-    swatches = printed(np.concatenate([surface.swatches_srgb, [[0.0, 0.0, 0.0]]])[None])[0]
-    design = printed(manifest.design.pixels() / 255.0).astype(np.float32)
-    return Promised(reduced(design, DESIGN_PX), swatches[:-1], swatches[-1])
+    design, ink = printed(manifest.design.pixels() / 255.0).astype(np.float32), printed(np.zeros((1, 1, 3)))[0, 0]
+    return Promised(reduced(with_markers(design, surface, ink), DESIGN_PX), ink)
 
 
-def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, ink: np.ndarray) -> np.ndarray:
-    """The whole piece, frame and all, as float32 linear light H×W×3 over `piece_mm`: white paper and what is on it.
+def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.ndarray:
+    """Linear light H×W×3 over the design's rectangle with the markers that lie on it; `ink` is their black."""
+    on_it = {
+        i: surface.corners_mm[i] for i in sorted(surface.piece_ids) if _inside(surface.rect_mm, surface.corners_mm[i])
+    }
+    if not on_it:
+        return design  # in a frame of markers, as pieces once were
+    x, y, *size_mm = surface.rect_mm
+    markers = tuple(marker_at(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_it.items())
+    piece = Piece((size_mm[0], size_mm[1]), markers, marker_rect(markers[0])[2] / MODULES)
+    image, reserved = marker_image(piece, (design.shape[1], design.shape[0]))
+    light = (ink + linear_from_srgb(image) * (1 - ink)).astype(np.float32)
+    return np.where(reserved[..., None], light, design)
 
-    Scissors, folds and what a shop adds beside the frame are left out. Edges fall on whole pixels.
+
+def piece_picture(surface: Surface, design: np.ndarray, ink: np.ndarray) -> np.ndarray:
+    """The whole piece as float32 linear light H×W×3 over `piece_mm`; `design` as `with_markers` makes it.
+
+    Scissors, folds, what a shop adds, and the swatches that pieces once had are left out. Edges fall on whole pixels.
     """
     x, y, w, h = surface.piece_mm
     px_per_mm = _LARGEST_PIECE_PX / max(w, h)
@@ -145,13 +153,11 @@ def piece_picture(surface: Surface, design: np.ndarray, swatches: np.ndarray, in
             size = int(x1 - x0), int(y1 - y0)
             picture[y0:y1, x0:x1] = cv2.resize(pixels.astype(np.float32), size, interpolation=how)
 
-    ids = sorted(surface.piece_ids)
-    for i, cells in zip(ids, cells_of(surface.dictionary, ids), strict=True):
+    paste(surface.rect_mm, design, cv2.INTER_AREA)
+    beside = [i for i in sorted(surface.piece_ids) if not _inside(surface.rect_mm, surface.corners_mm[i])]
+    for i, cells in zip(beside, cells_of(surface.dictionary, beside), strict=True):
         low, high = surface.corners_mm[i].min(0), surface.corners_mm[i].max(0)
         paste((*low, *(high - low)), ink + cells[..., None] * (1 - ink), cv2.INTER_NEAREST)
-    for rect, color in zip(surface.swatch_rects_mm, swatches, strict=True):
-        paste(rect, color[None, None], cv2.INTER_NEAREST)
-    paste(surface.rect_mm, design, cv2.INTER_AREA)
     return picture
 
 

@@ -102,7 +102,7 @@ def class_scene(
         images, table = _render_class(images_of.label, images_of.scene, base, seed, settings.renders_each, folder)
     scene = load_image_scene(scene_settings(settings, images_of, classifier, images, table), base, seed)
     side = float(settings.made_px)
-    return replace(scene, piece=Piece((side, side), (0.0, 0.0, side, side), (), (), 1.0), sheet_id=f"patch2d:{seed}")
+    return replace(scene, piece=Piece((side, side), (), 1.0), sheet_id=f"patch2d:{seed}")
 
 
 def scene_settings(
@@ -111,7 +111,7 @@ def scene_settings(
     """A millimeter of the patch is one of its texels; its size in pictures follows from the network's own."""
     side = settings.made_px
     low, high = (settings.shown_px * factor / classifier.input_px for factor in settings.scale)
-    largest = largest_share((side, side), settings.roll_deg)
+    largest = largest_share(settings.roll_deg)
     if high > largest:
         raise Refused(
             f"a patch of at most {largest * classifier.input_px:.0f} pixels before a network of {classifier.input_px}",

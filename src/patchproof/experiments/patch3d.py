@@ -114,10 +114,10 @@ def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Prob
 
 def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings:
     """A scene of images with the patch, printer, camera and optimizer of a scene with a mesh, and as large in it."""
-    *_, width, height = scene.piece.design_rect_mm
+    width, height = scene.piece.size_mm
     patch = PatchSettings(width_mm=width, height_mm=height)
     low, high = np.quantile(design_shares(scene), _SIZES)
-    largest = largest_share((width, height), settings.roll_deg)
+    largest = largest_share(settings.roll_deg)
     share = (float(min(low, largest)), float(min(high, largest)))
     return scene.settings.changed(
         object=ObjectSettings(images=".", labels="labels.csv"),
@@ -129,10 +129,10 @@ def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings
 
 
 def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
-    """The design's longer side over the picture's shorter one, in training views that see its face."""
+    """The piece's longer side over the picture's shorter one, in training views that see its face."""
     conditions, photo_px = scene.draw("train", views), scene.settings.camera.photo_px
     scales = scene.piece_scales(conditions[scene.facing(conditions)], photo_px)
-    return scales * max(scene.piece.design_rect_mm[2:]) / min(photo_px)
+    return scales * max(scene.piece.size_mm) / min(photo_px)
 
 
 def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Shown]:

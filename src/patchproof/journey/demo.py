@@ -32,8 +32,8 @@ up = "y"
 [patch]
 side = "+y"
 offset_mm = [0, 45]
-width_mm = 110
-height_mm = 110
+width_mm = 150
+height_mm = 150
 
 [target]
 label = "box truck"

@@ -26,10 +26,10 @@ from patchproof.output import image_bytes
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene
-from patchproof.sheets.piece import control_design
+from patchproof.sheets.piece import control_design, on_paper
 
 # A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
-# and not by others, and the frame, drawn on the same grid, would lose its markers.
+# and not by others, and markers, drawn on the same grid, would be lost.
 PRINTED_PX_PER_MM = 2.0
 DESIGN_FILE = "design.png"
 
@@ -78,14 +78,14 @@ class Patch:
     def pixels(self, design: Tensor) -> np.ndarray:
         """The uint8 H×W×3 that goes to the printer."""
         block = self.printed_px[0] // design.shape[2]
-        return as_pixels(design).repeat(block, 0).repeat(block, 1)
+        return on_paper(as_pixels(design).repeat(block, 0).repeat(block, 1), self.scene.piece)
 
     def control(self, kind: str, pixels: np.ndarray) -> np.ndarray:
         """What the control sheet of this kind prints in place of the design's pixels."""
-        return control_design(kind, pixels, self.scene.sheet_id)
+        return control_design(kind, pixels, self.scene.sheet_id, self.scene.piece)
 
     def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
-        """The printed piece round a design of any grid (the optimized one, or as printed); differentiable."""
+        """The printed piece with a design of any grid (the optimized one, or as printed); differentiable."""
         return self._printed.shown(design, kind)
 
     def printed_by(self, printer: Printer) -> Patch:
@@ -104,19 +104,15 @@ class Patch:
     def grid(self) -> Grid:
         """How fine designs are."""
         (width, height), (printed, _) = self.design_px, self.printed_px
-        width_mm = self.design_mm[0]
+        width_mm = self.scene.piece.size_mm[0]
         return Grid(self.design_px, self.printed_px, printed / width_mm, width * height, width / width_mm)
-
-    @property
-    def design_mm(self) -> tuple[float, float]:
-        """(width, height) of the design on paper."""
-        return self.scene.piece.design_rect_mm[2:]
 
     @property
     def printed_px(self) -> tuple[int, int]:
         """(width, height) of the design as it is printed: in whole blocks of at least PRINTED_PX_PER_MM."""
         width, height = self.design_px
-        block = math.ceil(PRINTED_PX_PER_MM * max(self.design_mm[0] / width, self.design_mm[1] / height))
+        width_mm, height_mm = self.scene.piece.size_mm
+        block = math.ceil(PRINTED_PX_PER_MM * max(width_mm / width, height_mm / height))
         return width * block, height * block
 
     @cached_property

@@ -1,7 +1,7 @@
-"""From what the camera saw to what was promised: an affine map in linear light, fitted to swatches or to paper and ink.
+"""From what the camera saw to what was promised: an affine map in linear light, fitted to colors or to paper and ink.
 
 In: linear light as photographed and as promised, media-relative (paper = 1). Out: `ColorFit`. The ladder: with at
-least eight usable swatches a full affine map (12 numbers: gains, channel mixing and a veil), fitted robustly; else
+least eight usable colors a full affine map (12 numbers: gains, channel mixing and a veil), fitted robustly; else
 per channel from paper and ink. Either takes out light and camera; what no affine map explains stays, and that is what
 a color difference should measure.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LEAST_SWATCHES = 8  # 12 numbers from 24 values; fewer have let one bad swatch turn the map
+LEAST_COLORS = 8  # 12 numbers from 24 values; fewer have let a single bad color turn the map
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class ColorFit:
 
 
 def affine12(photographed: np.ndarray, promised: np.ndarray) -> ColorFit | None:
-    """Robust affine map of N×3 swatches; None where they are too few or too much alike to hold it.
+    """Robust affine map of N×3 colors; None where they are too few or too much alike to hold it.
 
-    Fitted from promised to photographed and turned round: the promise is exact, and a glare on one swatch is then an
+    Fitted from promised to photographed and turned round: the promise is exact, and a glare on a color is then an
     outlier of the answer and not of the question, where it would pull the map towards itself.
     """
-    if len(photographed) < LEAST_SWATCHES:
+    if len(photographed) < LEAST_COLORS:
         return None
     rows = np.column_stack([promised, np.ones(len(promised))])
     singular = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-12), compute_uv=False)
@@ -51,7 +51,7 @@ def affine12(photographed: np.ndarray, promised: np.ndarray) -> ColorFit | None:
             weight = np.minimum(1, 1.345 * spread / np.maximum(error, 1e-12))  # Huber finds the basin,
         else:
             weight = np.maximum(1 - (error / (4.685 * spread)) ** 2, 0) ** 2  # Tukey lets the outliers go
-        if (weight > 0).sum() < LEAST_SWATCHES - 2:
+        if (weight > 0).sum() < LEAST_COLORS - 2:
             return None
     if np.linalg.cond(seen_from_promised[:, :3]) > 50:  # no camera mixes its channels so far
         return None

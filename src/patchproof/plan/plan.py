@@ -151,7 +151,7 @@ def marker_plan(scene: PieceScene) -> Markers:
     px_per_mm = np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE)
     return Markers(
         needed_mm=max(MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
-        printed_mm=scene.piece.module_mm * MODULES,
+        printed_mm=scene.piece.marker_mm,
         unreadable_share=scene.unreadable_share,
     )
 

@@ -1,9 +1,8 @@
 """A run's sheets: the design's own page and those of its controls, each with the marker ids that tell it from the
 others.
 
-In: a finished run. Out: SHEET.pdf and SHEET.json. The promise belongs to the design in the piece it was optimized with:
-another template, and with it another frame, would be another promise, which is then made anew. A piece whose blank was
-photographed keeps its size on every template, or the template is refused. The last page of a template with `plan_page`
+In: a finished run. Out: SHEET.pdf and SHEET.json. The piece is the same on every template that has room for it, but for
+the ids of its markers. The last page of a template with `plan_page`
 says where the piece goes and how to photograph it. Before there is a run, `blank_page` writes the pages of blanks,
 charts and boards.
 """
@@ -14,8 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS, make_promise
 from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
@@ -24,7 +21,7 @@ from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest, Promise
-from patchproof.sheets.piece import MODULES, control_design, lay_out_piece
+from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.several import write_several
@@ -62,14 +59,12 @@ def _content(run: Run, template: str | None, control: str | None) -> tuple[Print
     own = needs_piece(run.scene)
     scene = own if template is None else own.with_template(template)
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
-    piece, promise = scene.piece, run.promise
+    piece = scene.piece
     if control is not None:
-        piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, scene.sheet_id, control)
-        design = control_design(control, run.design, scene.sheet_id)
+        piece = with_ids(piece, scene.sheet_id, control)
+        design = control_design(control, run.design, scene.sheet_id, piece)
         return PrintedPiece(piece, scene.sheet_id, control, design, settings=settings), scene
-    if piece.size_mm != own.piece.size_mm:
-        promise = make_promise(set_problem(scene), run.design, scene.draw("promise", PROMISE_VIEWS))
-    return PrintedPiece(piece, scene.sheet_id, "design", run.design, promise, settings), scene
+    return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings), scene
 
 
 def _plan(scene: PieceScene, template: Template, promise: Promise | None) -> PlanPage | None:

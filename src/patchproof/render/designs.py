@@ -2,7 +2,7 @@
 
 In: a design, a float tensor in [0, 1]: 3×h×w of any grid for a piece, 3×1×M (the texels that may change, texture by
 texture, by rows) for textures. Out: what `photograph` shows, differentiable in the design. The piece is shown whole,
-with its printed frame of markers, because that is what will hang there.
+with its printed markers, because that is what will hang there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from patchproof.channel.printer import Printer
 from patchproof.render.pixels import ObjectTextures, PiecePicture
 from patchproof.scene.texture import Canvas
-from patchproof.sheets.piece import MODULES, FrameImage, Piece, frame_image, lay_out_piece
+from patchproof.sheets.piece import Piece, marker_image, with_ids
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,27 +31,22 @@ class PrintedPiece:
     device: torch.device
 
     def shown(self, design: Tensor, kind: str = "design") -> PiecePicture:
-        """The printed piece round a design 3×h×w, on the design's own grid, in the frame of that kind of sheet."""
+        """The printed piece with a design 3×h×w, on the design's own grid, and the markers of that kind of sheet."""
         height, width = design.shape[1:]
-        frame, printed_frame = self._frame(kind, (width, height))
-        x0, y0, *_ = frame.design_box_px
-        printed = self.printer.apply(design[None])[0].permute(1, 2, 0)
-        rows = torch.cat(
-            [printed_frame[y0 : y0 + height, :x0], printed, printed_frame[y0 : y0 + height, x0 + width :]], 1
-        )
-        picture = torch.cat([printed_frame[:y0], rows, printed_frame[y0 + height :]])
-        return PiecePicture(picture, frame.piece_box_px, (x0, y0, x0 + width, y0 + height))
+        markers, reserved = self._markers(kind, (width, height))
+        return PiecePicture(torch.where(reserved, markers, self._printed(design)))
 
     @lru_cache(maxsize=8)  # noqa: B019 - it lives as long as its stage
-    def _frame(self, kind: str, design_px: tuple[int, int]) -> tuple[FrameImage, Tensor]:
-        """The frame of a kind of sheet, as drawn and as printed (H×W×3)."""
-        piece = self.piece
-        if kind != "design":
-            # the control's own marker ids, as they will be printed
-            piece = lay_out_piece(piece.design_rect_mm[2:], piece.module_mm * MODULES, self.sheet_id, kind)
-        frame = frame_image(piece, design_px)
-        sent = torch.tensor(np.asarray(frame.srgb), dtype=torch.float32, device=self.device).permute(2, 0, 1)[None]
-        return frame, self.printer.apply(sent)[0].permute(1, 2, 0)
+    def _markers(self, kind: str, design_px: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """A kind of sheet's markers as printed, H×W×3, and where they and their white lie, bool H×W×1."""
+        # a control has its own marker ids, as they will be printed
+        image, reserved = marker_image(with_ids(self.piece, self.sheet_id, kind), design_px)
+        sent = torch.tensor(image, device=self.device).permute(2, 0, 1)
+        return self._printed(sent), torch.tensor(reserved, device=self.device)[..., None]
+
+    def _printed(self, srgb: Tensor) -> Tensor:
+        """3×H×W as sent, H×W×3 as it looks on paper."""
+        return self.printer.apply(srgb[None])[0].permute(1, 2, 0)
 
 
 @dataclass(frozen=True, eq=False)

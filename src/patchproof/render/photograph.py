@@ -124,12 +124,10 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
 
 def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[Tensor]]:
     """Each view's own print of the picture, and footprints on all of them."""
-    x0, y0, x1, y1 = picture.box_px
-    width_mm, height_mm = views.stage.piece_surface.size_mm
+    (height, width, _), (width_mm, height_mm) = picture.srgb.shape, views.stage.piece_surface.size_mm
     shifts = torch.as_tensor(views.conditions.print.misregistration_mm).to(picture.srgb)
-    shifts = shifts * shifts.new_tensor([(x1 - x0) / width_mm, (y1 - y0) / height_mm])
+    shifts = shifts * shifts.new_tensor([width / width_mm, height / height_mm])
     prints = [misregistered(picture.srgb, shift) for shift in shifts]
-    height, width = picture.srgb.shape[:2]
     texels = sum((max(width >> k, 1) + 1) * (max(height >> k, 1) + 1) for k in range(max(width, height).bit_length()))
     return on_copies(views.on_piece.texels, views.on_piece.view * texels), prints
 

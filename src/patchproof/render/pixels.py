@@ -14,24 +14,19 @@ from torch import Tensor
 
 from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface
-from patchproof.render.texture import Footprint, footprint, joined, layout
+from patchproof.render.texture import Footprint, footprint, layout
 
 # Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
 # optimized designs 20 to 200 px wide, four 30. The object's own texture has one unless it is what is optimized.
-# What frames the design is seen with 4, and nothing is learned there.
-DESIGN_TAPS, FRAME_TAPS, OBJECT_TAPS, OBJECT_LEARNED_TAPS = 8, 4, 1, 4
+DESIGN_TAPS, OBJECT_TAPS, OBJECT_LEARNED_TAPS = 8, 1, 4
 _LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
 
 
 @dataclass(frozen=True)
 class PiecePicture:
-    """The whole piece as it looks on paper, H×W×3 sRGB; `box_px` (x0, y0, x1, y1) is where the cut line falls, and
-    `design_px` where the design does.
-    """
+    """The whole piece as it looks on paper, H×W×3 sRGB up to the cut line."""
 
     srgb: Tensor
-    box_px: tuple[float, float, float, float]
-    design_px: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -112,20 +107,8 @@ def piece_pixels(
 def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor) -> Footprint:
     """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
     height, width, _ = piece.srgb.shape
-    x0, y0, x1, y1 = piece.box_px
-    scale, size = at.new_tensor([(x1 - x0) / width, (y1 - y0) / height]), at.new_tensor([width, height])
-    uv, uv_dx, uv_dy = at * scale + at.new_tensor([x0, y0]) / size, at_dx * scale, at_dy * scale
-    # whose pixel reaches into the design, or whose taps may read it: half a pixel and two texels
-    low, high = at.new_tensor(piece.design_px).view(2, 2) / size
-    reach = (uv_dx.abs() + uv_dy.abs()) * 0.75 + 2 / size
-    inside = ((uv + reach > low) & (uv - reach < high)).all(1)
-    where, parts = layout([(width, height)], wrap=False, device=at.device), []
-    for which, taps, learned in ((inside, DESIGN_TAPS, True), (~inside, FRAME_TAPS, False)):
-        index = which.nonzero()[:, 0]
-        at_index = [values.index_select(0, index) for values in (uv, uv_dx, uv_dy)]
-        texture = at.new_zeros(len(index), dtype=torch.long)
-        parts.append((index, footprint(where, texture, *at_index, taps=taps, blocks=True, learned=learned)))
-    return joined(parts, len(at))
+    where, texture = layout([(width, height)], wrap=False, device=at.device), at.new_zeros(len(at), dtype=torch.long)
+    return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True, learned=True)
 
 
 def object_pixels(

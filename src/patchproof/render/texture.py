@@ -141,16 +141,6 @@ def footprint(
     return Footprint(tuple(groups), len(uv))
 
 
-def joined(parts: list[tuple[Tensor, Footprint]], fragments: int) -> Footprint:
-    """One footprint of several, each of the fragments that its indices name."""
-    groups = (
-        replace(group, fragment=index if group.fragment is None else index.index_select(0, group.fragment))
-        for index, part in parts
-        for group in part.groups
-    )
-    return Footprint(tuple(groups), fragments)
-
-
 def on_copies(footprint: Footprint, offset: Tensor) -> Footprint:
     """The same footprints on copies of their textures that begin `offset` texels on, P of them."""
     groups = []

@@ -21,7 +21,7 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import PieceScene
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings
-from patchproof.sheets.piece import MODULES, Piece
+from patchproof.sheets.piece import Piece
 from patchproof.strict import Refused
 
 VIEWS_TRIED = 256  # for figures over a scene's views
@@ -85,8 +85,9 @@ class FlatScene(PieceScene):
         """What a reader should know, also where more than one view in twenty shows markers that cannot be read."""
         if self.unreadable_share <= 1 - READABLE_SHARE:
             return self.notes
-        marker_mm = self.piece.module_mm * MODULES
-        warning = f"markers of {marker_mm:.1f} mm will be unreadable in {self.unreadable_share:.0%} of the views"
+        warning = (
+            f"markers of {self.piece.marker_mm:.1f} mm will be unreadable in {self.unreadable_share:.0%} of the views"
+        )
         return (*self.notes, warning)
 
 

@@ -28,24 +28,14 @@ from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings, identifying
-from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.piece import (
-    MODULES,
-    SMALLEST_MARKER_MM,
-    Piece,
-    frame_mm,
-    lay_out_piece,
-    marker_size_mm,
-    sheet_id,
-)
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, expand
 
 SPLIT_FROM = 20
 _OPTIMIZED_ON = {"train", "select"}
 ERASED_AREA, ERASED_ASPECT = (0.02, 0.33), (0.3, 3.3)  # shares of the centered square; height over width
-# of the design's longer side: markers that small pictures would need hide more of them than the patch
-_LARGEST_MARKER = 0.2
 _ERASED_CELLS = 224  # random values per side of the centered square: one a pixel at networks' usual size
 
 
@@ -127,8 +117,8 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: s
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
-    """N scales at `photo_px`: the design's longer side takes the drawn share of the picture's shorter one."""
-    return _shares(settings, conditions) * min(settings.camera.photo_px) / max(piece.design_rect_mm[2:])
+    """N scales at `photo_px`: the piece's longer side takes the drawn share of the picture's shorter one."""
+    return _shares(settings, conditions) * min(settings.camera.photo_px) / max(piece.size_mm)
 
 
 def labels_of(folder: Path, table: Path) -> list[str]:
@@ -139,11 +129,9 @@ def labels_of(folder: Path, table: Path) -> list[str]:
     return found
 
 
-def largest_share(design_mm: tuple[float, float], roll_deg: tuple[float, float]) -> float:
-    """The largest `view.patch_share` at which the piece, with its smallest frame, fits into the square at all angles
-    (in whole thousandths).
-    """
-    return int(1000 * max(design_mm) / _least_mm(design_mm) / _widest(roll_deg)) / 1000
+def largest_share(roll_deg: tuple[float, float]) -> float:
+    """The largest `view.patch_share` at which the piece fits into the square at all angles (in whole thousandths)."""
+    return int(1000 / _widest(roll_deg)) / 1000
 
 
 def erase(picture: np.ndarray, seed: int) -> None:
@@ -226,30 +214,22 @@ def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[flat.
 
 
 def _piece(settings: SceneSettings, identity: str) -> Piece:
-    """The printed piece; its markers are as large as the views need them, no larger than picture and page can hold."""
-    patch, (low, high) = settings.patch, settings.view.patch_share
+    """The printed piece; its markers are as large as the views need them."""
+    (low, high), size_mm, template = settings.view.patch_share, settings.patch.size_mm, settings.sheet.template
     if low <= 0:
         raise Refused("view.patch_share above 0", f"{low:g}", "give a share that can be seen")
-    design_mm = patch.design_mm
-    # a square of this side fits into the picture at every drawn size and angle
-    fits_mm = max(design_mm) / high / _widest(settings.view.roll_deg)
-    least_mm = _least_mm(design_mm)
-    if least_mm > fits_mm:
+    largest = largest_share(settings.view.roll_deg)
+    if high > largest:
         raise Refused(
             "a piece that fits into the picture's centered square at the largest view.patch_share",
-            f"{least_mm / fits_mm:.0%} of it with its frame of markers",
-            f"lower it to {int(high * fits_mm / least_mm * 100) / 100:g}",
+            f"{high / largest:.0%} of it",
+            f"lower it to {largest:g}",
         )
     smallest = low * (high / low) ** (1 - READABLE_SHARE)
-    needed_mm = MODULES * PX_PER_MODULE * max(design_mm) / (smallest * min(settings.camera.photo_px))
-    needed_mm = min(needed_mm, _LARGEST_MARKER * max(design_mm))
-    width_mm, height_mm = largest_piece_mm(load_template(settings.sheet.template))
-    largest_mm = min(width_mm, fits_mm), min(height_mm, fits_mm)
-    return lay_out_piece(design_mm, marker_size_mm(needed_mm, design_mm, largest_mm), identity, "design")
-
-
-def _least_mm(design_mm: tuple[float, float]) -> float:
-    return max(design_mm) + 2 * frame_mm(SMALLEST_MARKER_MM)
+    needed_mm = MODULES * PX_PER_MODULE * max(size_mm) / (smallest * min(settings.camera.photo_px))
+    piece = lay_out_piece(size_mm, marker_size_mm(needed_mm, size_mm), identity, "design")
+    refuse_larger_than_page(load_template(template), piece)
+    return piece
 
 
 def _widest(roll_deg: tuple[float, float]) -> float:

@@ -23,7 +23,7 @@ from patchproof.scene.conditions import Conditions, draw
 from patchproof.scene.placement import Placement
 from patchproof.scene.resolution import design_grid
 from patchproof.settings import SceneSettings, identifying
-from patchproof.sheets.piece import MODULES, Piece, sheet_id
+from patchproof.sheets.piece import Piece, sheet_id
 from patchproof.strict import Refused
 
 SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
@@ -212,9 +212,9 @@ class PieceScene(Scene):
 
     def design_px(self, network_px: int) -> tuple[int, int]:
         """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.design_rect_mm[2:])
+        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.size_mm)
 
     def record(self) -> dict[str, Any]:
         """What run.json says of the piece."""
-        marker_mm = self.piece.module_mm * MODULES
-        return {"piece_mm": self.piece.size_mm, "marker_mm": marker_mm, "unreadable_share": self.unreadable_share}
+        piece = self.piece
+        return {"piece_mm": piece.size_mm, "marker_mm": piece.marker_mm, "unreadable_share": self.unreadable_share}

@@ -75,7 +75,7 @@ def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
     clear_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
     white = _inside(mm, whole, -clear_mm - _CUT_SLACK_MM)
-    for rect in [*(marker_rect(marker) for marker in piece.markers), *(rect for rect, _ in piece.swatches)]:
+    for rect in map(marker_rect, piece.markers):
         white &= ~_inside(mm, rect, clear_mm)
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
 

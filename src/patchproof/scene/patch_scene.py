@@ -1,8 +1,8 @@
 """A mesh with a piece on it, and the door to all scenes with a mesh.
 
 In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
-layout of the printed piece (the design with its frame of markers; the marker size follows from the views) and where
-the piece lies; or a `TextureScene`, where the object's own texture is what changes.
+layout of the printed piece (the design and its markers, whose size follows from the views) and where the piece lies;
+or a `TextureScene`, where the object's own texture is what changes.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from patchproof.scene.placement import Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.texture import texture_canvas
 from patchproof.settings import SceneSettings, identifying
-from patchproof.sheets.page import largest_piece_mm
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheets.template import load_template
-from patchproof.sheets.tiles import plan_tiles
+from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, expand
 
 
@@ -170,21 +169,15 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     """
     settings, mesh, frame = scene.settings, scene.mesh, scene.frame
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
-    design_mm = patch.design_mm
-    scales = _smallest_scales(scene, place(mesh, frame, design_mm, patch.spin_deg))
+    placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
+    scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
-    template = load_template(settings.sheet.template)
-    largest_mm = width_mm, height_mm = largest_piece_mm(template)
-    if not patch.bend:
-        largest_mm = min(width_mm, frame.extent_mm[0]), min(height_mm, frame.extent_mm[1])
-    marker_mm = marker_size_mm(float(needed_mm), design_mm, largest_mm)
-    piece = lay_out_piece(design_mm, marker_mm, scene.sheet_id, "design")
-    if template.tiles is not None:
-        plan_tiles(template.tiles, piece)  # refuses what no sheet could be made of, before hours of optimizing
+    marker_mm = marker_size_mm(float(needed_mm), patch.size_mm)
+    piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
+    refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    placement = place(mesh, frame, piece.size_mm, patch.spin_deg)
     notes = (*mesh.warnings, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
     return piece, placement, unreadable, notes
 

@@ -34,16 +34,16 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Part
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.settings import SceneSettings, identifying
-from patchproof.sheets.blank import blank_piece_mm
+from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
-from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.piece import Piece, lay_out_piece, sheet_id, with_ids
+from patchproof.sheets.piece import Piece, sheet_id, with_ids
 from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, expand
 
 LEAST_PHOTOS = 6
 _MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small
-_MOST_RESIDUAL = 0.01  # as in verify, of the design's shorter side
+_MOST_RESIDUAL = 0.01  # as in verify, of the piece's shorter side
 _MOST_UNCERTAIN = 0.01  # 95 % point of the worst corner, as a share of the same
 _UNEVEN = 0.05  # of the light: what the quadratic leaves; from here on a reader should know
 
@@ -76,7 +76,7 @@ class PhotoScene(flat.FlatScene):
         return f"{len(self.photos)} photographs"
 
     def _laid_out(self) -> Self:
-        _refuse_larger_than_page(self.settings, self.piece)
+        refuse_larger_than_page(load_template(self.settings.sheet.template), self.piece)
         return replace(self, piece=with_ids(self.piece, self.sheet_id, "design"))
 
     def without(self, part: Part) -> Self | None:
@@ -140,13 +140,13 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     if photos is None or sheet is None:
         raise ValueError("a scene of photographs names them and their sheet")
     manifest = load_manifest(expand(sheet, base))
-    design_mm, marker_mm = blank_piece_mm(manifest)
-    settings = _with_size(settings, design_mm)
+    blank = blank_piece(manifest)
+    settings = _with_size(settings, blank.size_mm)
     folder = Path(expand(photos, base))
     known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
     identity = identity or sheet_id(identifying(settings) | known, seed)
-    piece = lay_out_piece(design_mm, marker_mm, identity, "design")
-    _refuse_larger_than_page(settings, piece)
+    piece = with_ids(blank, identity, "design")
+    refuse_larger_than_page(load_template(settings.sheet.template), piece)
     base_photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)
     warnings = [f"{name} is left out: {reason}" for name, reason in skipped.items()]
     for photo in base_photos:
@@ -160,7 +160,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
 def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
     """What one photograph of the blank sheet says; `CannotJudge` where it cannot be used."""
     srgb = read_photo(path).srgb
-    fit, blur = _locate(srgb, manifest, min(piece.design_rect_mm[2:]))
+    fit, blur = _locate(srgb, manifest, min(piece.size_mm))
     x, y, *_ = manifest.cut_mm
     picture, photo_from_srgb = flat.picture_for(srgb, photo_px)
     px_from_piece = fit.px_from_mm @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
@@ -217,7 +217,7 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
     found = complete(srgb, found, on_piece)
     borders = [b for i, b in found.markers.items() if b.fitted and i in on_piece]
     if len(borders) < 3:
-        raise CannotJudge("too_few_markers", len(borders), 3, "show more of the frame, sharp and well lit")
+        raise CannotJudge("too_few_markers", len(borders), 3, "show the whole piece, sharp and well lit")
     corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in on_piece}
     fit, blur = fit_page(corners, on_piece), blur_px(borders)
     if blur > _MOST_BLUR * (module_px := float(np.median([b.module_px for b in borders]))):
@@ -230,22 +230,12 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
     return fit, blur
 
 
-def _with_size(settings: SceneSettings, design_mm: tuple[float, float]) -> SceneSettings:
+def _with_size(settings: SceneSettings, size_mm: tuple[float, float]) -> SceneSettings:
     patch = settings.patch
-    if patch.width_mm is not None and not np.allclose(patch.design_mm, design_mm, atol=0.01):
+    if patch.width_mm is not None and not np.allclose(patch.size_mm, size_mm, atol=0.01):
         raise Refused(
-            f"a patch as large as the blank sheet's ({design_mm[0]:g} × {design_mm[1]:g} mm)",
-            f"{patch.design_mm[0]:g} × {patch.design_mm[1]:g} mm",
+            f"a patch as large as the blank sheet's ({size_mm[0]:g} × {size_mm[1]:g} mm)",
+            f"{patch.size_mm[0]:g} × {patch.size_mm[1]:g} mm",
             "leave out width_mm and height_mm, or print a blank of that size",
         )
-    return settings.changed(patch={"width_mm": design_mm[0], "height_mm": design_mm[1]})
-
-
-def _refuse_larger_than_page(settings: SceneSettings, piece: Piece) -> None:
-    width, height = largest_piece_mm(load_template(settings.sheet.template))
-    if piece.size_mm[0] > width + 1e-6 or piece.size_mm[1] > height + 1e-6:
-        raise Refused(
-            f"a template that holds the blank's piece of {piece.size_mm[0]:.1f} × {piece.size_mm[1]:.1f} mm",
-            f"{settings.sheet.template} with room for {width:.1f} × {height:.1f} mm",
-            "name a larger template",
-        )
+    return settings.changed(patch={"width_mm": size_mm[0], "height_mm": size_mm[1]})

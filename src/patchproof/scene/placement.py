@@ -180,7 +180,7 @@ def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, exten
     across, along = c * width + s * height, s * width + c * height
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
         expected = f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)"
-        got = f"{across:.0f} × {along:.0f} mm with its frame of markers"
+        got = f"{across:.0f} × {along:.0f} mm"
         raise Refused(expected, got, "make the patch smaller or choose a larger side")
 
 

@@ -1,9 +1,9 @@
 """Pages without a design, printed before there is a run: a blank piece, or a color chart alone.
 
 In: a template. Out: a PDF and its JSON; the sheet id is a hash of the template, so equal templates give equal pages.
-A template with a [blank] table has a piece with markers and swatches: photographs of the object with it show where a
-design of the same size would lie and what light falls on it, all that a photographed scene needs. Its cut line and
-markers say all about the piece: `blank_piece_mm` reads its two sizes back. A template without a place for a piece is a
+A template with a [blank] table has a piece with markers alone: photographs of the object with it show where a design of
+the same size would lie and what light falls on it, all that a photographed scene needs. Its cut line and markers say
+all about the piece: `blank_piece` reads it back. A template without a place for a piece is a
 chart, printed to learn what a printer does to colors; nothing is cut, but its `cut_mm` is what photographs are to show.
 """
 
@@ -14,7 +14,17 @@ from pathlib import Path
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.page import lay_out_parts
-from patchproof.sheets.piece import frame_mm, lay_out_piece, marker_ids, page_id
+from patchproof.sheets.piece import (
+    MODULES,
+    Piece,
+    PieceMarker,
+    lay_out_piece,
+    marker_ids,
+    marker_rect,
+    moved_marker,
+    page_id,
+)
+from patchproof.sheets.rects import holds
 from patchproof.sheets.template import Template, load_template, template_names
 from patchproof.sheets.write import write_page, write_sheet
 from patchproof.strict import Refused
@@ -29,7 +39,7 @@ def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:
         do = f"use one of: {', '.join(template_names(BLANK))}, or name the run whose design belongs on the page"
         raise Refused("a template with a [blank] table for a page without a design", f"{template}", do)
     identity = page_id(page)
-    piece = lay_out_piece(page.blank.design_mm, page.blank.marker_mm, identity, BLANK)
+    piece = lay_out_piece(page.blank.piece_mm, page.blank.marker_mm, identity, BLANK)
     settings = {BLANK: page.blank.model_dump(mode="json")}
     return write_sheet(pdf_path, page, PrintedPiece(piece, identity, BLANK, None, settings=settings))
 
@@ -46,12 +56,14 @@ def chart_sheet(template: Template, pdf_path: str | Path) -> Manifest:
     return write_page(pdf_path, page, template, (*grid.corner_mm, width, height), CHART, grid)
 
 
-def blank_piece_mm(manifest: Manifest) -> tuple[tuple[float, float], float]:
-    """(design's width and height, marker size) of a blank sheet, from its cut line and the first marker in it."""
+def blank_piece(manifest: Manifest) -> Piece:
+    """The piece of a blank sheet, from its cut line and the markers in it, wherever these lie."""
     if manifest.kind != BLANK:
         got = f'one of kind "{manifest.kind}"'
         raise Refused("the manifest of a blank sheet", got, "name the JSON beside BLANK.pdf")
-    (x0, _), (x1, _) = manifest.markers[0].corners_mm[:2]  # the piece's markers come first
-    marker_mm = round(x1 - x0, 4)
-    width, height = (round(side - 2 * frame_mm(marker_mm), 4) for side in manifest.cut_mm[2:])
-    return (width, height), marker_mm
+    x, y, width, height = manifest.cut_mm
+    markers = [PieceMarker(m.id, m.corners_mm) for m in manifest.markers if m.page == 1]
+    inside = [moved_marker(m, (-x, -y)) for m in markers if holds(manifest.cut_mm, marker_rect(m))]
+    if not inside:
+        raise Refused("markers within the blank's cut line", "none", "name the JSON beside BLANK.pdf")
+    return Piece((width, height), tuple(inside), round(marker_rect(inside[0])[2] / MODULES, 6))

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from patchproof.sheets.layout import PageLayout
-from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256, png_base64
-from patchproof.sheets.piece import Piece, printed
+from patchproof.sheets.manifest import WHOLE_PIECE, Design, Manifest, Promise, Swatch, design_sha256, png_base64
+from patchproof.sheets.piece import Piece, on_paper, printed
 from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import BoardTemplate, Template
 from patchproof.strict import Refused
@@ -20,7 +20,8 @@ from patchproof.strict import Refused
 
 @dataclass(frozen=True, eq=False)
 class PrintedPiece:
-    """A piece and what belongs to it; `design_srgb8` is uint8 H×W×3, or None for white paper. Other pixels are refused.
+    """A piece and what belongs to it; `design_srgb8` is uint8 H×W×3, or None for white paper. Other pixels are refused,
+    and those that the markers need become white.
 
     `kind` is "design", or the control that it is.
     """
@@ -34,10 +35,11 @@ class PrintedPiece:
 
     def __post_init__(self):
         pixels = self.design_srgb8
-        if pixels is not None and (
-            pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size
-        ):
+        if pixels is None:
+            return
+        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
             raise Refused("a design of uint8 H×W×3 pixels", f"{pixels.dtype} {pixels.shape}", "convert it to 8-bit RGB")
+        object.__setattr__(self, "design_srgb8", on_paper(pixels, self.piece))
 
     @property
     def code(self) -> str:
@@ -48,24 +50,22 @@ class PrintedPiece:
     @property
     def words(self) -> dict[str, str]:
         """What a template's words stand for on its page."""
-        design = size_text(self.piece.design_rect_mm[2:])
-        return {"sheet_id": self.sheet_id, "kind": self.kind, "design": design, "piece": size_text(self.piece.size_mm)}
+        size = size_text(self.piece.size_mm)
+        return {"sheet_id": self.sheet_id, "kind": self.kind, "design": size, "piece": size}
 
     def pictures(self, rect_mm: RectMm) -> tuple[tuple[RectMm, np.ndarray], ...]:
         """The design in that rectangle, or nothing."""
         return () if self.design_srgb8 is None else ((rect_mm, self.design_srgb8),)
 
-    def manifest(
-        self, page: PageLayout, template: Template, cut_mm: RectMm, design_mm: RectMm, design_page: int = 1
-    ) -> Manifest:
-        """The manifest of its page, cut line and design."""
+    def manifest(self, page: PageLayout, template: Template, cut_mm: RectMm, design_page: int = 1) -> Manifest:
+        """The manifest of its page, and of its design within the cut line."""
         manifest = page_manifest(page, template, cut_mm, self.sheet_id, self.kind, self.settings)
         pixels = self.design_srgb8
         if pixels is None:
             return manifest.changed(promise=self.promise)
         size_px = (pixels.shape[1], pixels.shape[0])
         sha256, png = design_sha256(pixels), png_base64(pixels)
-        design = Design(sha256=sha256, rect_mm=design_mm, size_px=size_px, page=design_page, png=png)
+        design = Design(sha256=sha256, rect_mm=cut_mm, size_px=size_px, page=design_page, png=png)
         return manifest.changed(design=design, promise=self.promise)
 
 
@@ -79,6 +79,7 @@ def page_manifest(
 ) -> Manifest:
     """The manifest of a sheet's one page, without a design."""
     return Manifest(
+        version=WHOLE_PIECE,
         sheet_id=sheet_id,
         kind=kind,
         page_mm=page.page_mm,

@@ -51,7 +51,6 @@ class Window:
 
     rect_mm: RectMm
     markers: tuple[PieceMarker, ...]
-    swatches: tuple[SwatchRect, ...]
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,8 @@ class PageLayout:
 
     page_mm: tuple[float, float]
     cuts_mm: tuple[RectMm, ...] = ()  # dashed lines, one for each piece
-    designs_mm: tuple[RectMm, ...] = ()
     markers: tuple[PieceMarker, ...] = ()  # the pieces' first
-    swatches: tuple[SwatchRect, ...] = ()  # the chart's first
+    swatches: tuple[SwatchRect, ...] = ()
     qr_mm: tuple[RectMm, ...] = ()
     ticks: tuple[Line, ...] = ()
     texts: tuple[TextLine, ...] = ()

@@ -25,6 +25,7 @@ Point = tuple[Finite, Finite]
 Rect = tuple[Finite, Finite, Positive, Positive]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
+WHOLE_PIECE = 2  # the design fills the piece; before (1) it lay in a frame of markers and swatches
 PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
 Page = Annotated[int, Field(ge=1)]
 
@@ -136,6 +137,7 @@ class Promise(Strict):
 class Manifest(Strict):
     """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
 
+    version: Annotated[int, Field(ge=1, le=WHOLE_PIECE)] = 1
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
     kind: Annotated[str, Gray]  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
     page_mm: tuple[Positive, Positive]

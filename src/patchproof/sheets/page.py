@@ -16,10 +16,8 @@ from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, PageLayout, Parts, prove_apart, quiet_box, ruler_parts, text_box
 from patchproof.sheets.piece import (
     MODULES,
-    SMALLEST_MARKER_MM,
     Piece,
     black_runs,
-    frame_mm,
     marker_at,
     marker_ids,
     marker_rect,
@@ -44,7 +42,7 @@ def piece_zone_mm(template: Template) -> RectMm:
 
 
 def largest_piece_mm(template: Template) -> tuple[float, float]:
-    """Width and height that a piece may have on this template, for `marker_size_mm`."""
+    """Width and height that a piece may have on this template."""
     _, _, w, h = piece_zone_mm(template)
     if template.tiles is not None:  # as many as marker ids last for, in one row or column; `tiles` counts exactly
         _, _, w, h = (MOST_TILES * side for side in template.tiles.zone_mm)
@@ -71,13 +69,11 @@ def lay_out_parts(
     own = [marker_at(i, at, size) for i, at in zip(ids, template.marker.corners_mm, strict=True)]
     quiet = [quiet_box(marker_rect(m), size / MODULES, template.page_mm, template.margin_mm) for m in own]
     chart = [(rounded(rect), srgb) for rect, srgb in chart_swatches(template.chart)]
-    frames = [(moved(rect, corner), srgb) for piece, corner in placed for rect, srgb in piece.swatches]
     page = PageLayout(
         page_mm=template.page_mm,
         cuts_mm=tuple(rounded((*corner, *piece.size_mm)) for piece, corner in placed),
-        designs_mm=tuple(moved(piece.design_rect_mm, corner) for piece, corner in placed),
         markers=(*(moved_marker(m, corner) for piece, corner in placed for m in piece.markers), *own),
-        swatches=(*chart, *frames),
+        swatches=tuple(chart),
         ticks=more.lines,
         texts=more.texts,
         boxes=(
@@ -157,29 +153,19 @@ def place_pieces(template: Template, pieces: Sequence[Piece]) -> list[tuple[Piec
 def _refuse_larger(template: Template, piece: Piece) -> None:
     widest, highest = largest_piece_mm(template)
     if piece.size_mm[0] > widest + 1e-6 or piece.size_mm[1] > highest + 1e-6:
-        marker = piece.module_mm * MODULES
-        hints = [
-            f"{widest - 2 * frame_mm(size):.0f} × {highest - 2 * frame_mm(size):.0f} mm with {size:.3g} mm markers"
-            for size in sorted({SMALLEST_MARKER_MM, marker}, reverse=True)
-            if min(widest, highest) > 2 * frame_mm(size)
-        ]
         tiled = template_names("tiles")
         raise Refused(
             f"a piece of at most {size_text((widest, highest))} mm on this page",
             f"{size_text(piece.size_mm)} mm",
-            f"choose a larger template, one with tiles ({', '.join(tiled)}), or a design of at most "
-            f"{' or '.join(hints)}",
+            f"choose a larger template, one with tiles ({', '.join(tiled)}), or a smaller patch",
         )
 
 
 def _piece_boxes(piece: Piece, corner: PointMm, number: int) -> list[Box]:
-    """The piece and its parts with half a module of white round each, so that a whole one lies between."""
-    half, name = piece.module_mm / 2, f"piece {number + 1}" if number else "piece"
-    parts = [(f"{name}'s design" if number else "design", piece.design_rect_mm)]
-    parts += [(f"{name} marker {i}", marker_rect(marker)) for i, marker in enumerate(piece.markers, 1)]
-    parts += [(f"{name} swatch {i}", rect) for i, (rect, _) in enumerate(piece.swatches, 1)]
-    cut = Box(name, grown((*corner, *piece.size_mm), CUT_LINE_MM))
-    return [cut, *(Box(part, grown(moved(rect, corner), half), name) for part, rect in parts)]
+    """The piece, and in it its markers with their quiet zones."""
+    name = f"piece {number + 1}" if number else "piece"
+    markers = [Box(f"{name} marker {i}", moved(rect, corner), name) for i, rect in enumerate(piece.reserved_mm, 1)]
+    return [Box(name, grown((*corner, *piece.size_mm), CUT_LINE_MM)), *markers]
 
 
 def _filled(line: TextLine, words: dict[str, str]) -> TextLine:

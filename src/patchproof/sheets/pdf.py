@@ -100,7 +100,7 @@ def _draw(canvas: Canvas, page: Printed) -> None:
         path = canvas.beginPath()
         path.rect(x, height - y - h, w, h)
         canvas.clipPath(path, stroke=0, fill=0)
-        _draw_parts(canvas, page.windowed, layout.window.swatches, layout.window.markers, height)
+        _draw_parts(canvas, page.windowed, (), layout.window.markers, height)
         canvas.restoreState()
     canvas.setStrokeGray(0)
     for line in layout.ticks:

@@ -1,13 +1,13 @@
-"""The piece that is cut out and put on the object: the design in the middle of a frame of markers and swatches.
+"""The piece that is cut out and put on the object: the design all over it, but for the markers.
 
-Millimeters from the top-left corner of the cut line, x right, y down. From the design outwards the frame is one
-module of white (the markers' quiet zone), the markers (7 modules), one module of white, and 2 mm for the scissors.
-Markers sit in the four corners and, where a side is long enough, in its middle, so that a hidden corner costs
-nothing. Between them lie up to twelve swatches, so that color is measured on the object too. Everything in the frame
-is an axis-aligned rectangle, hence `frame_image` can be exact: each pixel has the mean *light* of what covers it.
+Millimeters from the top-left corner of the cut line, x right, y down. A marker is 7 modules wide, with a module of
+white round it (its quiet zone), and lies a millimeter inside the cut line, for the scissors. Markers sit in the four
+corners and, on a piece that bends or is long, along its sides. What belongs to a marker is white or black whatever the
+design has there: `marker_image` says which of a design's pixels that are, and what they look like. It is exact, since
+all is axis-aligned rectangles: each pixel has the mean *light* of what covers it.
 
 Ids and the sheet's name come from SHA-256 alone: they stay the same on every machine and in every version. The sheet
-id is fixed before optimizing and never taken from the design, because the frame is rendered with its marker ids.
+id is fixed before optimizing and never taken from the design, because the piece is rendered with its marker ids.
 """
 
 from __future__ import annotations
@@ -24,15 +24,17 @@ import numpy as np
 from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.settings import identifying
 from patchproof.sheets.manifest import Marker
-from patchproof.sheets.rects import PointMm, RectMm, SwatchRect
-from patchproof.sheets.swatches import frame_swatches
+from patchproof.sheets.rects import PointMm, RectMm, grown
 from patchproof.strict import Refused, Strict, nearest
 
 DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
 MODULES = 7  # a 5×5 code and its black border
-SCISSORS_MM = 2.0
+SCISSORS_MM = 1.0
 SMALLEST_MARKER_MM = 8.0
+LARGEST_CORNER = 0.29  # of the piece's shorter side, white and all: four leave two thirds of a square to the design
+LONGEST_GAP = 12.0  # markers between two of a long side; on bent paper a side has one in its middle
+SLIVER_MM = 2.0  # between a quiet zone and the cut line; narrower ones are white, too
 CELLS = 16  # of the noise and shuffled controls, along the shorter side
 
 
@@ -49,23 +51,18 @@ class Piece:
     """Geometry of a piece; `size_mm` is the cut line, corner markers come first (clockwise from the top-left)."""
 
     size_mm: tuple[float, float]
-    design_rect_mm: RectMm
     markers: tuple[PieceMarker, ...]
-    swatches: tuple[SwatchRect, ...]
     module_mm: float
 
+    @property
+    def marker_mm(self) -> float:
+        """Side of a marker's black square."""
+        return self.module_mm * MODULES
 
-@dataclass(frozen=True)
-class FrameImage:
-    """A raster of the whole piece on the design's pixel grid.
-
-    The design's texels are the pixels of `design_box_px` (x0, y0, width, height); the cut line falls on `piece_box_px`
-    (x0, y0, x1, y1), in general between pixels. Beyond it the paper goes on white.
-    """
-
-    srgb: np.ndarray  # float32 H×W×3
-    design_box_px: tuple[int, int, int, int]
-    piece_box_px: tuple[float, float, float, float]
+    @property
+    def reserved_mm(self) -> tuple[RectMm, ...]:
+        """What belongs to each marker: its quiet zone, and what slivers it would leave at the cut line."""
+        return tuple(_to_the_cut(grown(marker_rect(m), self.module_mm), self.size_mm) for m in self.markers)
 
 
 def sheet_id(settings: dict[str, Any], seed: int) -> str:
@@ -95,48 +92,53 @@ def hash_order(text: str, count: int) -> tuple[int, ...]:
     return tuple(sorted(range(count), key=lambda i: hashlib.sha256(f"{text}:{i}".encode()).digest()))
 
 
-def frame_mm(marker_mm: float) -> float:
-    """Width of the frame on each side of the design."""
+def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
+    """The marker to print: what is needed (never under 8 mm), else the largest that leaves the design its share, in
+    whole 0.1 mm.
+    """
+    wanted, least = max(needed_mm, SMALLEST_MARKER_MM), _corner_mm(SMALLEST_MARKER_MM) / LARGEST_CORNER
+    if min(piece_mm) < least:
+        raise Refused(
+            f"a piece of at least {math.ceil(least)} mm, beside {SMALLEST_MARKER_MM:g} mm markers",
+            f"{piece_mm[0]:g} × {piece_mm[1]:g} mm",
+            "make the patch larger",
+        )
+    fitting = (LARGEST_CORNER * min(piece_mm) - SCISSORS_MM) * MODULES / (MODULES + 2)
+    return wanted if fitting >= wanted else math.floor(fitting * 10 + 1e-6) / 10
+
+
+def lay_out_piece(
+    piece_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str, bends: bool = False
+) -> Piece:
+    """The piece of that size, with a marker in each corner and as many along its sides as it needs."""
+    module = marker_mm / MODULES
+    edge = SCISSORS_MM + module
+    (left, right), (top, bottom) = ((edge, side - edge - marker_mm) for side in piece_mm)
+    places = [(left, top), (right, top), (right, bottom), (left, bottom)]
+    xs, ys = (_between(edge, side - edge - marker_mm, marker_mm, bends) for side in piece_mm)
+    places += [(x, y) for x in xs for y in (top, bottom)] + [(x, y) for y in ys for x in (right, left)]
+    ids = marker_ids(sheet_id, kind, len(places))
+    markers = tuple(marker_at(id_, place, marker_mm) for id_, place in zip(ids, places, strict=True))
+    return Piece(piece_mm, markers, module)
+
+
+def _between(first: float, last: float, marker_mm: float, bends: bool) -> list[float]:
+    """Where markers begin between a side's two corner markers, evenly apart."""
+    gap = last - first - marker_mm
+    count = max(math.ceil(gap / (LONGEST_GAP * marker_mm)) - 1, 1 if bends and gap >= 3 * marker_mm else 0)
+    return [first + (last - first) * i / (count + 1) for i in range(1, count + 1)]
+
+
+def _corner_mm(marker_mm: float) -> float:
+    """How much of a side a corner marker takes, white and all."""
     return marker_mm * (MODULES + 2) / MODULES + SCISSORS_MM
 
 
-def marker_size_mm(needed_mm: float, design_mm: tuple[float, float], largest_piece_mm: tuple[float, float]) -> float:
-    """The marker to print: what is needed (never under 8 mm), else the largest that fits, in whole 0.1 mm."""
-    wanted = max(needed_mm, SMALLEST_MARKER_MM)
-    room = min(piece - design for piece, design in zip(largest_piece_mm, design_mm, strict=True)) / 2
-    fitting = (room - SCISSORS_MM) * MODULES / (MODULES + 2)
-    if fitting >= wanted:
-        return wanted
-    fitting = math.floor(fitting * 10 + 1e-6) / 10
-    if fitting < SMALLEST_MARKER_MM:
-        widest, highest = (side - 2 * frame_mm(SMALLEST_MARKER_MM) for side in largest_piece_mm)
-        raise Refused(
-            f"a design of at most {widest:.0f} × {highest:.0f} mm, beside {SMALLEST_MARKER_MM:g} mm markers",
-            f"{design_mm[0]:g} × {design_mm[1]:g} mm",
-            "make the patch smaller or choose a larger template",
-        )
-    return fitting
-
-
-def lay_out_piece(design_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str) -> Piece:
-    """The piece round a design of that size.
-
-    A side as long as a marker gets one in its middle; swatches, four millimeters or larger, get what is left.
-    """
-    module, frame = marker_mm / MODULES, frame_mm(marker_mm)
-    (w, h), edge = design_mm, SCISSORS_MM + module
-    size = (w + 2 * frame, h + 2 * frame)
-    right, bottom = size[0] - edge - marker_mm, size[1] - edge - marker_mm
-    middle_x, middle_y = (size[0] - marker_mm) / 2, (size[1] - marker_mm) / 2
-    places = [(edge, edge), (right, edge), (right, bottom), (edge, bottom)]
-    if w >= marker_mm:
-        places += [(middle_x, edge), (middle_x, bottom)]
-    if h >= marker_mm:
-        places += [(right, middle_y), (edge, middle_y)]
-    ids = marker_ids(sheet_id, kind, len(places))
-    markers = tuple(marker_at(id_, place, marker_mm) for id_, place in zip(ids, places, strict=True))
-    swatches = frame_swatches(size, edge, marker_mm, module, (w >= marker_mm, h >= marker_mm))
-    return Piece(size, (frame, frame, w, h), markers, swatches, module)
+def _to_the_cut(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
+    x0, y0, x1, y1 = rect[0], rect[1], rect[0] + rect[2], rect[1] + rect[3]
+    low = [0.0 if v <= SLIVER_MM + 1e-6 else v for v in (x0, y0)]
+    high = [side if side - v <= SLIVER_MM + 1e-6 else v for v, side in zip((x1, y1), size_mm, strict=True)]
+    return low[0], low[1], high[0] - low[0], high[1] - low[1]
 
 
 def with_ids(piece: Piece, sheet_id: str, kind: str) -> Piece:
@@ -186,49 +188,52 @@ def black_runs(dark: np.ndarray, corner_mm: PointMm, module_mm: float) -> list[R
     ]
 
 
-def frame_image(piece: Piece, design_px: tuple[int, int]) -> FrameImage:
-    """The piece without its design (0.5 gray there) on the pixel grid of a design of (width, height) pixels.
+def marker_image(piece: Piece, design_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """What a design of (width, height) pixels must leave to the markers, float32 sRGB H×W×3 (white elsewhere), and
+    which pixels that are, bool H×W: all that touch what is reserved, so that quiet zones are a module wide at least.
 
-    A pixel is the mean light of what covers it, in sRGB code values: a box filter without error, since the frame
+    A pixel is the mean light of what covers it, in sRGB code values: a box filter without error, since a marker
     consists of disjoint rectangles alone.
     """
-    design = np.array(piece.design_rect_mm)
-    scale = np.array(design_px) / design[2:]  # px per mm, along x and y
-    before = design[:2] * scale
-    origin = np.ceil(before - 1e-9)  # whole pixels left of and above the design
-    cut = np.concatenate([origin - before, origin - before + np.array(piece.size_mm) * scale])
-    width, height = (int(v) for v in np.ceil(cut[2:] - 1e-9))
-    linear = np.ones((height, width, 3))
-    black = [(rect, (0.0, 0.0, 0.0)) for marker in piece.markers for rect in marker_rects_mm(marker)]
-    for rect, srgb in [*black, *piece.swatches]:
-        x0, y0 = cut[:2] + np.array(rect[:2]) * scale
-        x1, y1 = np.array([x0, y0]) + np.array(rect[2:]) * scale
-        _cover(linear, (x0, y0, x1, y1), linear_from_srgb(np.array(srgb)))
-    image = srgb_from_linear(np.clip(linear, 0, 1)).astype(np.float32)
-    (x, y), (w, h) = origin.astype(int), design_px
-    image[y : y + h, x : x + w] = 0.5
-    x0, y0, x1, y1 = map(float, cut)
-    return FrameImage(image, (int(x), int(y), w, h), (x0, y0, x1, y1))
+    (width, height), scale = design_px, np.array(design_px) / piece.size_mm  # px per mm, along x and y
+    coverage, reserved = np.zeros((height, width)), np.zeros((height, width), bool)
+    for marker in piece.markers:
+        for x, y, w, h in marker_rects_mm(marker):
+            _cover(coverage, (x * scale[0], y * scale[1], (x + w) * scale[0], (y + h) * scale[1]))
+    for x, y, w, h in piece.reserved_mm:
+        x0, y0 = (max(math.floor(v * s + 1e-6), 0) for v, s in zip((x, y), scale, strict=True))
+        x1, y1 = (math.ceil(v * s - 1e-6) for v, s in zip((x + w, y + h), scale, strict=True))
+        reserved[y0:y1, x0:x1] = True
+    gray = srgb_from_linear(np.clip(1 - coverage, 0, 1)).astype(np.float32)
+    return np.repeat(gray[..., None], 3, 2), reserved
 
 
-def control_design(kind: str, design: np.ndarray, sheet_id: str) -> np.ndarray:
-    """What a control sheet prints in place of a uint8 H×W×3 design, in as many pixels.
+def on_paper(design: np.ndarray, piece: Piece) -> np.ndarray:
+    """A uint8 H×W×3 design as it goes to the printer: white where the markers' own pixels are."""
+    _, reserved = marker_image(piece, (design.shape[1], design.shape[0]))
+    return np.where(reserved[..., None], np.uint8(255), design)
+
+
+def control_design(kind: str, design: np.ndarray, sheet_id: str, piece: Piece | None = None) -> np.ndarray:
+    """What a control sheet prints in place of a uint8 H×W×3 design, in as many pixels; those of a piece's markers are
+    white.
 
     "mean": its mean color, averaged in light; "gray": sRGB 128; "noise": random cells, 16 along the shorter side;
-    "shuffled": the design's own 16 × 16 cells in another order (pixels left over at the right and bottom stay);
-    "blank": white paper; "design": the design.
+    "shuffled": the design's own 16 × 16 cells in another order (those with a marker's pixel stay, as do pixels left
+    over at the right and bottom); "blank": white paper; "design": the design.
     """
     height, width = design.shape[:2]
+    free = np.ones((height, width), bool) if piece is None else ~marker_image(piece, (width, height))[1]
     if _known(kind) == "mean":
-        mean = linear_from_srgb(design.reshape(-1, 3) / 255).mean(0)
-        return np.broadcast_to(codes_of(srgb_from_linear(mean)), design.shape).copy()
-    if kind == "noise":
-        return _noise(height, width, sheet_id)
-    if kind == "shuffled":
-        return _shuffled(design, sheet_id)
-    if kind == "design":
-        return design.copy()
-    return np.full_like(design, 128 if kind == "gray" else 255)
+        mean = linear_from_srgb(design[free] / 255).mean(0)
+        control = np.broadcast_to(codes_of(srgb_from_linear(mean)), design.shape)
+    elif kind == "noise":
+        control = _noise(height, width, sheet_id)
+    elif kind == "shuffled":
+        control = _shuffled(design, free, sheet_id)
+    else:
+        control = design if kind == "design" else np.full_like(design, 128 if kind == "gray" else 255)
+    return np.where(free[..., None], control, np.uint8(255))
 
 
 def _known(kind: str) -> str:
@@ -247,16 +252,18 @@ def _noise(height: int, width: int, sheet_id: str) -> np.ndarray:
     return cells[y[:, None], x]
 
 
-def _shuffled(design: np.ndarray, sheet_id: str) -> np.ndarray:
+def _shuffled(design: np.ndarray, free: np.ndarray, sheet_id: str) -> np.ndarray:
     height, width = design.shape[:2]
     rows, columns = min(CELLS, height), min(CELLS, width)
     h, w = height // rows, width // columns
-    cells = design[: rows * h, : columns * w].reshape(rows, h, columns, w, 3).swapaxes(1, 2).reshape(-1, h, w, 3)
-    cells = cells[list(hash_order(f"{sheet_id}:shuffled", len(cells)))]
-    result = design.copy()
-    result[: rows * h, : columns * w] = (
-        cells.reshape(rows, columns, h, w, 3).swapaxes(1, 2).reshape(rows * h, columns * w, 3)
-    )
+
+    def cells(image: np.ndarray) -> np.ndarray:
+        """A view: rows × columns × h × w (× 3)."""
+        return image[: rows * h, : columns * w].reshape(rows, h, columns, w, *image.shape[2:]).swapaxes(1, 2)
+
+    result, moving = design.copy(), np.argwhere(cells(free).all((2, 3)))
+    order = moving[list(hash_order(f"{sheet_id}:shuffled", len(moving)))]
+    cells(result)[tuple(moving.T)] = cells(design)[tuple(order.T)]
     return result
 
 
@@ -269,12 +276,11 @@ def _marker_modules(id_: int) -> np.ndarray:
     return cv2.aruco.generateImageMarker(dictionary, id_, MODULES) == 0
 
 
-def _cover(linear: np.ndarray, box: tuple[float, float, float, float], color: np.ndarray) -> None:
-    """Put a rectangle on white: each pixel goes towards `color` by the share of it that lies inside, in place."""
+def _cover(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None:
+    """Add a rectangle in pixels: each pixel gets the share of it that lies inside, in place."""
     x0, y0, x1, y1 = box
-    columns = np.arange(max(math.floor(x0), 0), min(math.ceil(x1), linear.shape[1]))
-    rows = np.arange(max(math.floor(y0), 0), min(math.ceil(y1), linear.shape[0]))
+    columns = np.arange(max(math.floor(x0), 0), min(math.ceil(x1), coverage.shape[1]))
+    rows = np.arange(max(math.floor(y0), 0), min(math.ceil(y1), coverage.shape[0]))
     in_x = np.clip(np.minimum(columns + 1, x1) - np.maximum(columns, x0), 0, 1)
     in_y = np.clip(np.minimum(rows + 1, y1) - np.maximum(rows, y0), 0, 1)
-    share = (in_y[:, None] * in_x)[:, :, None]
-    linear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += share * (color - 1)
+    coverage[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += in_y[:, None] * in_x

@@ -2,7 +2,7 @@
 
 In: what `write_sheet` takes, once for each design. Out: SHEET.pdf and SHEET_1.json, SHEET_2.json... in the order of the
 designs, all of which the PDF carries. The page has an id of its own and one code for all of them: a code that lists
-three designs or more is too fine to be read at 150 dpi. Frames keep the marker ids that they were promised with. Ids
+three designs or more is too fine to be read at 150 dpi. Pieces keep the marker ids that they were promised with. Ids
 come from 1000 by hash, so two sheets may share one; the page's own markers avoid all of them, and in a design's
 manifest the others' markers stand among the page's where nothing else has their id, so that a photograph of the uncut
 page is known as one.
@@ -23,7 +23,7 @@ from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.page import lay_out_parts, place_pieces
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import hash_order, moved_marker, sheet_id
-from patchproof.sheets.rects import PointMm, moved, size_text
+from patchproof.sheets.rects import PointMm, size_text
 from patchproof.sheets.template import Template
 from patchproof.sheets.write import manifest_paths, pdf_name, save_sheets
 from patchproof.strict import Refused
@@ -44,7 +44,7 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[Pr
     code = _page_code(identity, designs)
     page = lay_out_parts(template, placed, _page_ids(designs, template), code, _words(identity, designs))
     manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
-    pictures = [design.pictures(rect) for rect, design in zip(page.designs_mm, designs, strict=True)]
+    pictures = [design.pictures(rect) for rect, design in zip(page.cuts_mm, designs, strict=True)]
     paths = manifest_paths(pdf_path, len(designs))
     save_sheets(pdf_path, [Printed(page, tuple(chain(*pictures)))], dict(zip(paths, manifests, strict=True)))
     return manifests
@@ -67,7 +67,7 @@ def _words(identity: str, designs: Sequence[PrintedPiece]) -> dict[str, str]:
     return {
         "sheet_id": identity,
         "kind": f"{len(designs)} designs,",
-        "design": " and ".join(sorted({size_text(design.piece.design_rect_mm[2:]) for design in designs})),
+        "design": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
         "piece": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
     }
 
@@ -79,7 +79,5 @@ def _manifest(
     own = [moved_marker(marker, corner) for marker in design.piece.markers]
     counts = Counter(marker.id for marker in page.markers)
     others = [marker for marker in page.markers if counts[marker.id] == 1 and marker not in own]
-    frame = [(moved(rect, corner), srgb) for rect, srgb in design.piece.swatches]
-    chart = page.swatches[: template.chart.columns * template.chart.rows]
-    own_page = replace(page, markers=(*own, *others), swatches=(*chart, *frame))
-    return design.manifest(own_page, template, page.cuts_mm[index], page.designs_mm[index]).changed(page_code=code)
+    own_page = replace(page, markers=(*own, *others))
+    return design.manifest(own_page, template, page.cuts_mm[index]).changed(page_code=code)

@@ -61,8 +61,8 @@ class PageMarkers(Strict):
 class BlankPiece(Strict):
     """The piece of a page that is printed without a design, before there is a scene."""
 
-    design_mm: tuple[Positive, Positive]  # of the design that will take its place
-    marker_mm: Annotated[Positive, Field(ge=8)]  # of the frame; smaller ones are lost in photographs
+    piece_mm: tuple[Positive, Positive]  # width and height, as of the design that will take its place
+    marker_mm: Annotated[Positive, Field(ge=8)]  # smaller ones are lost in photographs
 
 
 class TileGrid(Strict):

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.manifest import Manifest, Swatch, Tile
+from patchproof.sheets.manifest import Manifest, Tile
 from patchproof.sheets.page import lay_out_parts, piece_zone_mm
 from patchproof.sheets.pdf import Printed
-from patchproof.sheets.piece import Piece, marker_ids, printed
+from patchproof.sheets.piece import marker_ids, printed
 from patchproof.sheets.rects import moved
 from patchproof.sheets.template import Template, TileGrid
-from patchproof.sheets.tiles import MARKERS, TilePlan, lay_out_tile, own_markers, own_swatches, plan_tiles, tile_map
+from patchproof.sheets.tiles import MARKERS, TilePlan, lay_out_tile, own_markers, plan_tiles, tile_map
 
 FIRST_TILE_PAGE = 2
 
@@ -35,20 +35,16 @@ def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tup
         for i, tile in enumerate(tiles)
     ]
     pages = [Printed(first, tuple((rect, _pale(design)) for rect, design in content.pictures(small)))]
-    pages += [Printed(page, windowed=content.pictures(page.designs_mm[0])) for page in layouts]
+    whole = [moved((0.0, 0.0, *piece.size_mm), tile.page_from_piece_mm) for tile in tiles]
+    pages += [Printed(page, windowed=content.pictures(rect)) for page, rect in zip(layouts, whole, strict=True)]
     numbered = list(enumerate(tiles, FIRST_TILE_PAGE))
     markers = [printed(marker, number) for number, tile in numbered for marker in own_markers(tile, piece)]
     markers += [printed(marker) for marker in first.markers]
     markers += [
         printed(marker, number) for number, page in enumerate(layouts, FIRST_TILE_PAGE) for marker in page.markers
     ]
-    swatches = [(swatch, 1) for swatch in first.swatches]
-    swatches += [(swatch, number) for number, tile in numbered for swatch in own_swatches(tile, piece)]
-    cut_mm = moved((0.0, 0.0, *piece.size_mm), tiles[0].page_from_piece_mm)
-    manifest = content.manifest(first, template, cut_mm, layouts[0].designs_mm[0], FIRST_TILE_PAGE).changed(
-        markers=tuple(markers),
-        chart=tuple(Swatch(rect_mm=rect, srgb=srgb, page=number) for (rect, srgb), number in swatches),
-        tiles=tuple(_tile(tile, piece, number) for number, tile in numbered),
+    manifest = content.manifest(first, template, whole[0], FIRST_TILE_PAGE).changed(
+        markers=tuple(markers), tiles=tuple(_tile(tile, number) for number, tile in numbered)
     )
     return pages, manifest
 
@@ -58,6 +54,6 @@ def _pale(design: np.ndarray) -> np.ndarray:
     return (255 - (255 - design.astype(int)) // 3).astype(np.uint8)
 
 
-def _tile(tile: TilePlan, piece: Piece, page: int) -> Tile:
-    dx, dy, *_ = moved(piece.design_rect_mm, tile.page_from_piece_mm)
+def _tile(tile: TilePlan, page: int) -> Tile:
+    dx, dy = (round(by, 6) for by in tile.page_from_piece_mm)
     return Tile(page=page, page_from_design_mm=((1.0, 0.0, dx), (0.0, 1.0, dy)), cut_mm=tile.page_rect_mm)

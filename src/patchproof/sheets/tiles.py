@@ -4,8 +4,8 @@ In: a template with a [tiles] table and a piece. Out: `Tile`s (which part of the
 page layouts. A tile shows its part of the piece; to the right and below, where another tile follows, a flap of 10 mm
 goes on: the piece's picture for one more millimeter, so that no gap shows where scissors slip, then white paper with a
 marker that the next tile will hide. Each tile has five markers of its own, in flaps and trimmed margins, which tell its
-scan or photograph from any other's; when all is glued, the piece's own frame alone is left to be seen.
-Seams are as even as they can be without cutting through a marker of the frame (nor, where there is room, a swatch).
+scan or photograph from any other's; when all is glued, the piece's own markers alone are left to be seen.
+Seams are as even as they can be without cutting through a marker of the piece.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from itertools import pairwise
 
 from patchproof.sheets.fonts import text_width_mm
 from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
-from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES
+from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES, place_pieces
 from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, marker_rect, moved_marker
-from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet, moved, size_text
+from patchproof.sheets.rects import PointMm, RectMm, grown, meet, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
 from patchproof.strict import Refused
 
@@ -72,6 +72,14 @@ def plan_tiles(grid: TileGrid, piece: Piece) -> list[TilePlan]:
     ]
 
 
+def refuse_larger_than_page(template: Template, piece: Piece) -> None:
+    """Refuse a piece of which no sheet could be made."""
+    if template.tiles is None:
+        place_pieces(template, [piece])
+    else:
+        plan_tiles(template.tiles, piece)
+
+
 def lay_out_tile(
     template: Template, grid: TileGrid, piece: Piece, tile: TilePlan, ids: Sequence[int], sheet_id: str
 ) -> PageLayout:
@@ -85,7 +93,6 @@ def lay_out_tile(
     texts = _words(template, grid, tile, sheet_id)
     boxes = [Box(f"tile marker {i}", rect) for i, rect in enumerate(quiet, 1)] + [text_box(line) for line in texts]
     markers = [moved_marker(marker, by) for marker in piece.markers]
-    swatches = [(moved(rect, by), srgb) for rect, srgb in piece.swatches]
     boxes = (
         Box("tile", grown(cut, CUT_LINE_MM)),
         Box("its picture", window, "tile"),
@@ -95,15 +102,10 @@ def lay_out_tile(
     return PageLayout(
         page_mm=page_mm,
         cuts_mm=(cut,),
-        designs_mm=(moved(piece.design_rect_mm, by),),
         markers=tuple(own),
         texts=tuple(texts),
         boxes=boxes,
-        window=Window(
-            window,
-            tuple(marker for marker in markers if meet(grown(window, 1e-6), marker_rect(marker))),
-            tuple((rect, srgb) for rect, srgb in swatches if meet(window, rect)),
-        ),
+        window=Window(window, tuple(m for m in markers if meet(grown(window, 1e-6), marker_rect(m)))),
     )
 
 
@@ -114,7 +116,7 @@ def _extended(tile: TilePlan, by_mm: float) -> RectMm:
 
 
 def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[Parts, RectMm]:
-    """The assembled piece drawn small in a zone: outline, seams and names, and where the design's picture goes."""
+    """The assembled piece drawn small in a zone: outline, seams and names, and where its picture goes."""
     x, y, w, h = grown(zone_mm, -6.0)
     scale = min(w / piece.size_mm[0], h / piece.size_mm[1])
     x, y = x + (w - scale * piece.size_mm[0]) / 2, y + (h - scale * piece.size_mm[1]) / 2
@@ -132,8 +134,8 @@ def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[
         size = min(6.0, height / 3, width / 3)
         at = (left + (width - text_width_mm(tile.name, size, True)) / 2, top + height / 2 + size / 3)
         texts.append(TextLine(at_mm=at, size_mm=size, text=tile.name, bold=True))
-    design = small(piece.design_rect_mm)
-    return Parts(tuple(lines), tuple(texts), (Box("plan of the tiles", small((0, 0, *piece.size_mm))),)), design
+    whole = small((0, 0, *piece.size_mm))
+    return Parts(tuple(lines), tuple(texts), (Box("plan of the tiles", whole),)), whole
 
 
 def own_markers(tile: TilePlan, piece: Piece) -> list[PieceMarker]:
@@ -144,36 +146,24 @@ def own_markers(tile: TilePlan, piece: Piece) -> list[PieceMarker]:
     return [m for m, (mx, my) in zip(markers, middles, strict=True) if x <= mx < x + w and y <= my < y + h]
 
 
-def own_swatches(tile: TilePlan, piece: Piece) -> list[SwatchRect]:
-    """The piece's swatches that lie wholly on the tile, in page millimeters."""
-    rects = [(moved(rect, tile.page_from_piece_mm), srgb) for rect, srgb in piece.swatches]
-    return [(rect, srgb) for rect, srgb in rects if holds(tile.page_rect_mm, rect, 1e-6)]
-
-
 def _seams(piece: Piece, axis: int, most_mm: float) -> list[float]:
     """0, the seams along an axis, and the piece's end."""
     length = round(piece.size_mm[axis], 6)
-    markers = [_span(marker_rect(m), axis, piece.module_mm) for m in piece.markers]
-    swatches = [_span(rect, axis, 0.0) for rect, _ in piece.swatches]
+    blocked = [(rect[axis], rect[axis] + rect[axis + 2]) for rect in piece.reserved_mm]
     fewest = max(math.ceil(length / most_mm - 1e-9), 1)
     for count in range(fewest, fewest + 3):
-        for blocked in (markers + swatches, markers):
-            seams = [0.0, *(_free(length * i / count, blocked) for i in range(1, count)), length]
-            if all(0 < b - a <= most_mm + 1e-6 for a, b in pairwise(seams)):
-                return seams
+        seams = [0.0, *(_free(length * i / count, blocked) for i in range(1, count)), length]
+        if all(0 < b - a <= most_mm + 1e-6 for a, b in pairwise(seams)):
+            return seams
     raise Refused(
         "a piece that can be cut into tiles without cutting a marker",
-        f"markers of {piece.module_mm * MODULES:.0f} mm on tiles of {most_mm:.0f} mm",
+        f"markers of {piece.marker_mm:.0f} mm on tiles of {most_mm:.0f} mm",
         _larger_tiles(),
     )
 
 
 def _larger_tiles() -> str:
     return f"choose a template with larger tiles (of {', '.join(template_names('tiles'))})"
-
-
-def _span(rect: RectMm, axis: int, room: float) -> tuple[float, float]:
-    return rect[axis] - room, rect[axis] + rect[axis + 2] + room
 
 
 def _free(at: float, blocked: list[tuple[float, float]]) -> float:

@@ -20,8 +20,7 @@ from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
 from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
-from patchproof.sheets.rects import RectMm, holds
-from patchproof.sheets.swatches import FRAME_COLORS
+from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardTemplate, Template
 from patchproof.sheets.tile_pages import tile_pages
 from patchproof.strict import Refused, Strict
@@ -37,8 +36,8 @@ def write_sheet(
     pdf_path = pdf_name(pdf_path)
     if template.tiles is None:
         page = lay_out_page(template, content)
-        pages = [Printed(page, content.pictures(page.designs_mm[0]))] * copies
-        manifest = content.manifest(page, template, page.cuts_mm[0], page.designs_mm[0])
+        pages = [Printed(page, content.pictures(page.cuts_mm[0]))] * copies
+        manifest = content.manifest(page, template, page.cuts_mm[0])
     else:
         if copies > 1:
             raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
@@ -105,13 +104,7 @@ def check_sheet(manifest: Manifest) -> list[str]:
             f"Page {manifest.plan_page} is for people, on any paper: where the piece goes and how to photograph it."
         )
     if manifest.design is None:
-        lines.append("The piece carries no design: its middle stays white paper.")
-    frames = {tile.page: tile.cut_mm for tile in manifest.tiles} or {1: manifest.cut_mm}
-    inside = sum(s.page in frames and holds(frames[s.page], s.rect_mm) for s in manifest.chart)
-    if inside < len(FRAME_COLORS):
-        lines.append(
-            f"The frame has room for {inside} of {len(FRAME_COLORS)} swatches, so color on it is measured less well."
-        )
+        lines.append("The piece carries no design: between its markers it stays white paper.")
     return lines
 
 

@@ -138,10 +138,10 @@ def _hung(scene_path: str, seed: int) -> tuple[HungSheet, PatchScene]:
     if not scene.is_flat:
         raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
     piece = scene.piece
-    blank = np.zeros((240, round(240 * piece.design_rect_mm[2] / piece.design_rect_mm[3]), 3), np.uint8)
+    blank = np.zeros((240, round(240 * piece.size_mm[0] / piece.size_mm[1]), 3), np.uint8)
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"
-        noise = control_design("noise", blank, scene.sheet_id)
+        noise = control_design("noise", blank, scene.sheet_id, piece)
         content = PrintedPiece(piece, scene.sheet_id, "design", noise)
         manifest = write_sheet(pdf, load_template(scene.settings.sheet.template), content)
         sent = sent_pixels(pdf, manifest, scene)
