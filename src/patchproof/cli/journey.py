@@ -69,11 +69,16 @@ def optimize(
     overwrite: Overwrite = False,
     device: Device = "cpu",
     seed: Seed = None,
+    require: Annotated[
+        str | None, typer.Option(help='"better" makes a design exit with 1 that is not better than its best control.')
+    ] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.run import optimize_scene
     from patchproof.report.summary import promise_lines
 
+    if require not in (None, "better"):
+        raise typer.BadParameter('takes "better" only', param_hint="--require")
     with progress() as bar:
         run = optimize_scene(
             scene,
@@ -87,6 +92,7 @@ def optimize(
             on_promise=lambda done, total: bar("promise", done, total),
         )
     say(*promise_lines(run.promise), f"run: {out}")
+    raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
 
 
 def evaluate(
@@ -148,6 +154,7 @@ def sheet(
     else:
         manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=control)
     for manifest, path in zip(manifests, paths, strict=True):
+        say(*([] if manifest.promise is None else [manifest.promise.headline]))
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
         lines = (line for manifest in manifests for line in check_sheet(manifest))

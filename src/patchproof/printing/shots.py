@@ -37,7 +37,7 @@ class ShotPlan:
 def plan_shots(promise: Promise) -> ShotPlan:
     """The counts for a promise; the control that is hardest to beat decides."""
     sign = promise.target.goal.sign
-    best = max(promise.controls, key=lambda name: sign * promise.controls[name].rate)
+    best = promise.best_control
     rates = (promise.rate, promise.controls[best].rate)
     better, worse = rates[::sign]
     return ShotPlan(

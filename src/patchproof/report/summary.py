@@ -15,6 +15,7 @@ def promise_lines(promise: Any) -> list[str]:
     low, high = promise.interval
     target = promise.target
     lines = [
+        promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
         f"[{low:.1%}, {high:.1%}] by {promise.models[0].name}"
     ]

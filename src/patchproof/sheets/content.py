@@ -50,8 +50,10 @@ class PrintedPiece:
     @property
     def words(self) -> dict[str, str]:
         """What a template's words stand for on its page."""
-        size = size_text(self.piece.size_mm)
-        return {"sheet_id": self.sheet_id, "kind": self.kind, "design": size, "piece": size}
+        size, kind = size_text(self.piece.size_mm), self.kind
+        if self.promise is not None and self.promise.worth != "better":
+            kind = f"{kind}, {self.promise.worth} than {self.promise.best_control}"
+        return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size}
 
     def pictures(self, rect_mm: RectMm) -> tuple[tuple[RectMm, np.ndarray], ...]:
         """The design in that rectangle, or nothing."""

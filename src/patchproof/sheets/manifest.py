@@ -12,7 +12,7 @@ import hashlib
 import io
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -26,6 +26,7 @@ Rect = tuple[Finite, Finite, Positive, Positive]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
 WHOLE_PIECE = 2  # the design fills the piece; before (1) it lay in a frame of markers and swatches
+Worth = Literal["better", "no better", "worse"]
 PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
 Page = Annotated[int, Field(ge=1)]
 
@@ -132,6 +133,28 @@ class Promise(Strict):
     n: Annotated[int, Field(ge=1)]
     controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
+
+    @property
+    def best_control(self) -> str:
+        """The control that is hardest to beat."""
+        return max(self.controls, key=lambda name: self.target.goal.sign * self.controls[name].rate)
+
+    @property
+    def worth(self) -> Worth:
+        """The design beside its best control: "better" or "worse" where the interval of their difference says so."""
+        ends = [self.target.goal.sign * end for end in self.controls[self.best_control].difference_interval]
+        return "better" if min(ends) > 0 else "worse" if max(ends) < 0 else "no better"
+
+    @property
+    def headline(self) -> str:
+        """What the design is worth, in a sentence."""
+        control = self.controls[self.best_control]
+        low, high = (100 * end for end in control.difference_interval)
+        advice = "" if self.worth == "better" else " Try another place, size or seed before printing it."
+        return (
+            f"{self.worth} than its best control ({self.best_control}): {self.rate:.1%} beside {control.rate:.1%} "
+            f"recognized, {100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}].{advice}"
+        )
 
 
 class Manifest(Strict):
