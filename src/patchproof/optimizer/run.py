@@ -107,6 +107,7 @@ def load_run(folder: str | Path) -> Run:
         details = json.loads((folder / _RUN).read_text(encoding="utf-8"))
         settings = validated(SceneSettings, details["settings"], str(folder / _RUN))
         promise = validated(Promise, details["promise"], str(folder / _RUN))
+        _refuse_framed(settings, details["placement"], folder)
         base, seed = folder / details["scene_folder"], details["seed"]
         glb = (folder / _GIVEN).read_bytes() if (folder / _GIVEN).is_file() else None
         scene = build_scene(settings, base.resolve(), seed, details["sheet_id"], glb)
@@ -116,6 +117,17 @@ def load_run(folder: str | Path) -> Run:
             raise
         raise Refused("a finished run", f"{folder} that cannot be read ({error})", "optimize again") from error
     return Run(folder, scene, design, promise, details)
+
+
+def _refuse_framed(settings: SceneSettings, placement: dict[str, Any] | None, folder: Path) -> None:
+    """Refuse a run from when a patch's size was that of the design inside a frame of markers."""
+    width_mm = settings.patch.width_mm
+    if placement is not None and width_mm is not None and abs(placement["piece_mm"][0] - width_mm) > 0.01:
+        raise Refused(
+            "a run whose design fills its piece",
+            f"one from before in {folder}, with a frame round its {width_mm:g} mm",
+            f"verify its sheets, but optimize again, with the whole piece's width_mm = {placement['piece_mm'][0]:.4g}",
+        )
 
 
 def _design(scene: Scene, folder: Path) -> np.ndarray:

@@ -164,8 +164,9 @@ def _refuse_larger(template: Template, piece: Piece) -> None:
 def _piece_boxes(piece: Piece, corner: PointMm, number: int) -> list[Box]:
     """The piece, and in it its markers with their quiet zones."""
     name = f"piece {number + 1}" if number else "piece"
-    markers = [Box(f"{name} marker {i}", moved(rect, corner), name) for i, rect in enumerate(piece.reserved_mm, 1)]
-    return [Box(name, grown((*corner, *piece.size_mm), CUT_LINE_MM)), *markers]
+    quiet = [grown(moved(marker_rect(marker), corner), piece.module_mm) for marker in piece.markers]
+    cut = Box(name, grown((*corner, *piece.size_mm), CUT_LINE_MM))
+    return [cut, *(Box(f"{name} marker {i}", rect, name) for i, rect in enumerate(quiet, 1))]
 
 
 def _filled(line: TextLine, words: dict[str, str]) -> TextLine:

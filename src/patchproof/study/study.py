@@ -38,6 +38,7 @@ STUDIES: dict[str, str] = {
     "envelope": "patchproof.validation.envelope.sweeps",
     "gamut": "patchproof.validation.gamut",
     "harden": "patchproof.harden.folder",
+    "layouts": "patchproof.validation.layouts",
     "ledger": "patchproof.validation.ledger_trials",
     "mining": "patchproof.experiments.mining",
     "patch2d": "patchproof.experiments.patch2d",
