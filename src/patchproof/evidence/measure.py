@@ -27,7 +27,7 @@ from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, blur_px, frame_light
 from patchproof.photo.ratio import x_over_y
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
-from patchproof.photo.unroll import LEAST_MARKERS, Unrolled, unroll
+from patchproof.photo.unroll import Unrolled, unroll
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighboring cells melt together
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
@@ -35,6 +35,7 @@ MOST_TILT_DEG = 78.0  # foreshortened to a fifth
 MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
 MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
+_LEAST_AGREEING = 3  # markers: each has a slope of its own, so that three do not fit a plane where paper is bent
 MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
 _SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
@@ -42,8 +43,8 @@ MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
 _COME_CLOSER = "come closer or use the camera's full resolution"
-_FEW = "show more of the frame: its markers fix where the patch lies"
-_FEW_AGREE = "too few markers agree to tell flat paper from bent: show all of the frame"
+_FEW = "show more of the piece: its markers fix where it lies"
+_FEW_AGREE = "too few markers agree to tell flat paper from bent: show all of the piece"
 _BENT = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
 
 
@@ -224,7 +225,7 @@ def _trouble(geometry: Geometry, fit: PageFit, detected: MarkersInView, surface:
     most_blur = MOST_BLUR * float(np.median([b.module_px for b in detected.markers.values()]))
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
     agreeing, markers = len(fit.inlier_ids), len(detected.markers)
-    least = min(LEAST_MARKERS, len(surface.piece_ids) or 1)
+    least = min(_LEAST_AGREEING, len(surface.piece_ids) or 1)
     bent = residual > most_residual or agreeing < 0.5 * markers
     most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
     uncertain = uncertainty > most_uncertain

@@ -2,7 +2,8 @@
 
 In: corners in pixels and in page millimeters, by marker id. Out: `PageFit`. Least median of squares finds the corners
 that agree (it breaks down when half of them lie), Gauss-Newton on the reprojection error of those gives the
-homography and its covariance. The uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn
+homography and its covariance. Blur and sharpening make all markers of a photograph a little larger or smaller; that is
+no noise, so where there are three or more, what their corners lie too far out on average is taken off first. The uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn
 from that covariance. Few corners say little of their own noise, so what is made of it is wider (Student's t); a single
 marker fits any noise exactly, and gets a wide guess. Left out on purpose: lens terms. A lens that bends shows as
 residual, and residual widens the uncertainty.
@@ -47,6 +48,9 @@ def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.n
     homography = fit_homography(mm[keep], px[keep])
     for _ in range(3):
         homography = _gauss_newton(homography, mm[keep], px[keep])
+        if len(ids) > 2:
+            px = px - _swelling(homography, mm, px, keep)
+            homography = _gauss_newton(homography, mm[keep], px[keep])
         error = np.linalg.norm(apply_homography(homography, mm) - px, axis=1)
         again = error < np.maximum(4 * np.sqrt(np.mean(error[keep] ** 2)), 0.5)
         if len(ids) < 3 or (again == keep).all():
@@ -163,6 +167,14 @@ def _agreeing(mm, px) -> np.ndarray:
     return keep if keep.sum() >= 8 else np.ones(len(px), bool)
 
 
+def _swelling(homography, mm, px, keep) -> np.ndarray:
+    """N×2: how far all markers' corners, four by four, lie outwards of the homography on average."""
+    outward = px - np.repeat(px.reshape(-1, 4, 2).mean(1), 4, 0)
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    residual = ((px - apply_homography(homography, mm)) * outward).sum(1)
+    return outward * residual[keep].mean()
+
+
 def _gauss_newton(homography, mm, px) -> np.ndarray:
     """Homography of least squared reprojection error; four corners are met exactly."""
     for _ in range(10):
@@ -195,7 +207,7 @@ def _mm_from_px(homography, mm) -> np.ndarray:
 
 def _with_figures(homography, mm, px, ids) -> PageFit:
     residual = px - apply_homography(homography, mm)
-    freedom, noise = residual.size - 8, UNSEEN_NOISE_PX
+    freedom, noise = residual.size - (9 if len(ids) > 2 else 8), UNSEEN_NOISE_PX
     if freedom > 0:
         student = stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
         noise = max(CORNER_NOISE_PX, float(np.sqrt((residual**2).sum() / freedom) * student))
