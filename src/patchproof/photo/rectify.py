@@ -3,10 +3,11 @@
 In: corners in pixels and in page millimeters, by marker id. Out: `PageFit`. Least median of squares finds the corners
 that agree (it breaks down when half of them lie), Gauss-Newton on the reprojection error of those gives the
 homography and its covariance. Blur and sharpening make all markers of a photograph a little larger or smaller; that is
-no noise, so where there are three or more, what their corners lie too far out on average is taken off first. The uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn
-from that covariance. Few corners say little of their own noise, so what is made of it is wider (Student's t); a single
-marker fits any noise exactly, and gets a wide guess. Left out on purpose: lens terms. A lens that bends shows as
-residual, and residual widens the uncertainty.
+no noise, so where there are three or more, what their corners lie too far out on average is taken off first. The
+uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn from that covariance. Few corners
+say little of their own noise, so what is made of it is wider (Student's t); a single marker fits any noise exactly, and
+gets a wide guess. Left out on purpose: lens terms. A lens that bends shows as residual, and residual widens the
+uncertainty.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.2 (reprojection error), 5.2 (covariance).
 """
