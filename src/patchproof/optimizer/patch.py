@@ -44,7 +44,7 @@ class Patch:
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
-    STEP_SIZE: ClassVar[float] = 0.05
+    STEP_SIZE: ClassVar[float] = 0.015
     LOOK: ClassVar[str] = "printer"
 
     def start(self) -> Tensor:

@@ -169,11 +169,16 @@ def _agreeing(mm, px) -> np.ndarray:
 
 
 def _swelling(homography, mm, px, keep) -> np.ndarray:
-    """N×2: how far all markers' corners, four by four, lie outwards of the homography on average."""
-    outward = px - np.repeat(px.reshape(-1, 4, 2).mean(1), 4, 0)
-    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    residual = ((px - apply_homography(homography, mm)) * outward).sum(1)
-    return outward * residual[keep].mean()
+    """N×2: how far all markers' corners, four by four, lie outwards of the homography, their borders moved alike."""
+    quads = apply_homography(homography, mm).reshape(-1, 4, 2)
+    along = np.roll(quads, -1, 1) - quads
+    along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-9)
+    after = np.stack([along[..., 1], -along[..., 0]], 2)  # a clockwise quad's normals outwards, y down
+    before = np.roll(after, 1, 1)
+    outward = (after + before) / np.maximum(1 + (after * before).sum(2, keepdims=True), 0.1)
+    outward = outward.reshape(-1, 2)
+    residual = ((px - quads.reshape(-1, 2)) * outward).sum(1)
+    return outward * (residual[keep].sum() / (outward[keep] ** 2).sum())
 
 
 def _gauss_newton(homography, mm, px) -> np.ndarray:
