@@ -36,7 +36,6 @@ STUDIES: dict[str, str] = {
     "deceive": "patchproof.experiments.deceive",
     "detection": "patchproof.validation.detection",
     "envelope": "patchproof.validation.envelope.sweeps",
-    "gamut": "patchproof.validation.gamut",
     "harden": "patchproof.harden.folder",
     "ledger": "patchproof.validation.ledger_trials",
     "mining": "patchproof.experiments.mining",
