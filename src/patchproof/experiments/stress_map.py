@@ -1,4 +1,4 @@
-"""What stress tests share: cells of pose × light, and what a network answers to the clean object there.
+"""Maps of stress tests: cells of pose × light, and what a network answers to the clean object there.
 
 In: a scene with a mesh before one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
 a map while everything else stays as drawn; recognized and confidence per draw; and the worst tenth of a map's cells.
@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from patchproof.channel.effects import EFFECTS
+from patchproof.channel.effects import EFFECT, EFFECTS
 from patchproof.goal import Goal
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, responses
@@ -28,6 +28,10 @@ from patchproof.study.study import Cell
 
 PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
 LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
+# What of a draw is the pose and the light; the rest is background, print and camera.
+POSE = EFFECT["viewpoint"].fields
+_LIGHT = ("ambient light", "directional light", "exposure", "lamp", "uneven ambient")
+LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
 WORST_SHARE = 0.1
 
 
@@ -99,6 +103,13 @@ def in_cells(conditions: Conditions, axes: tuple[Axis, Axis], places: Sequence[P
     n = len(conditions) // len(places)
     parts = [fields_of(in_cell(conditions[i * n : (i + 1) * n], axes, place)) for i, place in enumerate(places)]
     return of_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str]) -> Conditions:
+    """The fields `names` of each row of `tried`, with all else from each row of `rest`: row by row of `tried`."""
+    rows = np.tile(np.arange(len(rest)), len(tried))
+    fields = fields_of(tried)
+    return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
 
 
 def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Answers:

@@ -38,7 +38,6 @@ STUDIES: dict[str, str] = {
     "envelope": "patchproof.validation.envelope.sweeps",
     "harden": "patchproof.harden.folder",
     "ledger": "patchproof.validation.ledger_trials",
-    "mining": "patchproof.experiments.mining",
     "patch2d": "patchproof.experiments.patch2d",
     "patch3d": "patchproof.experiments.patch3d",
     "promises": "patchproof.validation.promises",
