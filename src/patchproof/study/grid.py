@@ -67,7 +67,7 @@ def with_tables(values: Values, tables: Tables) -> Values:
 def pairs(settings: GridSettings, base: Path) -> Iterator[Values]:
     """The values of every scene before every single network, whose name tables say, but for the seed."""
     for file in settings.scenes:
-        values = scene_values(file, base) | {"of_scene": not settings.networks}
+        values: Values = scene_values(file, base) | {"of_scene": not settings.networks}
         for network in settings.networks or values["scene"]["target"]["models"]:
             yield values | {"networks": [network], "network": short_name(network)}
 
