@@ -3,7 +3,7 @@
 Also whether the stated uncertainty holds.
 In: a scene with wide ranges of view, light and camera. Out: by photograph its status and code, and against the
 renderer's truth the error of the design's corners; over all of them shares with Wilson intervals by tilt, distance,
-blur, noise, light, hiding and JPEG, and maps. The sheet carries noise in place of a design, since only markers are
+blur, noise, light, hiding and JPEG. The sheet carries noise in place of a design, since only markers are
 read here. In a share of the photographs a card of drawn size, place and color hides a part of the piece.
 """
 
@@ -31,7 +31,7 @@ from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pixels
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
@@ -63,7 +63,6 @@ _LABELS = {
     "hidden": "share of the piece hidden",
     "jpeg": "JPEG quality",
 }
-_COLORS = {"measured": "#2a9d6f", "judged": "#e0a030", "rejected": "#d1495b"}
 
 
 class DetectionSettings(Strict):
@@ -232,36 +231,4 @@ def _codes(found: Sequence[Mapping]) -> Table:
     return Table("codes", "Status and code", ("status", "code", "photographs"), rows)
 
 
-def figures(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Drawing]:
-    """Maps of what was measured, judged and rejected, and errors against the stated uncertainty."""
-    found = [one.answers for one in results]
-    pairs = (("module_px", "tilt_deg"), ("module_px", "blur_px"), ("hidden", "tilt_deg"), ("noise", "jpeg"))
-    maps = [
-        Drawing(f"{x}_{y}", f"By {_LABELS[x]} and {_LABELS[y]}", lambda figure, x=x, y=y: _map(figure, found, x, y))
-        for x, y in pairs
-    ]
-    return (*maps, Drawing("uncertainty", "Stated and true", lambda figure: _stated(figure, found)))
-
-
-def _map(figure, found: Sequence[Mapping], x: str, y: str) -> None:
-    axes = figure.add_subplot()
-    for status, color in _COLORS.items():
-        here = [f for f in found if f["status"] == status]
-        axes.scatter([f[x] for f in here], [f[y] for f in here], s=18, color=color, label=f"{status} ({len(here)})")
-    axes.set_xlabel(_LABELS[x])
-    axes.set_ylabel(_LABELS[y])
-    axes.legend(frameon=False)
-
-
-def _stated(figure, found: Sequence[Mapping]) -> None:
-    axes, known = figure.add_subplot(), [f for f in found if f["status"] == "measured" and f["error_mm"] is not None]
-    stated = [f["uncertainty_mm"] for f in known]
-    axes.loglog(stated, [f["error_mm"] for f in known], ".", color="#2457c5")
-    if known:
-        ends = min(stated), max(stated)
-        axes.loglog(ends, ends, color="gray", linewidth=1)
-    axes.set_xlabel("stated 95 % uncertainty of the largest corner error, mm")
-    axes.set_ylabel("largest corner error, mm")
-
-
-STUDY = Study("detection", DetectionSettings, cells, run, tables, figures)
+STUDY = Study("detection", DetectionSettings, cells, run, tables)

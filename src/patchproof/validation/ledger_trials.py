@@ -272,9 +272,4 @@ def _trials(results: Sequence[Result]) -> Table:
     return Table("trials", "Every trial", head, tuple(rows), "cost and shares in confidence")
 
 
-def figures(settings: LedgerSettings, results: Sequence[Result]) -> tuple[()]:
-    """None: the tables say it."""
-    return ()
-
-
-STUDY = Study("ledger", LedgerSettings, cells, run, tables, figures)
+STUDY = Study("ledger", LedgerSettings, cells, run, tables)

@@ -16,7 +16,7 @@ import numpy as np
 from patchproof.claims import Estimate, rate
 from patchproof.goal import Goal
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.study.figures import number_grid, whiskers
+from patchproof.study.figures import number_grid
 from patchproof.validation.envelope.axes import AXES
 from patchproof.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 
@@ -74,7 +74,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
 
 
 def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
-    """The page to print, and the curves behind it."""
+    """The page to print."""
     sweeps, maps = _split(results)
     page = Drawing(
         "page",
@@ -84,16 +84,7 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
         "Bars run from the easy end to where half of what the sweep takes is lost; whiskers: 95 % intervals; →: it "
         "holds; !: not monotone; in brackets the fitted rates at both ends.",
     )
-    if not sweeps:
-        return (page,)
-    rows = -(-len(sweeps) // 3)
-    return page, Drawing(
-        "curves",
-        "Sweeps",
-        lambda figure: _draw_curves(figure, sweeps, rows),
-        (10.0, 2.4 * rows),
-        "Shares of conditions with Wilson intervals, the fitted falling curves, breaking points (dotted).",
-    )
+    return (page,)
 
 
 def _split(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
@@ -250,31 +241,3 @@ def _draw_map(axes: Axes, result: Result) -> None:
         values = axis.values(end["easy"], end["hard"], end["points"])
         set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
         set_label(f"{axis.title}, {axis.unit}", fontsize=7)
-
-
-def _draw_curves(figure: Figure, sweeps: Sequence[Result], rows: int) -> None:
-    grid = figure.subplots(rows, 3, squeeze=False)
-    for axes, result in zip(grid.flat, sweeps, strict=False):
-        _draw_sweep(axes, result)
-    for axes in grid.flat[len(sweeps) :]:
-        axes.set_axis_off()
-    grid.flat[0].legend(fontsize=7, frameon=False)
-
-
-def _draw_sweep(axes: Axes, result: Result) -> None:
-    x, works = result.cell.values["x"], worked(result.answers)
-    at, fine = np.linspace(0, 1, x["points"]), np.linspace(0, 1, 101)
-    for k, (stage, color) in enumerate(_COLORS.items()):
-        values, reach = whiskers([rate(row.tolist()) for row in works[stage]])
-        here = at + 0.012 * (k - 1)
-        axes.errorbar(here, values, reach, fmt="o", ms=3, lw=0.8, color=color, label=STAGES[stage])
-        break_ = result.answers["breaks"][stage]
-        axes.plot(fine, break_["curve"], color=color, linewidth=1)
-        if break_["value"] is not None and break_["value"] < BEYOND:
-            axes.axvline(break_["value"], color=color, linestyle=":", linewidth=1)
-    axis = AXES[x["axis"]]
-    values = axis.values(x["easy"], x["hard"], x["points"])
-    axes.set_xticks(at, [_short(v) for v in values], fontsize=7)
-    axes.set_xlabel(f"{axis.title}, {axis.unit}", fontsize=8)
-    axes.set_ylim(-0.05, 1.05)
-    axes.spines[["top", "right"]].set_visible(False)
