@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import Field
 
-from patchproof.experiments.turntable import sides
+from patchproof.experiments.sides import sides
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.claims import rate
-from patchproof.experiments.turntable import sides, three_views
+from patchproof.experiments.sides import sides, three_views
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses

@@ -80,8 +80,8 @@ class Study:
 
     `cells(settings, base)` lists the work; paths in settings are relative to the config's folder `base`.
     `run(settings, base, cell)` does one cell: JSON values and, under keys that are file names, bytes to be kept.
-    `tables(settings, results)` and, if any, `figures(settings, results)` get the finished cells in the order of `cells`;
-    some may be missing. Whatever `run` needs at random follows from the settings' seed and the cell's values.
+    `tables(settings, results)` and, if any, `figures(settings, results)` get the finished cells in the order of
+    `cells`; some may be missing. Whatever `run` needs at random follows from the settings' seed and the cell's values.
     """
 
     name: str
