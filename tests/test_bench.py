@@ -37,10 +37,9 @@ def test_a_point_that_another_beats_is_not_on_the_front():
     assert pareto(cost, error).tolist() == [True, True, False, False, True]
 
 
-def test_the_front_of_a_quality_is_its_upper_edge():
-    for made, expected in ((chart(), ["0", "1"]), (chart(higher_is_better=True), ["0"])):
-        (points,) = made.tasks.values()
-        assert [p.setting for p in made.front(points)] == expected
+def test_the_front_is_the_lower_edge_cheapest_first():
+    (points,) = chart().tasks.values()
+    assert [p.setting for p in chart().front(points)] == ["0", "1"]
 
 
 def test_a_point_without_a_finite_error_is_no_choice():
@@ -74,7 +73,7 @@ def test_a_check_that_fails_is_said_to_fail():
 
 
 def test_json_tables_charts_and_page_can_be_read_back(tmp_path, monkeypatch):
-    named = [chart(), replace(chart(checks=(Check("width", 3.0, 2.0),)), name="other", one_front=True, target=1.5)]
+    named = [chart(), replace(chart(checks=(Check("width", 3.0, 2.0),)), name="other", one_front=True)]
     monkeypatch.setattr(run, "load_bench", lambda name: lambda quick, on_stage: iter(named))
     (results,) = run.run_bench("render", tmp_path / "out", quick=True)
     data = json.loads((tmp_path / "out" / "render.json").read_text("utf-8"))

@@ -44,12 +44,6 @@ def test_a_default_is_held_against_the_front_at_its_cost_alone():
     assert not checked(point(1, 0.0), point(2, 1.0, default=True)).holds
 
 
-def test_a_default_s_quality_in_decibels_is_an_error_too():
-    # 1 dB less is 12 % more error
-    worse = checked(point(1, 41.0), point(2, 40.0, default=True), higher_is_better=True)
-    assert worse.figure == pytest.approx(100 * (10**0.05 - 1)) and not worse.holds
-
-
 def test_one_front_spans_all_series():
     series = {"a": [point(1, 1), point(2, 0.9)], "b": [point(1, 2), point(2, 0.5, default=True)]}
     chart = Chart("some", "Some knob", "cost", "error", series, "")
