@@ -36,14 +36,14 @@ BEYOND = 2.0  # stands for a breaking point that is not in the sweep
 class Break:
     """Positions in the sweep, `BEYOND` where the curve holds; None where nothing worked at the easy end.
 
-    `curve` is the best one at positions 0, 0.01, ... 1.
+    `rates` are those of the best curve at both ends.
     """
 
     value: float | None
     low: float | None
     high: float | None
     monotone_p: float
-    curve: tuple[float, ...]
+    rates: tuple[float, float]
 
 
 def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
@@ -53,15 +53,15 @@ def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
     weights = rng.multinomial(n, np.full(n, 1 / n), DRAWS)
     counts = weights @ worked.astype(float)
     p = monotone_p(worked.mean(0), counts / n)
-    best = curve_at(_fit(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.linspace(0, 1, 101))
+    first, last = curve_at(_fit(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.array([0.0, 1.0])).tolist()
     if wilson(int(worked[:, 0].sum()), n)[0] < LEAST_AT_EASY_END:
-        return Break(None, None, None, p, tuple(best.tolist()))
+        return Break(None, None, None, p, (first, last))
     low, high, _ = _fit(counts, n, at)
     middle = np.where(high < BEYOND, (low + high) / 2, low)
     value, low, high = (
         float(np.quantile(drawn, q, method="inverted_cdf")) for drawn, q in ((middle, 0.5), (low, 0.025), (high, 0.975))
     )
-    return Break(value, low, high, p, tuple(best.tolist()))
+    return Break(value, low, high, p, (first, last))
 
 
 def curve_at(curve: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -88,9 +88,8 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
 
 
 def _split(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
-    return [result for result in results if "y" not in result.cell.values], [
-        result for result in results if "y" in result.cell.values
-    ]
+    sweeps, maps = ([each for each in results if ("y" in each.cell.values) == is_map] for is_map in (False, True))
+    return sweeps, maps
 
 
 def worked(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -132,9 +131,7 @@ def _beyond_row(result: Result) -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     where = answers["breaks"]["measured"]["value"]
     at = np.linspace(0, 1, x["points"])
-    beyond = [i for i in range(x["points"]) if at[i] > min(1.0 if where is None else where, 1 - 1e-9)]
-    if where is None:
-        beyond = list(range(x["points"]))
+    beyond = [i for i in range(x["points"]) if where is None or at[i] > min(where, 1 - 1e-9)]
     photos = [photo for i in beyond for photo in zip(answers["status"][i], answers["code"][i], strict=True)]
     status, codes = [status for status, _ in photos], [code for status, code in photos if status != "measured"]
     return AXES[x["axis"]].title, len(status), status.count("measured"), _counted(codes)
@@ -187,14 +184,8 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
     for row, result in enumerate(sweeps):
         x = result.cell.values["x"]
         for k, (stage, color) in enumerate(_COLORS.items()):
-            _draw_bar(
-                axes,
-                row + 0.24 * (k - 1),
-                x,
-                result.answers["breaks"][stage],
-                color,
-                STAGES[stage] if not row else None,
-            )
+            label = None if row else STAGES[stage]
+            _draw_bar(axes, row + 0.24 * (k - 1), x, result.answers["breaks"][stage], color, label)
         axis = AXES[x["axis"]]
         axes.text(-0.02, row, f"{axis.title}\n{axis.unit}", ha="right", va="center", fontsize=7.5)
         axes.text(0.0, row + 0.46, _short(x["easy"]), ha="left", va="center", fontsize=6, alpha=0.7)
@@ -215,8 +206,8 @@ def _draw_bar(axes: Axes, y: float, x: End, break_: Break, color: str, label: st
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)
         return
     axes.plot([low, min(high, 1.0)], [y, y], color="black", linewidth=0.9)
-    curve = break_["curve"]
-    text = f"{_short(_at(x, value))} ({curve[0]:.2f}–{curve[-1]:.2f})" + (" !" if _rises(break_) else "")
+    first, last = break_["rates"]
+    text = f"{_short(_at(x, value))} ({first:.2f}–{last:.2f})" + (" !" if _rises(break_) else "")
     axes.text(min(high, 1.0) + 0.01, y, text, va="center", fontsize=6.5)
 
 
@@ -233,11 +224,8 @@ def _draw_map(axes: Axes, result: Result) -> None:
     texts = [[f"{100 * a:.0f}" + ("×" if b < 0.5 else "") for a, b in zip(*row, strict=True)] for row in rows]
     number_grid(axes, share, texts, colors="RdYlGn", fontsize=6)
     axes.invert_yaxis()
-    for set_ticks, set_label, end in (
-        (axes.set_xticks, axes.set_xlabel, x),
-        (axes.set_yticks, axes.set_ylabel, y),
-    ):
+    for drawn, end in ((axes.xaxis, x), (axes.yaxis, y)):
         axis = AXES[end["axis"]]
         values = axis.values(end["easy"], end["hard"], end["points"])
-        set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
-        set_label(f"{axis.title}, {axis.unit}", fontsize=7)
+        drawn.set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
+        drawn.set_label_text(f"{axis.title}, {axis.unit}", fontsize=7)
