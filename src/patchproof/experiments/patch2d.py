@@ -133,12 +133,12 @@ def _answers(
     """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
     (classifier,), (target,) = problem.classifiers, problem.indices
     own = _indices(classifier, images_of)
-    both = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
+    judged = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
     return {
         "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
         "images": len(scene.images),
         "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
-        "hits": recorded(responses(both, shown, scene.draw("evaluate", n)))["hits"],
+        "hits": recorded(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
     }
 
 

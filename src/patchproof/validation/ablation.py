@@ -141,9 +141,10 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
     for group in _groups(results):
         designs += [(*who(result), result.cell.values["effect"], *_means(result)) for result in group.values()]
     for effect in settings.effects:
-        both = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
-        if both:
-            rows.append((effect, len(both), *_earned(both), mean([whole.answers["cost"][effect] for whole, _ in both])))
+        compared = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
+        if compared:
+            costs = [whole.answers["cost"][effect] for whole, _ in compared]
+            rows.append((effect, len(compared), *_earned(compared), mean(costs)))
     start = ("scene", "network", "seed", "trained without", *head[2:])
     cost = "share of a step's time"
     return (
@@ -165,11 +166,11 @@ def _means(result: Result) -> list[float | None]:
     return [float(np.mean(some)) if some else None for some in figures]
 
 
-def _earned(both: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
+def _earned(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
     """What the first of each pair is better by: rate and confidence in each world."""
     differences = [
         [None if a is None or b is None else a - b for a, b in zip(_means(whole), _means(less), strict=True)]
-        for whole, less in both
+        for whole, less in compared
     ]
     columns = ([value for value in column if value is not None] for column in zip(*differences, strict=True))
     return [mean(column) for column in columns]
