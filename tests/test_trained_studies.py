@@ -21,7 +21,7 @@ from patchproof.strict import Refused, validated
 from patchproof.study.grid import short_name
 from patchproof.study.record import Record
 from patchproof.study.study import Cell, Result, run_study
-from patchproof.study.trained import TrainedSettings, networks_of, trained_cells, verdict
+from patchproof.study.trained import TrainedSettings, trained_cells, verdict
 from test_textures_optimized import scene_file
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
@@ -201,13 +201,8 @@ def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_pat
         trained_cells(wrong, config.parent)
 
 
-def test_optional_networks_are_left_out_and_said_and_names_must_differ(tmp_path):
-    settings = TrainedSettings(
-        scenes=("a.toml",), networks=("builtin",), if_installed=("module:fake_networks.missing", RED)
-    )
-    assert networks_of(settings, tmp_path) == ("builtin", RED)
-    with pytest.raises(Refused, match="different names"):
-        networks_of(settings.changed(if_installed=("builtin",)), tmp_path)
+def test_names_must_differ_and_ways_be_words():
+    settings = TrainedSettings(scenes=("a.toml",), networks=("builtin",))
     with pytest.raises(Refused, match="different names"):
         settings.changed(networks=("file:a/net.pt2", "file:b/net.pt2"))
     with pytest.raises(Refused, match=r"ways\.a b"):

@@ -31,7 +31,6 @@ from patchproof.study.trained import (
     TrainedSettings,
     Way,
     Word,
-    left_out_note,
     tested_in,
     trained_cells,
     trained_on,
@@ -99,7 +98,6 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
-    about += left_out_note(settings, results)
     of_colors = "Mean light of the object's pixels over a full turn in even white light, as sRGB codes."
     head = (*_HEAD, "tested on", "gray", "design", "confidence", "gain", "shows")
     named = (*_HEAD, "mean color", "red", "green", "blue")

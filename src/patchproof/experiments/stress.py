@@ -20,7 +20,6 @@ from pydantic import Field
 from torch import Tensor
 
 from patchproof.claims import difference, rate
-from patchproof.experiments.heat import heat_map, map_ticks, words_of
 from patchproof.experiments.stress_map import (
     LIGHT,
     POSE,
@@ -29,9 +28,12 @@ from patchproof.experiments.stress_map import (
     axes_values,
     clean,
     each_before_all,
+    heat_map,
     in_cells,
     map_of,
+    map_ticks,
     mesh_cells,
+    words_of,
     worst_cells,
 )
 from patchproof.optimizer.problem import Problem
