@@ -72,7 +72,7 @@ def test_falling_rates_are_the_nearest_ones():
     rates = np.array([0.9, 0.5, 0.7, 0.2])
     assert falling(rates) == pytest.approx([0.9, 0.6, 0.6, 0.2])
     drawn = np.random.default_rng(0).random((50, 6))
-    nearest = falling(drawn)
+    nearest = np.array([falling(row) for row in drawn])
     assert (np.diff(nearest, axis=1) <= 1e-12).all() and nearest.sum(1) == pytest.approx(drawn.sum(1))
     other = np.sort(np.random.default_rng(1).random((50, 6)), 1)[:, ::-1]
     assert (((drawn - nearest) ** 2).sum(1) <= ((drawn - other) ** 2).sum(1)).all()

@@ -229,10 +229,13 @@ def test_numbers_stay_numbers(tmp_path):
 
 
 def test_keys_of_former_runs_are_forgotten_where_they_changed_nothing(tmp_path):
-    former = load_scene_settings(scene(tmp_path, extra="[optimize]\nrefresh = 1\nmine = 0\nnps = 0\nsteps = 7"))
+    former = load_scene_settings(
+        scene(tmp_path, extra="[optimize]\nrefresh = 1\nmine = 0\nnps = 0\nin_gamut = false\nsteps = 7")
+    )
     assert former.optimize.steps == 7
-    with pytest.raises(Refused, match="mine"):
-        load_scene_settings(scene(tmp_path, extra="[optimize]\nmine = 8"))
+    for key, value in (("mine", "8"), ("in_gamut", "true")):
+        with pytest.raises(Refused, match=key):
+            load_scene_settings(scene(tmp_path, extra=f"[optimize]\n{key} = {value}"))
 
 
 def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):

@@ -1,4 +1,4 @@
-"""Stress tests and mining: cells, worst cases on a network whose weakness is known, and that mining repeats itself."""
+"""Stress tests: cells, and worst cases on a network whose weakness is known."""
 
 from __future__ import annotations
 
@@ -6,21 +6,11 @@ import json
 
 import numpy as np
 import pytest
-import torch
-from scipy.stats import spearmanr
 
 from patchproof.channel.effects import FIELDS
-from patchproof.experiments import mining
-from patchproof.experiments.hard_views import (
-    CANDIDATES,
-    LIGHT,
-    POSE,
-    expected_losses,
-    hardest,
-    training_conditions,
-)
 from patchproof.experiments.stress import OcclusionSettings, SearchSettings, occluded, worst_case
 from patchproof.experiments.stress_map import (
+    LIGHT,
     Axis,
     MapSettings,
     axes_of,
@@ -32,12 +22,11 @@ from patchproof.experiments.stress_map import (
 )
 from patchproof.goal import Goal
 from patchproof.optimizer import loop, run
-from patchproof.optimizer.loop import State, steps
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
-from patchproof.settings import OptimizeSettings, SceneSettings
+from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
 from patchproof.study.grid import GridSettings
 from patchproof.study.study import run_study
@@ -82,84 +71,6 @@ def losses_of(problem, conditions):
 
 def rows_of(conditions, names):
     return np.concatenate([fields_of(conditions)[name].astype(float).reshape(len(conditions), -1) for name in names], 1)
-
-
-# ---------------------------------------------------------------------------------------------------------- mining
-
-
-def test_without_mining_the_views_are_those_drawn(tmp_path):
-    problem = problem_with(tmp_path, patch=PRINTED)
-    given, drawn = (list(steps(problem, conditions=views)) for views in (problem.scene.draw("train", 12), None))
-    assert torch.equal(given[-1].state.design, drawn[-1].state.design)
-
-
-def test_mined_views_take_pose_and_light_of_expectedly_bad_draws_and_nothing_else(tmp_path):
-    problem = problem_with(tmp_path)
-    mined, drawn = training_conditions(problem, 64), problem.scene.draw("train", 12 + 64 + 6 * CANDIDATES)
-    assert len(mined) == 12
-    names = POSE + LIGHT
-    others = [name for name in FIELDS if name not in names]
-    np.testing.assert_array_equal(rows_of(mined, others), rows_of(drawn[:12], others))
-    np.testing.assert_array_equal(rows_of(mined, names)[::2], rows_of(drawn[:12], names)[::2])
-    fresh, tried = drawn[76:], drawn[12:76]  # the worst of each eight draws that no try has used
-    expected = expected_losses(tried, losses_of(problem, tried), fresh).reshape(6, CANDIDATES)
-    groups = zip(rows_of(mined, names)[1::2], rows_of(fresh, names).reshape(6, CANDIDATES, -1), expected, strict=True)
-    for row, group, losses in groups:
-        assert (row == group).all(1).nonzero()[0].tolist() == [losses.argmax()]
-
-
-def test_the_fit_finds_what_is_hard_and_ignores_what_does_not_vary(tmp_path):
-    """Losses that rise with darkness and away from one azimuth, with noise: the expected order, by rank correlation."""
-    problem = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]}, light={"ambient": [0.1, 0.9]})
-    drawn = problem.scene.draw("train", 400)
-    truth = 2 * (1 - drawn.light.ambient) - np.cos(np.radians(drawn.pose.azimuth_deg - 40))
-    noisy = truth + np.random.default_rng(0).normal(0, 0.5, 400)
-    expected = expected_losses(drawn[:128], noisy[:128], drawn[128:])
-    assert spearmanr(expected, truth[128:]).statistic > 0.9
-    assert truth[128:][hardest(expected)].mean() > np.quantile(truth[128:], 0.8)
-    alike = expected_losses(drawn[:128], np.full(128, 3.0), drawn[128:])
-    np.testing.assert_allclose(alike, 3)
-
-
-def test_views_from_behind_a_patch_are_not_mined(tmp_path):
-    """The object fails there, too, but the patch cannot be seen; where too few are not, nothing is mined."""
-    around = problem_with(tmp_path, view={"azimuth_deg": [-180, 180]})
-    mined, drawn = training_conditions(around, 16), around.scene.draw("train", 12)
-    changed = mined.pose.azimuth_deg != drawn.pose.azimuth_deg
-    assert changed.any() and (np.abs(around.scene.piece_azimuth_deg(mined))[changed] < 90).all()
-    too_few = training_conditions(around, 1)  # to fit anything to
-    np.testing.assert_array_equal(too_few.pose.azimuth_deg, drawn.pose.azimuth_deg)
-
-
-def test_the_worst_of_every_eight_by_hand():
-    assert hardest(np.array([0, 1, 9, 3, 4, 5, 6, 7, 2, 2, 1, 0, 0, 0, 0, 0, 5.0])).tolist() == [2, 8]  # one is left
-
-
-def test_a_step_of_mined_training_depends_on_state_and_number_alone(tmp_path):
-    first, second = (problem_with(tmp_path, patch=PRINTED) for _ in range(2))
-    whole = list(steps(first, conditions=training_conditions(first, 8)))
-    middle: State = whole[2].state
-    again = list(steps(second, middle, training_conditions(second, 8)))
-    assert [step.state.number for step in again] == [4, 5, 6]
-    assert torch.equal(again[-1].state.design, whole[-1].state.design) and again[-1].loss == whole[-1].loss
-    plain = list(steps(problem_with(tmp_path, patch=PRINTED)))
-    assert not torch.equal(plain[-1].state.design, whole[-1].state.design)
-
-
-def test_equal_cost_by_hand(monkeypatch):
-    monkeypatch.setattr(loop, "SELECT_AFTER", 80)
-    monkeypatch.setattr(loop, "SELECT_VIEWS", 64)
-    plain = OptimizeSettings(steps=40, views=8)
-    # 40 · 8 views, and 4 selections of 64 views forward only
-    assert mining.passes(plain) == pytest.approx(320 + 256 / 3)
-    # 192 tries cost 64 passes, which are 8 steps of 8 views
-    assert mining.equal_steps(plain, 192) == 32 and mining.equal_steps(plain, 193) == 31
-    assert mining.passes(plain.changed(steps=32), 192) == mining.passes(plain)
-    # one step's worth of tries from the last training that can pay for them
-    two = OptimizeSettings(steps=2, views=4)
-    assert mining.equal_steps(two, 12) == 1
-    with pytest.raises(Refused, match="raise steps or lower mine"):
-        mining.equal_steps(two, 13)
 
 
 # ----------------------------------------------------------------------------------------------------------- cells
@@ -255,14 +166,6 @@ rounds = 2
 draws = 1
 n = 4
 """
-MINING = """
-scenes = ["scene.toml"]
-networks = ["builtin"]
-mine = 4
-n = 3
-n_all = 4
-map = {pose_cells = 2, light_cells = 2, n = 2}
-"""
 
 
 def test_the_stress_study_leaves_tables_maps_and_a_page_twice_alike(tmp_path):
@@ -278,17 +181,6 @@ def test_the_stress_study_leaves_tables_maps_and_a_page_twice_alike(tmp_path):
     assert len(finished.tables[1].rows) == 4 and all(row[-2].n == 2 for row in finished.tables[1].rows)
     for name in ("stress_worst.csv", "stress_maps.csv", "stress.html", "stress.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
-def test_the_mining_study_compares_at_equal_cost_on_the_same_conditions(tmp_path, monkeypatch):
-    toml(tmp_path / "scene.toml", patch=PRINTED)
-    (tmp_path / "mining.toml").write_text(MINING)
-    finished = run_study("mining", tmp_path / "mining.toml", tmp_path / "out")
-    assert not finished.failed
-    worst = dict(zip(finished.tables[0].head, finished.tables[0].rows[0], strict=True))
-    assert worst["steps"] == 6 and worst["steps mined"] == 5 and worst["passes mined"] <= worst["passes"]
-    assert worst["clean"].n == worst["mined"].n == worst["mined - not mined"].n == 3
-    assert finished.tables[1].rows[0][-1].n == 4 and finished.tables[2].rows[0][:3] == ("scene", "builtin", 1)
 
 
 def test_settings_that_will_not_do_are_refused(tmp_path):

@@ -1,9 +1,8 @@
-"""Promises against photographs: the shares and the correction by hand, and one cell from scene to verdict."""
+"""Promises against photographs: the shares by hand, and one cell from scene to verdict."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from patchproof.claims import prediction_interval
@@ -34,25 +33,13 @@ def test_an_interval_holds_up_to_its_ends_and_not_beyond():
     assert promises.interval_of(count(0.8, 0)) == (low, high)
 
 
-def test_the_shift_of_the_log_odds_is_found_again_and_no_shift_changes_nothing():
-    rates = np.array([0.0, 0.02, 0.5, 0.9, 1.0])
-    assert promises.shifted(rates, 0.0).tolist() == rates.tolist()
-    true = promises.shifted(rates, -0.7)
-    assert promises.shifted(true, 0.7)[1:4] == pytest.approx(rates[1:4])
-    seen = [count(rate, 1000 * p, 1000) for rate, p in zip(rates[1:4], true[1:4], strict=True)]
-    assert promises.fitted_shift(seen) == pytest.approx(-0.7, abs=1e-3)
-
-
-def test_a_correction_is_judged_on_other_scenes_than_it_was_fitted_on():
+def test_shares_and_biases_by_hand():
     settings = promises.PromisesSettings(scenes=("a", "b"), networks=("builtin",))
     low = [result("a", count(0.8, hits)) for hits in (20, 21, 22)]  # promised too much
     fair = [result("b", count(0.8, hits)) for hits in (31, 32, 33)]
-    held, correction, each = promises.tables(settings, low + fair)
+    held, each = promises.tables(settings, low + fair)
     assert [(row[0], row[1].value, row[1].n) for row in held.rows] == [("a", 0, 3), ("b", 1, 3), ("all", 0.5, 6)]
     assert held.rows[0][3].value == pytest.approx(21 / 40 - 0.8)
-    on_b, on_a = correction.rows
-    assert on_b[:2] == ("a", "b") and on_b[2] < -0.5 and on_b[3].value == 1 > on_b[4].value
-    assert on_a[:2] == ("b", "a") and abs(on_a[2]) < 0.05 and on_a[3].value == 0
     assert len(each.rows) == 6
 
 

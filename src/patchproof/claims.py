@@ -82,15 +82,6 @@ def paired_means(values: np.ndarray) -> list[Estimate]:
     return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
-def standard_deviation(values: Sequence[float] | np.ndarray) -> Estimate:
-    """The standard deviation of normal values with its χ² interval."""
-    from scipy.stats import chi2
-
-    value, n = statistics.stdev(map(float, values)), len(values)
-    low, high = (value * math.sqrt((n - 1) / float(chi2.ppf(p, n - 1))) for p in (1 - _TAIL, _TAIL))
-    return Estimate(value, low, high, n)
-
-
 def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Wilson's interval of a rate; (0, 1) when nothing was seen."""
     if n == 0:

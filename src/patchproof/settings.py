@@ -204,13 +204,12 @@ class OptimizeSettings(Strict):
     # At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
     # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).
     gamut: NotNegative = 1.0  # loss for colors that the printer misses, per 100 ΔE00
-    in_gamut: bool = False  # keep the design, after every step, to colors that the printer shows as asked (ΔE00 ≤ 3)
 
     @model_validator(mode="before")
     @classmethod
     def _forget_former_keys(cls, data):
         # runs from before these keys went have them, nearly always at the values that changed nothing
-        former = {"refresh": 1, "mine": 0, "nps": 0.0}
+        former = {"refresh": 1, "mine": 0, "nps": 0.0, "in_gamut": False}
         if not isinstance(data, dict):
             return data
         return {key: value for key, value in data.items() if key not in former or value != former[key]}

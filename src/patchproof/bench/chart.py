@@ -61,10 +61,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Chart:
-    """A knob's settings by series. Cost to the right, error upwards, or where `higher_is_better` a quality in dB.
+    """A knob's settings by series. Cost to the right, error upwards.
 
-    `one_front`: series are choices for one task, not tasks of their own. `target` is a line across; `about` says what
-    was measured and on what.
+    `one_front`: series are choices for one task, not tasks of their own. `about` says what was measured and on what.
     """
 
     name: str
@@ -75,9 +74,7 @@ class Chart:
     about: str
     checks: tuple[Check, ...] = ()
     tables: tuple[Table, ...] = ()
-    higher_is_better: bool = False
     one_front: bool = False
-    target: float | None = None
 
     @property
     def tasks(self) -> dict[str, list[Point]]:
@@ -87,8 +84,7 @@ class Chart:
 
     def front(self, points: Sequence[Point]) -> list[Point]:
         """Those of a task's points that no other beats, cheapest first."""
-        sign = -1 if self.higher_is_better else 1
-        kept = pareto([p.at[0] for p in points], [sign * p.at[1] for p in points])
+        kept = pareto([p.at[0] for p in points], [p.at[1] for p in points])
         return sorted((p for p, is_kept in zip(points, kept, strict=True) if is_kept), key=lambda p: p.at[0])
 
 
@@ -107,23 +103,15 @@ def pareto(cost: Sequence[float], error: Sequence[float]) -> np.ndarray:
 
 def all_checks(chart: Chart) -> list[Check]:
     """The chart's own checks, and for each default how much more error it has than the front's at its cost: 0 % where
-    the two intervals overlap. Of a quality in dB the error is its root mean square.
+    the two intervals overlap.
     """
     checks = list(chart.checks)
     for task, points in chart.tasks.items():
         for default in (p for p in points if p.default):
-            rivals = [_error(p, chart) for p in points if p.at[0] <= default.at[0]]
+            rivals = [span(p.error) for p in points if p.at[0] <= default.at[0]]
             claim = f"{task}: % more error of the default than of the front at its cost"
-            checks.append(Check(claim, _excess(_error(default, chart), min(rivals)), OFF_FRONT))
+            checks.append(Check(claim, _excess(span(default.error), min(rivals)), OFF_FRONT))
     return checks
-
-
-def _error(point: Point, chart: Chart) -> tuple[float, float, float]:
-    """Error with its lower and upper end."""
-    middle, low, high = span(point.error)
-    if not chart.higher_is_better:
-        return middle, low, high
-    return 10 ** (-middle / 20), 10 ** (-high / 20), 10 ** (-low / 20)
 
 
 def _excess(default: tuple[float, float, float], front: tuple[float, float, float]) -> float:
@@ -141,7 +129,7 @@ def points_table(chart: Chart) -> Table:
             marks = (("default", p.default), ("front", any(p is other for other in on_front)))
             mark = ", ".join(word for word, applies in marks if applies)
             rows.append((label, p.setting, p.cost, p.error if p.drawable else None, mark))
-    head = ("series", "setting", "cost", "quality" if chart.higher_is_better else "error", "")
+    head = ("series", "setting", "cost", "error", "")
     return Table(chart.name, f"{chart.title}: {chart.error}, by {chart.cost}", head, tuple(rows), chart.about)
 
 

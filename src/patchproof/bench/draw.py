@@ -43,8 +43,6 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
         axes.plot(*np.array([p.at for p in front]).T, color=color, lw=1, ls="--", zorder=1)
     axes.plot([], [], color="0.4", lw=1, ls="--", label="Pareto front (filled)")
     axes.plot([], [], **_RING, label="default")
-    if chart.target is not None:
-        axes.axhline(chart.target, color="0.5", lw=1, ls=":", label=f"target {chart.target:g}")
     _scale(axes, [p for points in chart.series.values() for p in points if p.drawable])
     figure.suptitle(chart.title, x=0.01, ha="left")
     figure.supxlabel(machine, fontsize=6.5, color="0.35", x=0.995, ha="right")

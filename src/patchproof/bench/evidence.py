@@ -1,88 +1,180 @@
-"""What evidence costs: markers, the model that makes a sheet flat, and lens terms.
+"""What evidence costs: how many markers a piece needs, and which model makes its photograph flat.
 
-In: nothing. Out: a chart per knob; the first two are those of `sheets`. Boards for lenses are projected by OpenCV with
-noise on their corners.
+In: photographs of paper. Out: two charts. Errors are in millimeters of the paper, over the whole design.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache, partial
 
-import cv2
 import numpy as np
 
 from patchproof.bench.chart import Chart, OnStage, Point
-from patchproof.bench.paper import SIZE_PX
-from patchproof.bench.sheets import markers_chart, models_chart
-from patchproof.calibrate.boards import View, corner_places_mm
-from patchproof.calibrate.ladder import Rung
-from patchproof.calibrate.lens_ladder import FREE, climb
-from patchproof.claims import Estimate, mean
+from patchproof.bench.measure import clocked
+from patchproof.bench.paper import (
+    DESIGN_MM,
+    LENS,
+    MARKER_MM,
+    PIECE_MM,
+    RADII_MM,
+    SIZE_PX,
+    Kind,
+    Sheet,
+    corners_mm,
+    drawn_sheet,
+    photographed,
+)
+from patchproof.claims import median
+from patchproof.geometry import apply_homography, fit_homography
+from patchproof.photo.complete import find_sheet
+from patchproof.photo.detect import DICTIONARY
+from patchproof.photo.rectify import fit_page
+from patchproof.photo.unroll import explain, rolled, through_lens
 from patchproof.report.tables import Table
-from patchproof.sheets.board import load_board
+from patchproof.sheets.piece import MODULES, lay_out_piece
 
-FOCAL_PX = 1300.0
-LENSES = {
-    "no distortion": (0.0, 0.0, 0.0, 0.0, 0.0),
-    "a phone's main camera": (-0.015, 0.0, 0.0, 0.0, 0.0),
-    "a wide lens, off its axis": (-0.12, 0.03, 1e-3, -5e-4, 0.0),
-}
-BOARD, BOARD_VIEWS, CORNER_NOISE_PX = "charuco_a4", 10, 0.05
+WRONG_PX = 4.0  # by which a marker is moved that was glued on again
+MARKERS = {1: (100,), 2: (100, 107), 4: (100, 102, 105, 107), 8: tuple(range(100, 108))}
+COVERED = 100  # the marker of the corner that something covers
+
+Corners = Mapping[int, np.ndarray]
+ToPx = Callable[[np.ndarray], np.ndarray]
 
 
 def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
-    """Every chart of the evidence, one after the other."""
+    """Markers, then models."""
     yield markers_chart(6 if quick else 40, on_stage)
     yield models_chart(4 if quick else 24, on_stage)
-    yield lens_chart(1 if quick else 6, on_stage)
 
 
-def lens_chart(cameras: int, on_stage: OnStage) -> Chart:
-    """Numbers of a lens model against the error on photographs of a board that it was not fitted to."""
-    series, chosen = {}, []
-    for i, (name, terms) in enumerate(LENSES.items()):
-        ladders = [climb(board_views(np.array(terms), BOARD_VIEWS, seed)) for seed in range(cameras)]
-        names = Counter(fit.rung for _, fit in ladders)
-        default = names.most_common(1)[0][0]
-        rungs = zip(*(rungs for rungs, _ in ladders), strict=True)
-        series[name] = [_point(rung, default) for rung in rungs]
-        chosen.append((name, ", ".join(f"{rung} {count}" for rung, count in names.most_common())))
-        on_stage("lenses", i + 1, len(LENSES))
+def error_mm(model: ToPx, sheet: Sheet) -> float:
+    """The largest distance on paper, over a net on the design, between where a model sees a point and where it is."""
+    x, y, width, height = DESIGN_MM
+    across, down = np.meshgrid(np.linspace(x, x + width, 5), np.linspace(y, y + height, 5))
+    net = np.column_stack([across.ravel(), down.ravel()])
+    by_mm = [(sheet.px(net + step) - sheet.px(net - step)) / 0.1 for step in 0.05 * np.eye(2)]
+    off = np.linalg.solve(np.stack(by_mm, -1), (model(net) - sheet.px(net))[..., None])
+    return float(np.linalg.norm(off[..., 0], axis=1).max())
+
+
+# How many markers
+
+
+def markers_chart(count: int, on_stage: OnStage) -> Chart:
+    """Markers in the frame against the error of the design, with all of them in view and with a corner covered."""
+    ways: dict[str, tuple[int, ...]] = {"all in view": (), "a corner covered": (COVERED,)}
+    errors: dict[tuple[str, int], list[float]] = {(way, n): [] for way in ways for n in MARKERS}
+    milliseconds: dict[int, list[float]] = {n: [] for n in MARKERS}
+    for seed in range(count):
+        sheet, rng = drawn_sheet("flat", seed)
+        photo = photographed(sheet, rng)
+        for n, ids in MARKERS.items():
+            places = {i: corners_mm()[i] for i in ids}
+            sightings, taken = clocked(partial(find_sheet, photo, frozenset(ids), places, DICTIONARY))
+            milliseconds[n].append(taken)
+            for way, covered in ways.items():
+                left = {i: px for i, px in sightings.corners_px.items() if i not in covered}
+                errors[way, n].append(error_mm(plane(left), sheet) if left else np.inf)
+        on_stage("markers", seed + 1, count)
+    default = len(lay_out_piece(DESIGN_MM[2:], MARKER_MM, "", "design").markers)
+    times = [(n, median(ms)) for n, ms in milliseconds.items()]
+    area = 100 * (MARKER_MM * (MODULES + 2) / MODULES) ** 2 / PIECE_MM**2
     return Chart(
-        name="lens",
-        title="Terms of a lens model",
-        cost="numbers that are fitted",
-        error="held-out reprojection error, px (mean)",
-        series=series,
-        about=f"{BOARD_VIEWS} photographs of a board, corners off by {CORNER_NOISE_PX:g} px; {cameras} of each camera. "
-        "Default: the rung that is chosen most often, the lowest within one standard error of the best.",
-        tables=(Table("lens_chosen", "Chosen rungs", ("camera", "chosen"), tuple(chosen)),),
+        name="markers",
+        title="Markers in the frame",
+        cost="% of the piece's area that markers and their quiet zones take",
+        error="largest error on the design, mm (median)",
+        series={way: [Point(f"{n}", n * area, median(errors[way, n]), n == default) for n in MARKERS] for way in ways},
+        about=f"{count} photographs of {SIZE_PX[0]} × {SIZE_PX[1]} px of a piece of {PIECE_MM:g} mm with markers of "
+        f"{MARKER_MM:g} mm, tilt to 45°. 1: a corner, 2: two opposite corners, 4: all corners, 8: and the sides' "
+        "middles, which the frame has room for. With its only marker covered a sheet is not found: no point.",
+        tables=(Table("markers_time", "Time to find markers", ("markers", "ms"), tuple(times)),),
     )
 
 
-def _point(rungs: Sequence[Rung], default: str) -> Point:
-    """One rung over all cameras; of a single camera without an interval."""
-    name, errors = rungs[0].name, [rung.error for rung in rungs]
-    return Point(name, FREE[name], mean(errors) or Estimate(errors[0], errors[0], errors[0], 1), name == default)
+# Which model
 
 
-def board_views(terms: np.ndarray, count: int, seed: int) -> list[View]:
-    """Photographs of a board that fills most of the picture, tilted by 10 to 40° about any axis."""
-    places = corner_places_mm(load_board(BOARD))
-    flat = np.column_stack([places, 0 * places[:, 0]])
-    matrix = np.array([[FOCAL_PX, 0, SIZE_PX[0] / 2 - 10], [0, FOCAL_PX, SIZE_PX[1] / 2 + 10], [0, 0, 1.0]])
-    rng, views = np.random.default_rng([seed, 2]), []
-    while len(views) < count:
-        tilt, about, roll = np.radians(rng.uniform([10, 0, 0], [40, 360, 360]))
-        turn = cv2.Rodrigues(np.array([np.cos(about), np.sin(about), 0]) * tilt)[0]
-        turn = turn @ cv2.Rodrigues(np.array([0, 0, roll]))[0]
-        away = FOCAL_PX * 270 / (min(SIZE_PX) * rng.uniform(0.7, 1.2))
-        aside = rng.uniform(-0.25, 0.25, 2) * SIZE_PX / FOCAL_PX * away
-        move = np.array([*aside, away]) - turn @ flat.mean(0)
-        px = cv2.projectPoints(flat, cv2.Rodrigues(turn)[0], move, matrix, terms)[0].reshape(-1, 2)
-        inside = ((px > 5) & (px < np.array(SIZE_PX) - 5)).all(1)
-        if inside.sum() >= len(flat) // 2:
-            px = px + rng.normal(0, CORNER_NOISE_PX, px.shape)
-            views.append(View(f"{len(views):02d}.jpg", np.flatnonzero(inside), places[inside], px[inside], SIZE_PX))
-    return views
+def plane(corners_px: Corners) -> ToPx:
+    """The page's homography as the tool fits it."""
+    homography = fit_page(corners_px, corners_mm()).px_from_mm
+    return lambda mm: apply_homography(homography, mm)
+
+
+def _all_corners(corners_px: Corners) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ids = sorted(corners_px)
+    px, mm = (np.concatenate([corners[i] for i in ids]) for corners in (corners_px, corners_mm()))
+    return fit_homography(mm, px), mm, px
+
+
+def _plain(corners_px: Corners) -> ToPx:
+    homography, *_ = _all_corners(corners_px)
+    return lambda mm: apply_homography(homography, mm)
+
+
+def _lens(corners_px: Corners) -> ToPx:
+    return through_lens(*_all_corners(corners_px), SIZE_PX).px
+
+
+def _cylinder(corners_px: Corners) -> ToPx:
+    shape = rolled(*_all_corners(corners_px), SIZE_PX, None)
+    return plane(corners_px) if shape is None else shape.px
+
+
+def what_pays(corners_px: Corners) -> ToPx:
+    """As photographs are measured: a plane, unless a cylinder or a lens explains the corners far better."""
+    explained = explain(corners_px, corners_mm(), SIZE_PX)
+    return plane(corners_px) if explained is None else explained.shape.px
+
+
+MODELS: dict[str, Callable[[Corners], ToPx]] = {
+    "plain plane": _plain,
+    "robust plane": plane,
+    "lens": _lens,
+    "cylinder": _cylinder,
+    "what pays": what_pays,
+}
+DEFAULT_MODEL = "what pays"  # as in `evidence.measure`
+
+
+@lru_cache(maxsize=512)
+def corners_found(kind: Kind, seed: int) -> dict[int, np.ndarray]:
+    """The corners that are found in a sheet's photograph, by marker."""
+    photo = photographed(*drawn_sheet(kind, seed))
+    return find_sheet(photo, frozenset(corners_mm()), corners_mm(), DICTIONARY).corners_px
+
+
+def models_chart(count: int, on_stage: OnStage) -> Chart:
+    """Models of the sheet against the error of the design, on flat, misprinted, bent and rolled sheets."""
+    kinds: dict[str, tuple[Kind, float]] = {
+        "flat": ("flat", 0.0),
+        f"flat, a marker {WRONG_PX:g} px off": ("flat", WRONG_PX),
+        "lens": ("lens", 0.0),
+        "rolled": ("rolled", 0.0),
+    }
+    series = {}
+    for number, (label, (kind, wrong_px)) in enumerate(kinds.items()):
+        errors: dict[str, list[float]] = {name: [] for name in MODELS}
+        milliseconds: dict[str, list[float]] = {name: [] for name in MODELS}
+        for seed in range(count):
+            sheet, wrong = drawn_sheet(kind, seed)[0], COVERED + seed % len(corners_mm())
+            corners = {i: px + np.array([wrong_px * (i == wrong), 0]) for i, px in corners_found(kind, seed).items()}
+            for name, model in MODELS.items():
+                fitted, taken = clocked(partial(model, corners))
+                milliseconds[name].append(taken)
+                errors[name].append(error_mm(fitted, sheet))
+        series[label] = [
+            Point(name, median(milliseconds[name]), median(errors[name]), name == DEFAULT_MODEL) for name in MODELS
+        ]
+        on_stage("models of sheets", number + 1, len(kinds))
+    return Chart(
+        name="models",
+        title="What makes a sheet flat",
+        cost="milliseconds to fit (median); finding the markers is not counted",
+        error="largest error on the design, mm (median)",
+        series=series,
+        about=f"{count} photographs with eight markers; rolled: radius {RADII_MM[0]:g} to {RADII_MM[1]:g} mm, either "
+        f"way; lens: k1 {LENS[0]:g}. What pays: the robust plane, unless its residual is halved by a lens or a "
+        "cylinder; no focal length known.",
+    )

@@ -6,7 +6,6 @@ times of the same run.
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import time
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from torch import Tensor
 
 from patchproof.claims import Estimate, median
 
@@ -65,12 +63,6 @@ def clocked(call: Callable[[], Answer]) -> tuple[Answer, float]:
 def ratio(seconds: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
     """How many times as long `a` took as `b`: the median over rounds, each with its own ratio."""
     return median(seconds[a] / seconds[b])
-
-
-def psnr(picture: Tensor, truth: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of pictures in [0, 1]."""
-    square = float(((picture.double() - truth.double()) ** 2).mean())
-    return -10 * math.log10(max(square, 1e-12))
 
 
 def _processor() -> str:

@@ -1,92 +1,43 @@
-"""The renderer's knobs: texture taps (see `texture`), supersampled edges, and resolution of training views.
+"""How large training's views have to be: a step's time against how far confidences lie from photographs'.
 
-In: the benchmarks' world. Out: one chart per knob.
+In: the benchmarks' world. Out: one chart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from patchproof.bench.chart import Chart, OnStage, Point
-from patchproof.bench.measure import psnr, ratio, timed
-from patchproof.bench.texture import QUICK_WIDTHS_PX, SUBSAMPLES, WIDTHS_PX, texture_chart
-from patchproof.bench.world import World, set_world
-from patchproof.channel.camera import encoded
+from patchproof.bench.measure import ratio, timed
+from patchproof.bench.world import design_for_demo
 from patchproof.claims import student_mean
 from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import ask
 from patchproof.output import image_pixels
-from patchproof.render.photograph import expose, shade
+from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
-from patchproof.render.views import see
 from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import take_photo
-from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 
-SUPERSAMPLES, EDGES_PX = (1, 2, 3), 192
 SIDES_PX = (96, 128, 192, 224, 384)
 
 
 def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
-    """Every chart of the renderer, one after the other."""
-    world, rounds = set_world(80 if quick else 160, on_stage), 2 if quick else 15
-    yield texture_chart(world, QUICK_WIDTHS_PX if quick else WIDTHS_PX, rounds, on_stage)
-    yield edges_chart(world, 2 if quick else 8, rounds, on_stage)
-    yield resolution_chart(world, 6 if quick else 40, rounds, on_stage)
+    """The one chart."""
+    problem, design = design_for_demo(80 if quick else 160, on_stage)
+    yield resolution_chart(problem, design, 6 if quick else 40, 2 if quick else 15, on_stage)
 
 
-# What samples at the object's edges buy
-
-
-def edges_chart(world: World, views: int, rounds: int, on_stage: OnStage) -> Chart:
-    """Samples per pixel of the object against a picture rendered 16 times as large and averaged in linear light."""
-    problem, size_px = world.problem, (EDGES_PX, EDGES_PX)
-    large_px = (EDGES_PX * SUBSAMPLES, EDGES_PX * SUBSAMPLES)
-    settings = problem.scene.settings.changed(camera={"photo_px": size_px})
-    plain = Backgrounds((np.full((1, 1, 3), 128, np.uint8),))  # the object's own edges are what is looked at
-    stage = replace(problem.stage, scene=replace(problem.scene, settings=settings, backgrounds=plain))
-    shown, conditions = world.shown(), problem.scene.draw("select", views)
-    quality: dict[int, list[float]] = {n: [] for n in SUPERSAMPLES}
-    with torch.no_grad():
-        for i in range(views):
-            view = conditions[i : i + 1]
-            large = shade(see(stage, shown, view, large_px), shown)
-            truth = encoded(F.avg_pool2d(large, SUBSAMPLES))
-            for n, values in quality.items():
-                values.append(psnr(encoded(shade(see(stage, shown, view, size_px, n), shown)), truth))
-            on_stage("edges", i + 1, views)
-    seconds = timed(
-        {n: lambda n=n: expose(see(stage, shown, conditions, size_px, n), shown) for n in SUPERSAMPLES}, rounds
-    )
-    return Chart(
-        name="edges",
-        title="Samples per pixel of the object",
-        cost="see + expose, relative to one sample per pixel",
-        error=f"PSNR of the whole picture, dB (mean of {views} views)",
-        series={
-            "object with its patch": [
-                Point(f"{n} × {n}", ratio(seconds, n, 1), student_mean(quality[n]), n == 1) for n in SUPERSAMPLES
-            ]
-        },
-        about=f"Truth: {SUBSAMPLES} × {SUBSAMPLES} samples per pixel, averaged in linear light; {EDGES_PX} px.",
-        higher_is_better=True,
-    )
-
-
-# How large training views have to be
-
-
-def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -> Chart:
+def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, on_stage: OnStage) -> Chart:
     """Sides at which views are rendered against whole photographs of the same conditions, JPEG files and all."""
-    problem, shown = world.problem, world.shown()
+    shown = problem.patch.shown(trained)
     conditions, (classifier,), (indices,) = problem.scene.draw("select", views), problem.classifiers, problem.indices
 
     def pictures(side: int, picture: PiecePicture, part: Conditions) -> Tensor:
@@ -96,8 +47,8 @@ def resolution_chart(world: World, views: int, rounds: int, on_stage: OnStage) -
         return ask(problem, photos).confidence[0]
 
     def step(side: int) -> None:
-        design = world.design.clone().requires_grad_()
-        logits = classifier.logits(pictures(side, world.patch.shown(design), conditions[:8]))
+        design = trained.clone().requires_grad_()
+        logits = classifier.logits(pictures(side, problem.patch.shown(design), conditions[:8]))
         torch.autograd.grad(target_loss(logits, indices, problem.scene.settings.target.goal).mean(), design)
 
     truth = []

@@ -1,4 +1,4 @@
-"""The knobs of training: views per step, optimizer and step size, how conditions are drawn.
+"""The knobs of training: views per step, optimizer and step size.
 
 In: the demo's scene. Out: a chart per knob. Designs are compared on conditions of the evaluate stream, which neither
 trains nor selects. The cost of training is counted in views that the network sees, those of the selection set
@@ -7,7 +7,6 @@ included; what one of them takes is `render`'s business.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,22 +14,18 @@ import numpy as np
 from torch import Tensor
 
 from patchproof.bench.chart import Chart, OnStage, Point
-from patchproof.bench.world import demo_problem, set_world, with_optimize
-from patchproof.claims import Estimate, paired_means, standard_deviation, student_mean
+from patchproof.bench.world import demo_problem, with_optimize
+from patchproof.claims import paired_means
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
-from patchproof.report.tables import Table
-from patchproof.scene.conditions import Stream
 from patchproof.settings import OptimizeSettings
 
 VIEWS, QUICK_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
 ADAM, QUICK_ADAM = (0.01, 0.025, 0.05, 0.1, 0.2), (0.025, 0.05, 0.1)  # step sizes
 SIGN, QUICK_SIGN = (0.01, 0.03, 0.1), (0.03,)
-SAMPLES, QUICK_SAMPLES = (8, 16, 32, 64, 128, 256), (8, 16, 32, 64)
-
 
 USUAL = OptimizeSettings(step_size=Patch.STEP_SIZE)
 Losses = Mapping[tuple[OptimizeSettings, int], Sequence[float]]  # by settings and training views, one per seed
@@ -55,7 +50,6 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, on_stage)
     yield runs_chart("views", "Views per step, for as many views in all", views, losses, effort)
     yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
-    yield draws_chart(quick, on_stage)
 
 
 # Views per step, and how the design moves: quality after as many views
@@ -109,42 +103,3 @@ def trained(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
     """The best design, as printed, after each of these numbers of steps (rising)."""
     states: dict[int, State] = {step.state.number: step.state for step in steps(problem)}
     return [from_pixels(as_pixels(states[number].best)) for number in numbers]
-
-
-# Sobol points against independent draws
-
-
-def draws_chart(quick: bool, on_stage: OnStage) -> Chart:
-    """How far the loss of n views lies from that of all views, by how their conditions were drawn."""
-    counts, scrambles, single = (QUICK_SAMPLES, 10, 256) if quick else (SAMPLES, 40, 2048)
-    world = set_world(40 if quick else 160, lambda stage, done, total: None)
-
-    def losses(stream: Stream, count: int, seed: int) -> np.ndarray:
-        conditions = world.problem.scene.draw(stream, count, seed)
-        return responses(world.problem, {0: world.shown()}, conditions, world.problem.training_px)[0].loss[0]
-
-    sobol = []
-    for seed in range(scrambles):
-        sobol.append(losses("select", counts[-1], seed))
-        on_stage("Sobol", seed + 1, scrambles)
-    alone = losses("evaluate", single, 0)
-    square = student_mean((alone - alone.mean()) ** 2)  # losses are far from normal: no χ² interval
-    spread, low, high = (math.sqrt(max(x, 0)) for x in (square.value, square.low, square.high))
-    by_chance = [Estimate(spread / n**0.5, low / n**0.5, high / n**0.5, single) for n in counts]
-    by_sobol = [standard_deviation(np.stack(sobol)[:, :n].mean(1)) for n in counts]
-    pairs = list(zip(counts, by_sobol, by_chance, strict=True))
-    worth = tuple((n, n * (chance.value / sobol.value) ** 2) for n, sobol, chance in pairs)
-    return Chart(
-        name="draws",
-        title="How conditions are drawn",
-        cost="views that the loss is estimated from",
-        error="standard deviation of the mean loss over draws",
-        series={
-            "Sobol points": [Point(f"{n}", n, sobol, n == SELECT_VIEWS) for n, sobol, _ in pairs],
-            "independent": [Point(f"{n}", n, chance) for n, _, chance in pairs],
-        },
-        about=f"Sobol: {scrambles} scrambles; independent: spread of {single} single views, over √n. Default: the "
-        "selection set, which as training is drawn by Sobol points.",
-        tables=(Table("draws_worth", "As many independent views do the same", ("Sobol views", "independent"), worth),),
-        one_front=True,
-    )

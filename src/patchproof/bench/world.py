@@ -6,7 +6,7 @@ optimization, since a real one has more contrast and finer detail than a picture
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,41 +15,20 @@ from torch import Tensor
 from patchproof.bench.chart import OnStage
 from patchproof.journey.demo import demo_scene
 from patchproof.optimizer.loop import start, steps
-from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.render.pixels import PiecePicture
 from patchproof.scene.scene import load_scene
 from patchproof.settings import OptimizeSettings
-from patchproof.sheets.piece import Piece
 
 
-@dataclass(frozen=True)
-class World:
-    """The demo's problem with its patch, and a design that was optimized a little for it (3×h×w)."""
-
-    problem: Problem
-    patch: Patch
-    piece: Piece
-    design: Tensor
-
-    def shown(self, tiled: int = 1) -> PiecePicture:
-        """The printed piece with the design, side by side with itself where it is `tiled`."""
-        return self.patch.shown(self.design.repeat(1, tiled, tiled))
-
-    def control(self, kind: str) -> PiecePicture:
-        """The printed piece with one of the design's controls."""
-        return self.patch.shown(from_pixels(self.patch.control(kind, self.patch.pixels(self.design))), kind)
-
-
-def set_world(count: int, on_stage: OnStage) -> World:
-    """The demo's problem, and the best design of `count` steps of its optimization."""
+def design_for_demo(count: int, on_stage: OnStage) -> tuple[Problem, Tensor]:
+    """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
     problem = with_optimize(demo_problem(), OptimizeSettings(steps=count))
     state = start(problem)
     for step in steps(problem, state):
         state = step.state
         on_stage("design", state.number, count)
-    return World(problem, problem.patch, problem.patch.scene.piece, from_pixels(as_pixels(state.best)))
+    return problem, from_pixels(as_pixels(state.best))
 
 
 def demo_problem() -> Problem:

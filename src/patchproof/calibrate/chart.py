@@ -270,19 +270,9 @@ def _row(reading: Reading, error: float | None) -> dict[str, Any]:
         "file": reading.path.name,
         "sha256": hashlib.sha256(reading.path.read_bytes()).hexdigest(),
         "print": reading.of_print + 1,
-        "when": _day(reading.path),
         "paper": [round(value, 3) for value in reading.chart.paper],
         "unevenness": round(reading.chart.unevenness, 2),
         "paper_misfit": round(reading.chart.misfit, 4),
         "px_per_mm": round(reading.chart.px_per_mm, 2),
         "delta_e00_from_print": None if error is None else round(error, 2),
     }
-
-
-def _day(path: Path) -> str | None:
-    """The day on which the camera says that it took the picture."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        taken = image.getexif().get_ifd(0x8769).get(0x9003)  # DateTimeOriginal, "2026:11:21 10:00:00"
-    return str(taken)[:10].replace(":", "-") if taken else None

@@ -29,10 +29,6 @@ from patchproof.strict import Finite, Refused, Strict, nearest, shipped, validat
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)
 SIZE = len(NODES_8BIT)
-# A color is in gamut where the printer misses it by at most this ΔE00. Colors that the shipped printers have just shown
-# are missed by up to 2.2 (coated) and 3.9 (uncoated) when they are sent, in 99 of 100: the round trip's own error.
-IN_GAMUT = 3.0
-_HALVINGS = 10
 Method = Literal["measured", "icc", "assumed"]
 GAMUT_STEPS = 8  # the gamut table is stored in eighths of a ΔE00, up to 31.9
 
@@ -69,29 +65,6 @@ class Printer:
     def gamut_distance(self, srgb: Tensor) -> Tensor:
         """N×1×H×W: ΔE00 by which the printer misses each color; differentiable, and so a penalty."""
         return _look_up(self._distances, srgb)
-
-    def into_gamut(self, srgb: Tensor) -> Tensor:
-        """N×3×H×W: colors that the printer misses by at most IN_GAMUT as they are; in place of others what it shows for
-        them and, where it misses that, too, a mix with middle gray. Holds where `holds_gray`; no gradients.
-        """
-        with torch.no_grad():
-            srgb = srgb.clamp(0, 1)
-            shown = torch.where(self.gamut_distance(srgb) > IN_GAMUT, self.apply(srgb), srgb)
-            missed = self.gamut_distance(shown) > IN_GAMUT
-            if not missed.any():
-                return shown
-            gray = torch.full_like(shown, 0.5)
-            low, high = torch.zeros_like(shown[:, :1]), torch.ones_like(shown[:, :1])  # share of the color itself
-            for _ in range(_HALVINGS):
-                middle = (low + high) / 2
-                good = self.gamut_distance(torch.lerp(gray, shown, middle)) <= IN_GAMUT
-                low, high = torch.where(good, middle, low), torch.where(good, high, middle)
-            return torch.where(missed, torch.lerp(gray, shown, low), shown)
-
-    @property
-    def holds_gray(self) -> bool:
-        """Whether middle gray is in gamut. It is not where the table is of a printer whose tones are not corrected."""
-        return float(self.gamut_distance(torch.full((1, 3, 1, 1), 0.5))) <= IN_GAMUT
 
     @cached_property
     def _colors(self) -> Tensor:

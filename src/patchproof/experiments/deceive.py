@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import Field
 
-from patchproof.experiments.turntable import sides
+from patchproof.experiments.sides import sides
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses
@@ -27,7 +27,7 @@ from patchproof.study.grid import grouped, of_values, problem_of, short_name
 from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
-from patchproof.study.trained import TrainedSettings, Way, Word, left_out_note, tested_in, trained_cells, trained_on
+from patchproof.study.trained import TrainedSettings, Way, Word, tested_in, trained_cells, trained_on
 
 CONTROLS = ("bare", "gray", "noise", "shuffled")
 _KINDS = ("design", *CONTROLS)
@@ -37,7 +37,6 @@ _SHEET_PX, _SHEET_VIEWS = 160, 4
 class DeceiveSettings(TrainedSettings):
     """As in all studies of trained designs; each network trains alone and all of them test."""
 
-    # By name: tables of the scene file with the keys that change.
     # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field(
         {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
@@ -76,9 +75,8 @@ def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
             rates.append((*start, *(level[0] for level in levels), levels[0][1]))
             differences.append((*start, *(records["design"].gain(records[kind], network)[0] for kind in CONTROLS)))
     head, n = ("scene", "way", "trained on", "tested on"), f"{settings.n} unseen conditions per seed"
-    note = left_out_note(settings, results)
     return [
-        Table("rates", "Rates", (*head, *_KINDS, "confidence"), tuple(rates), f"Over {n}.{note}"),
+        Table("rates", "Rates", (*head, *_KINDS, "confidence"), tuple(rates), f"Over {n}."),
         Table(
             "differences",
             "The design minus each control",

@@ -44,14 +44,14 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
 from patchproof.scene.scene import Scene
 from patchproof.strict import Refused, expand, nearest
-from patchproof.study.figures import number_grid, picture_sheet
+from patchproof.study.figures import picture_sheet
 from patchproof.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 KINDS = ("bare", "gray", "noise", "patch")
 OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target
@@ -133,12 +133,12 @@ def _answers(
     """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
     (classifier,), (target,) = problem.classifiers, problem.indices
     own = _indices(classifier, images_of)
-    both = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
+    judged = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
     return {
         "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
         "images": len(scene.images),
         "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
-        "hits": recorded(responses(both, shown, scene.draw("evaluate", n)))["hits"],
+        "hits": recorded(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
     }
 
 
@@ -221,21 +221,10 @@ def _pooled(results: Sequence[Result]) -> Table:
 
 
 def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Heat maps of what each patch does to each class, and what was made."""
-    count, networks = (
-        len(results[0].answers["classes"]),
-        list(dict.fromkeys(result.cell.values["network"] for result in results)),
-    )
+    """What was made."""
     firsts = [group[0] for group in grouped(results, of_values("target")).values()]
     files = [(_target(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
     return [
-        Drawing(
-            "effect",
-            "What each patch does to each class",
-            lambda figure: _draw_effect(figure, results, networks),
-            (1.6 + 0.75 * count, 1.4 + (0.5 * len(firsts) + 0.6) * len(networks)),
-            "Rate with the patch minus rate without it, in points, by the image's own labels. Targets are framed.",
-        ),
         picture_sheet(
             "patches",
             "Patches, and images with them",
@@ -244,25 +233,6 @@ def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawin
             "The patch, its own class, and other classes; first network and seed of each target.",
         ),
     ]
-
-
-def _draw_effect(figure: Figure, results: Sequence[Result], networks: Sequence[str]) -> None:
-    panels = figure.subplots(len(networks), 1, squeeze=False)[:, 0]
-    classes = results[0].answers["classes"]
-    for axes, network in zip(panels, networks, strict=True):
-        groups = [group for (_, of_group), group in _by_target(results).items() if of_group == network]
-        values, framed = np.zeros((len(groups), len(classes))), []
-        for row, group in enumerate(groups):
-            for column in range(len(classes)):
-                of_class = [result.answers["classes"][column] for result in group]
-                values[row, column] = 100 * _effect(of_class, OWN, "bare")
-                framed += [(row, column)] if of_class[0]["same"] else []
-        texts = [[f"{value:+.0f}" for value in row] for row in values]
-        number_grid(axes, values, texts, framed, "RdBu", (-100, 100))
-        axes.set_xticks(range(len(classes)), [each["name"].replace(" (", "\n(") for each in classes], fontsize=7)
-        axes.set_yticks(range(len(groups)), [_target(group[0])["name"] for group in groups], fontsize=7)
-        axes.set_ylabel("patch for")
-        axes.set_title(f"{network}: images of", fontsize=9)
 
 
 def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:

@@ -42,14 +42,14 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import needs_patch
 from patchproof.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
 from patchproof.strict import Range, Refused, Share
-from patchproof.study.figures import picture_sheet, whiskers
+from patchproof.study.figures import picture_sheet
 from patchproof.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import Record, hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 KINDS = ("bare", "gray", "noise", "2d", "3d")
 HARD = 0.2  # clean rate up to which an object counts as misread
@@ -223,13 +223,9 @@ def _by_cell(results: Sequence[Result]) -> Table:
 
 
 def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Rates by object, 3D against 2D by cluster, and what was optimized."""
+    """What was optimized."""
     firsts = [group[0] for group in grouped(results, of_values("name")).values()]
     return [
-        Drawing("rates", "Rates by object", lambda figure: _draw_rates(figure, results), (7.5, 3.6)),
-        Drawing(
-            "scatter", "3D against 2D, a point per cell", lambda figure: _draw_scatter(figure, results), (4.4, 4.2)
-        ),
         picture_sheet(
             "designs",
             "What was optimized: first network and seed of each object",
@@ -238,30 +234,6 @@ def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawin
             "2D design, pasted into an image, on the object; 3D design, on the object in the same view.",
         ),
     ]
-
-
-def _draw_rates(figure: Figure, results: Sequence[Result]) -> None:
-    axes, rows = figure.add_subplot(), _by_object(results, ("3d", "2d"), None)
-    colors = ("#b8bcc2", "#8a8f98", "#5f6570", "#e09f3e", "#2a6f97")
-    for i, (kind, color) in enumerate(zip(KINDS, colors, strict=True)):
-        values, reach = whiskers([row[1 + i] for row in rows])
-        x = np.arange(len(rows)) + (i - 2) * 0.16
-        axes.bar(x, values, 0.15, color=color, label=kind, yerr=reach, error_kw={"linewidth": 0.8})
-    axes.set_xticks(range(len(rows)), [row[0] for row in rows])
-    axes.set_ylim(0, 1)
-    axes.set_ylabel("rate")
-    axes.legend(ncols=len(KINDS), loc="upper center", bbox_to_anchor=(0.5, 1.15), frameon=False)
-
-
-def _draw_scatter(figure: Figure, results: Sequence[Result]) -> None:
-    axes = figure.add_subplot()
-    for (network,), group in grouped(results, of_values("network")).items():
-        flat, deep = ([_mean([result], kind) for result in group] for kind in ("2d", "3d"))
-        axes.plot(flat, deep, "o", label=network, alpha=0.7)
-    axes.plot([0, 1], [0, 1], color="#8a8f98", linewidth=0.8)
-    axes.set_xlabel("rate, optimized in 2D")
-    axes.set_ylabel("rate, optimized in 3D")
-    axes.legend(loc="lower right")
 
 
 def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:

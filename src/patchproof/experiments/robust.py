@@ -1,15 +1,14 @@
 """Free textures from gray: what networks ask for when an object should be read as a class.
 
 In: scenes, classes (labels), networks and seeds. Every texture is free and starts from gray, so that whatever color and
-pattern it has, a network asked for. Out: rates on all networks beside the untrained gray, a turntable contact sheet,
-the mean color per class (which color is preferred), and what of the change did it (see `turntable`).
+pattern it has, a network asked for. Out: rates on all networks beside the untrained gray, the mean color per class
+(which color is preferred), and a contact sheet.
 
 Source: Pestana et al., robust designs.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.experiments.turntable import attributions, goal_log, heat, mean_color, sides, turn
+from patchproof.experiments.sides import mean_color, sides
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.responses import responses
@@ -32,7 +31,6 @@ from patchproof.study.trained import (
     TrainedSettings,
     Way,
     Word,
-    left_out_note,
     tested_in,
     trained_cells,
     trained_on,
@@ -43,6 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHEET_PX, _TURN_VIEWS, _SIDES = 160, 8, 3
+_KINDS = ("start", "design")
 
 
 class RobustSettings(TrainedSettings):
@@ -63,23 +62,18 @@ def cells(settings: RobustSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train for one class on one network; rates on all, pictures, mean color, attributions."""
+    """Train for one class on one network; rates on all, pictures, mean color."""
     problem = problem_of(base, cell.values)
-    training, subject = trained_on(problem, cell), problem.subject
-    design = best_design(training)
-    things = {"start": subject.shown(subject.start()), "design": subject.shown(from_pixels(design, problem.device))}
-    views = sides(problem, _SIDES)
-    before, after = (photographs(problem, thing, views, training.training_px) for thing in things.values())
-    attributed = attributions(training, before, after)
-    suffix, content = problem.subject.file(design)
-    turned = [turn(problem, thing, _TURN_VIEWS, _SHEET_PX) for thing in things.values()]
+    subject, views = problem.subject, sides(problem, _SIDES)
+    design = best_design(trained_on(problem, cell))
+    pixels = (subject.start(), from_pixels(design, problem.device))
+    things = {kind: subject.shown(each) for kind, each in zip(_KINDS, pixels, strict=True)}
+    suffix, content = subject.file(design)
+    sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
     return {
         **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),
         "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
-        "attributed": attributed.sum((1, 2)).tolist(),
-        "change": (goal_log(training, after) - goal_log(training, before)).tolist(),
-        f"{cell.name}.turn.png": contact_sheet(turned),
-        f"{cell.name}.changed.png": contact_sheet([before, after, heat(attributed)]),
+        f"{cell.name}.sheet.png": sheet,
         f"{cell.name}.{suffix}": content,
     }
 
@@ -93,10 +87,8 @@ def _by_design(results: Sequence[Result]) -> Mapping[Key, Sequence[Result]]:
 
 
 def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
-    """Rates on all networks beside gray; the mean color of each class; how much of the change attributions explain,
-    which is a check of them, not of the design.
-    """
-    rates, colors, sums = [], [], []
+    """Rates on all networks beside gray; the mean color of each class."""
+    rates, colors = [], []
     for key, of_key in _by_design(results).items():
         design, begun = Record(of_key, "design"), Record(of_key, "start")
         for network in tested_in(of_key):
@@ -105,20 +97,13 @@ def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
             rates.append((*key, short_name(network), *levels, gain, verdict(gain)))
         codes = _mean_codes(of_key)
         colors.append((*key, _hex(codes), *codes))
-        sums += [
-            (*key, *(sum(result.answers[what]) / _SIDES for what in ("change", "attributed"))) for result in of_key
-        ]
     about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
-    about += left_out_note(settings, results)
     of_colors = "Mean light of the object's pixels over a full turn in even white light, as sRGB codes."
-    of_sums = "Of the log of the class's confidence, mean of three views: the two should agree."
     head = (*_HEAD, "tested on", "gray", "design", "confidence", "gain", "shows")
     named = (*_HEAD, "mean color", "red", "green", "blue")
-    summed = (*_HEAD, "change", "sum of attributions")
     return [
         Table("rates", "Rates", head, tuple(rates), about),
         Table("colors", "Mean colors", named, tuple(colors), of_colors),
-        Table("attributions", "What the attributions add up to", summed, tuple(sums), of_sums),
     ]
 
 
@@ -133,20 +118,8 @@ def _hex(codes: tuple[int, int, int]) -> str:
     return "#{:02x}{:02x}{:02x}".format(*codes)
 
 
-# what of a cell's pictures, title, inches of one picture, about
-_SHEETS = (
-    ("turn", "A full turn", (7.0, 1.8), "Above the start, below the design, in even light; the first seed."),
-    (
-        "changed",
-        "What of the change counts",
-        (3.4, 3.4),
-        "Start, design, integrated gradients between them: red raised the class's confidence, blue lowered it.",
-    ),
-)
-
-
 def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Colors of all classes, and per scene and way what the designs look like and what of them counts."""
+    """Colors of all classes, and per scene and way what the designs look like."""
     by_design = _by_design(results)
     rows, networks = list(dict.fromkeys(key[:3] for key in by_design)), list(dict.fromkeys(key[3] for key in by_design))
     drawings = [
@@ -160,12 +133,10 @@ def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing
     ]
     for scene, way in dict.fromkeys(row[:2] for row in rows):
         firsts = {f"{key[2]}, {key[3]}": some[0] for key, some in by_design.items() if key[:2] == (scene, way)}
-        for what, title, (wide, high), about in _SHEETS:
-            files = [(label, first.file(f"{first.cell.name}.{what}.png")) for label, first in firsts.items()]
-            columns = max(1, min(len(files), int(10 / wide)))
-            size = (wide * columns, (high + 0.3) * math.ceil(len(files) / columns))
-            name = f"{what}_{scene}_{way}"
-            drawings.append(picture_sheet(name, f"{title}: {scene}, {way}", files, size, about, columns))
+        files = [(label, first.file(f"{first.cell.name}.sheet.png")) for label, first in firsts.items()]
+        about = "Above the start, below the design, in even light; the first seed."
+        title = f"Designs: {scene}, {way}"
+        drawings.append(picture_sheet(f"sheet_{scene}_{way}", title, files, (3.6, 2.7 * len(files)), about))
     return drawings
 
 

@@ -20,16 +20,20 @@ from pydantic import Field
 from torch import Tensor
 
 from patchproof.claims import difference, rate
-from patchproof.experiments.hard_views import LIGHT, POSE, each_before_all
-from patchproof.experiments.heat import heat_map, map_ticks, words_of
 from patchproof.experiments.stress_map import (
+    LIGHT,
+    POSE,
     MapSettings,
     axes_of,
     axes_values,
     clean,
+    each_before_all,
+    heat_map,
     in_cells,
     map_of,
+    map_ticks,
     mesh_cells,
+    words_of,
     worst_cells,
 )
 from patchproof.optimizer.problem import Problem

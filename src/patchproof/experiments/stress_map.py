@@ -1,33 +1,42 @@
-"""What stress tests share: cells of pose × light, and what a network answers to the clean object there.
+"""Maps of stress tests: cells of pose × light, what a network answers to the clean object there, and how that is drawn.
 
 In: a scene with a mesh before one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
-a map while everything else stays as drawn; recognized and confidence per draw; and the worst tenth of a map's cells.
-All cells of a map share the same draws of background, camera and whatever is no axis, so that cells differ in pose and
-light alone.
+a map while everything else stays as drawn; recognized and confidence per draw; the worst tenth of a map's cells; and
+`Drawing`s, which share one scale from 0 to 1. All cells of a map share the same draws of background, camera and
+whatever is no axis, so that cells differ in pose and light alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from patchproof.channel.effects import EFFECTS
+from patchproof.channel.effects import EFFECT, EFFECTS
 from patchproof.goal import Goal
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, responses
+from patchproof.report.tables import Drawing
 from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, Strict
+from patchproof.study.figures import number_grid
 from patchproof.study.grid import Count, GridSettings, cell_of, pairs
 from patchproof.study.study import Cell
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
 LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
+# What of a draw is the pose and the light; the rest is background, print and camera.
+POSE = EFFECT["viewpoint"].fields
+_LIGHT = ("ambient light", "directional light", "exposure", "lamp", "uneven ambient")
+LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
 WORST_SHARE = 0.1
 
 
@@ -52,6 +61,8 @@ class Axis:
         return len(self.edges) - 1
 
 
+Ticks = tuple[str, Sequence[float], Sequence[str]]  # an axis's label, where its ticks are, and what they say
+_UNITS = {"deg": "°", "mm": "mm", "ev": "EV"}
 Place = tuple[int, int]  # a map's cell: which of the poses, which of the lights
 
 
@@ -101,6 +112,13 @@ def in_cells(conditions: Conditions, axes: tuple[Axis, Axis], places: Sequence[P
     return of_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
+def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str]) -> Conditions:
+    """The fields `names` of each row of `tried`, with all else from each row of `rest`: row by row of `tried`."""
+    rows = np.tile(np.arange(len(rest)), len(tried))
+    fields = fields_of(tried)
+    return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
+
+
 def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Answers:
     """The networks' answers to the clean object (bare, or with its own texture)."""
     return responses(problem, {"clean": None}, conditions, side_px)["clean"]
@@ -119,3 +137,45 @@ def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assi
     rate, sure = goal.sign * hits.mean(2).ravel(), goal.sign * confidence.mean(2).ravel()
     order = np.lexsort((np.arange(rate.size), sure, rate))[: math.ceil(WORST_SHARE * rate.size)]
     return [(int(i), int(j)) for i, j in zip(*np.unravel_index(order, hits.shape[:2]), strict=True)]
+
+
+def heat_map(
+    name: str,
+    titles: tuple[str, str],
+    rates: Sequence[Sequence[float]],
+    framed: Sequence[Sequence[int]],
+    ticks: Sequence[Ticks],
+    upward: bool = True,
+) -> Drawing:
+    """Rates over two axes, the second one upward or down; `titles` are the drawing's and the plot's own."""
+
+    def draw(figure: Figure) -> None:
+        plot, values = figure.add_subplot(), np.array(rates).T
+        texts = [[f"{value:.2f}" for value in row] for row in values]
+        image = number_grid(plot, values, texts, [(y, x) for x, y in framed], fontsize=8)
+        figure.colorbar(image, ax=plot, label="rate")
+        for axis, (label, places, words) in zip((plot.xaxis, plot.yaxis), ticks, strict=True):
+            axis.set_ticks(places, words)
+            axis.set_label_text(label)
+        if upward:
+            plot.invert_yaxis()
+        plot.set_title(titles[1])
+
+    size = max(2.2 + 0.6 * len(rates), 5.5), max(1.6 + 0.42 * len(rates[0]), 3.2)
+    return Drawing(name, titles[0], draw, size)
+
+
+def map_ticks(axes: Mapping[str, Any]) -> list[Ticks]:
+    """Of a map's axes (`names`, and the `edges` of their cells)."""
+    return [
+        (words_of(name), [i - 0.5 for i in range(len(edges))], [f"{value:.4g}" for value in edges])
+        for name, edges in zip(axes["names"], axes["edges"], strict=True)
+    ]
+
+
+def words_of(name: str) -> str:
+    """A condition's field as people read it: "azimuth (°)" for azimuth_deg."""
+    words, unit = name.split("_"), ""
+    if words[-1] in _UNITS:
+        unit = f" ({_UNITS[words.pop()]})"
+    return " ".join(words) + unit

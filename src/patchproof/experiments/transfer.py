@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.claims import rate
-from patchproof.experiments.turntable import sides, three_views
+from patchproof.experiments.sides import sides, three_views
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses
@@ -34,7 +34,6 @@ from patchproof.study.trained import (
     ORIGINAL,
     TrainedSettings,
     alone,
-    left_out_note,
     tested_in,
     trained_cells,
     trained_on,
@@ -92,7 +91,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
 def tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
     """The matrix, networks left out, and fixed views."""
     rows = _rows(results)
-    return [_matrix(settings, results, rows), *_left_out(results, rows), *_views(settings, rows)]
+    return [_matrix(settings, rows), *_left_out(results, rows), *_views(settings, rows)]
 
 
 Rows = Mapping[tuple, Mapping[str, Sequence[Result]]]  # results by (scene, way), then by row
@@ -103,7 +102,7 @@ def _rows(results: Sequence[Result]) -> Rows:
     return {key: grouped(group, lambda result: result.cell.values["row"]) for key, group in groups.items()}
 
 
-def _matrix(settings: TransferSettings, results: Sequence[Result], groups: Rows) -> Table:
+def _matrix(settings: TransferSettings, groups: Rows) -> Table:
     rows = []
     for key, by_row in groups.items():
         original = Record(by_row.get(ORIGINAL, ()), "design")
@@ -121,7 +120,6 @@ def _matrix(settings: TransferSettings, results: Sequence[Result], groups: Rows)
     about = (
         f"Rates and mean confidences of the target over {settings.n} unseen conditions per seed"
         f" ({len(settings.seeds)} of them); gains are over the original on the same conditions, paired."
-        f"{left_out_note(settings, results)}"
     )
     head = (*head, "confidence", "gain in confidence")
     return Table("matrix", "Trained on one, tested on another", head, tuple(rows), about)

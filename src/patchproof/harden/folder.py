@@ -30,14 +30,13 @@ from patchproof.harden.harden import Epsilon, Method, epsilon_words, harden, mov
 from patchproof.harden.labeled import in_blocks, labeled_files, read_large_enough
 from patchproof.output import image_bytes, write_whole
 from patchproof.photo.cannot import CannotJudge
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Table
 from patchproof.strict import Positive, Refused, Share, Strict, expand
 from patchproof.study.grid import Count, Names, short_name
 from patchproof.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    pass
 
 Attack = Literal["fgsm", "pgd"]
 Condition = tuple[str, float]  # an attack and its ε
@@ -194,40 +193,7 @@ def too_strong(condition: Condition, survivors: Mapping[Condition, int]) -> bool
     )
 
 
-def figures(settings: HardenSettings, results: Sequence[Result]) -> list[Drawing]:
-    """Accuracy over the attack's ε, original and hardened, a panel per network and attack."""
-    names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
-
-    def draw(figure: Figure) -> None:
-        grid = figure.subplots(len(names), len(settings.attacks), squeeze=False, sharex=True, sharey=True)
-        for panels, name in zip(grid, names, strict=True):
-            for axes, attack in zip(panels, settings.attacks, strict=True):
-                _draw_panel(axes, settings, results, name, attack)
-        grid[0, 0].legend(frameon=False, fontsize=7)
-        figure.supxlabel("ε of the attack", fontsize=9)
-        figure.supylabel("share recognized", fontsize=9)
-
-    if not settings.attacks or not settings.attack_epsilons:
-        return []
-    size = (4 * len(settings.attacks) + 0.5, 2.2 * len(names) + 0.6)
-    return [Drawing("accuracy", "Accuracy under attack", draw, size, "ε = 0 is the clean photograph.")]
-
-
-def _draw_panel(axes: Axes, settings: HardenSettings, results: Sequence[Result], name: str, attack: str) -> None:
-    conditions = list(_conditions(settings).values())
-    shown = [i for i, (other, _) in enumerate(conditions) if other in ("clean", attack)]
-    for variant in (None, *(some for some in _variants(settings) if name in some["models"])):
-        if outcomes := list(_outcomes(results, variant, name).values()):
-            shares = [float(np.mean([right[i] for right in outcomes])) for i in shown]
-            label, line = (" ".join(_words(variant)[1:]), "-o") if variant else ("original", "--o")
-            axes.plot([conditions[i][1] for i in shown], shares, line, color=None if variant else "0.4", label=label)
-    axes.set_ylim(-0.05, 1.05)
-    axes.set_title(f"{short_name(name)}, {attack}", fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.25)
-
-
-STUDY = Study("harden", HardenSettings, cells, run, tables, figures, files=".", own_files=("images",))
+STUDY = Study("harden", HardenSettings, cells, run, tables, files=".", own_files=("images",))
 
 
 def _variants(settings: HardenSettings) -> list[dict[str, Any]]:

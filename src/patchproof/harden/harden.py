@@ -27,7 +27,7 @@ from pydantic import BeforeValidator
 from torch import Tensor
 
 from patchproof.classifier.network import Classifier, center_square
-from patchproof.harden.attacks import Loss, cross_entropy, even_loss
+from patchproof.harden.attacks import cross_entropy, even_loss
 
 Method = Literal["pgd", "fgsm", "adam"]
 # Without ε. Of 11 photographs hardened in 50 steps against a MobileNetV1 0.25, PGD of 0.01 left, with steps of 0.03 and
@@ -68,7 +68,6 @@ def harden(
     epsilon: float | None,
     steps: int,
     step_size: float | None = None,
-    loss: Loss = cross_entropy,
 ) -> list[np.ndarray]:
     """Photographs H×W×3 of any sizes, hardened together; `labels[m][n]` is network m's index for photograph n.
 
@@ -81,7 +80,7 @@ def harden(
     adam = torch.optim.Adam(pixels, lr=step) if method == "adam" else None
     for number in range(steps):
         alpha = step if method == "fgsm" else step * (1 - number / steps)
-        gradients = torch.autograd.grad(_evened_loss(pixels, truth, classifiers, loss), pixels)
+        gradients = torch.autograd.grad(_evened_loss(pixels, truth, classifiers), pixels)
         with torch.no_grad():
             for picture, gradient in zip(pixels, gradients, strict=True):
                 if adam is None:
@@ -111,11 +110,9 @@ def moved(original: np.ndarray, hardened: np.ndarray) -> tuple[float, float]:
     return float((a - b).double().square().mean().sqrt()), sum(similar) / 3
 
 
-def _evened_loss(
-    pixels: Sequence[Tensor], truth: Sequence[Tensor], classifiers: Sequence[Classifier], loss: Loss
-) -> Tensor:
+def _evened_loss(pixels: Sequence[Tensor], truth: Sequence[Tensor], classifiers: Sequence[Classifier]) -> Tensor:
     views = (torch.cat([center_square(picture, c.input_px) for picture in pixels]) for c in classifiers)
-    return even_loss([c.network(view) for c, view in zip(classifiers, views, strict=True)], truth, loss)
+    return even_loss([c.network(view) for c, view in zip(classifiers, views, strict=True)], truth, cross_entropy)
 
 
 def _step(method: Method, epsilon: float | None, steps: int) -> float:

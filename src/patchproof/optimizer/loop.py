@@ -23,7 +23,6 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.views import Views
-from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
 
@@ -84,13 +83,11 @@ def views_seen(settings: OptimizeSettings) -> int:
     return settings.steps * settings.views + selections(settings) * SELECT_VIEWS
 
 
-def steps(problem: Problem, state: State | None = None, conditions: Conditions | None = None) -> Iterator[Step]:
-    """The steps from `state` (or from the start) to the last one that the scene's settings ask for; `conditions` of all
-    steps, `views` rows each, in place of the draws of the train stream.
-    """
+def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
+    """The steps from `state` (or from the start) to the last one that the scene's settings ask for."""
     state = start(problem) if state is None else state
     settings = problem.scene.settings.optimize
-    conditions = problem.scene.draw("train", settings.steps * settings.views) if conditions is None else conditions
+    conditions = problem.scene.draw("train", settings.steps * settings.views)
     selection = _selection(problem)
     while state.number < settings.steps:
         first = state.number * settings.views
@@ -102,10 +99,10 @@ def steps(problem: Problem, state: State | None = None, conditions: Conditions |
         yield step
 
 
-def best_design(problem: Problem, conditions: Conditions | None = None) -> np.ndarray:
+def best_design(problem: Problem) -> np.ndarray:
     """Run the whole loop; the pixels of the design that the selection set liked best."""
     state = start(problem)
-    for step in steps(problem, state, conditions):
+    for step in steps(problem, state):
         state = step.state
     return problem.subject.pixels(state.best)
 

@@ -53,9 +53,7 @@ class Patch:
         return torch.full((3, height, width), 0.5, device=self.device)
 
     def clipped(self, design: Tensor) -> Tensor:
-        """The nearest design that can be printed; with `in_gamut`, that the printer shows as it is asked to."""
-        if self.scene.settings.optimize.in_gamut:
-            return self.printer.into_gamut(design[None])[0]
+        """The nearest design in [0, 1]."""
         return design.clamp(0, 1)
 
     def levels(self, gradient: Tensor) -> tuple[Tensor, ...]:

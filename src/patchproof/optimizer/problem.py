@@ -13,7 +13,7 @@ from functools import partial
 
 import torch
 
-from patchproof.channel.printer import IN_GAMUT, Printer, load_printer
+from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -92,10 +92,6 @@ def set_problem(
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
-    if settings.optimize.in_gamut and not printer.holds_gray:
-        got = f"{printer.name}, which does not even show middle gray so"
-        do = "leave optimize.in_gamut out: pictures are made through the printer's table anyway"
-        raise Refused(f"a printer that shows colors as they are sent within ΔE00 {IN_GAMUT:g}", got, do)
     stage = set_stage(scene, device)
     if scene.HAS_PIECE:
         hung, network_px = needs_piece(scene), max(classifier.input_px for classifier in classifiers)

@@ -3,7 +3,7 @@
 In: a problem, a design that the classifier responds to, and a few views of the select stream. Out: `Terms`. The
 difference is taken where it counts: in the picture as the classifier gets it. What sensors and files do is measured on
 whole photographs' centered squares, stored as real JPEGs, and then asked whether training, which renders smaller views,
-shows it at all. Filtering and edges are measured against one sample per pixel.
+shows it at all.
 Left out on purpose: interactions of terms, but for one check of all that can go, left out at once.
 """
 
@@ -20,19 +20,15 @@ from patchproof.classifier.network import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.output import image_bytes, image_pixels
-from patchproof.plan.terms import Setup, Term, scene_terms, without_camera
-from patchproof.render.photograph import expose, photograph
+from patchproof.plan.terms import Setup, Term, scene_terms
+from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
 from patchproof.render.views import Views, relit, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.placement import Placement
 from patchproof.strict import Strict
 
-# A view of this many times the size, of which every fifth pixel is kept, shows points in place of a pixel's mean.
-_FINE = 5
-_WHOLE = 1 - 1 / 256  # share of a pixel from which on it lies inside of the piece
 _PIXELS_AT_ONCE = 1 << 21  # about 300 MB of pictures and what is between them
-_RENDERED = tuple(Term(name, "", lambda setup: setup) for name in ("footprint filtering", "piece's edges"))
 
 
 class TermError(Strict):
@@ -91,14 +87,12 @@ def measure_terms(
         wholes = [term for term in on if term.whole]
         whole = _squares(problem, photo_px, base, [changed[term.name] for term in wholes], advance)
         small = _squares(problem, problem.training_px, base, [changed[term.name] for term in on], advance)
-        points = _point_sampled(problem, base)
         confidence = _confidence(problem, whole[0])
         threshold = float(confidence.std()) / selection_views**0.5
         rows = {t.name: _row(problem, t, small[0], pictures) for t, pictures in zip(on, small[1:], strict=True)}
         for term, pictures in zip(wholes, whole[1:], strict=True):
             shows = bool(rows[term.name].codes_mean)
             rows[term.name] = _row(problem, term, whole[0], pictures).changed(in_training=shows)
-        rows |= {t.name: _row(problem, t, points[""], points[t.name]) for t in _RENDERED if t.name in points}
         judged = {row.name: row for row in _judged(terms, rows, threshold)}
         gone, setup, together = [t for t in on if t.key and judged[t.name].verdict == "can go"], base, None
         for term in gone:
@@ -117,7 +111,7 @@ def measure_terms(
 
 def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: float) -> list[TermError]:
     """The rows of all terms, with verdicts; terms without a row are off."""
-    terms, verdicts, sum_of_gone = (*terms, *(t for t in _RENDERED if t.name in rows)), {}, 0.0
+    verdicts, sum_of_gone = {}, 0.0
     changes = {name: row.confidence or 0.0 for name, row in rows.items()}
     for term in sorted((t for t in terms if t.name in rows), key=lambda t: changes[t.name]):
         change = changes[term.name]
@@ -197,39 +191,3 @@ def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
     """Pictures N×3×H×W that were JPEG files in between."""
     files = [image_bytes(as_pixels(p), "JPEG", {"quality": int(q)}) for p, q in zip(pictures, quality, strict=True)]
     return torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])
-
-
-def _point_sampled(problem: Problem, base: Setup) -> dict[str, Tensor]:
-    """N×3×S×S pictures by name: as rendered (""), and with one point per pixel within the piece (or, without one, on
-    the object) or along the piece's edges.
-    """
-    setup, side = without_camera(base), problem.training_px
-    scene, parts = setup.stage.scene, []
-    for rows in _chunks(len(base.conditions), _FINE * side):
-        conditions = setup.conditions[rows]
-        views = _views(setup, conditions, (side, side))
-        fine = photograph(setup.stage, setup.shown, conditions, (_FINE * side, _FINE * side), jpeg=False)
-        points = fine[..., _FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
-        rendered = expose(views, setup.shown, jpeg=False)
-        inside, edge = (_mask(which, len(rendered), side) for which in _pixels(views))
-        parts.append(
-            torch.stack([rendered, torch.where(inside, points, rendered), torch.where(edge, points, rendered)])
-        )
-    squares = center_square(torch.cat(parts, 1).flatten(0, 1), problem.classifiers[0].input_px)
-    rendered, inside, edge = squares.unflatten(0, (3, -1))
-    named = {"": rendered, "footprint filtering": inside}
-    return named | {"piece's edges": edge} if scene.HAS_PIECE else named
-
-
-def _pixels(views: Views) -> tuple[Tensor, Tensor]:
-    """Pixels that lie within the piece (or on the object), and those that the piece covers in part."""
-    if views.piece is None:
-        return views.on_object.pixel, views.on_object.pixel[:0]
-    whole = views.piece.share[:, 0] >= _WHOLE
-    return views.piece.pixel[whole], views.piece.pixel[~whole]
-
-
-def _mask(pixel: Tensor, views: int, side_px: int) -> Tensor:
-    mask = torch.zeros(views * side_px**2, dtype=torch.bool, device=pixel.device)
-    mask[pixel] = True
-    return mask.view(views, 1, side_px, side_px)

@@ -103,13 +103,3 @@ def _on_surface(setup: Setup, placement: Placement) -> Setup:
     scene = replace(needs_patch(setup.stage.scene), placement=placement)
     piece = set_stage(scene, setup.stage.device).piece
     return replace(setup, stage=replace(setup.stage, scene=scene, piece=piece))
-
-
-def without_camera(setup: Setup) -> Setup:
-    """The setup before a camera without blur, noise, motion, vignetting and distortion."""
-    for name in ("blur", "noise", "motion blur", "vignetting"):
-        setup = _without(setup, EFFECT[name]) or setup
-    for part in setup.stage.scene.PARTS:
-        if part.camera:
-            setup = _without_part(setup, part) or setup
-    return setup

@@ -1,18 +1,16 @@
-"""Figures that several studies draw: pictures that cells left behind, numbers in a grid, estimates with whiskers.
+"""Figures that several studies draw: pictures that cells left behind, numbers in a grid.
 
-In: files of pictures; rates as lists; estimates. Out: `Drawing`s for a study's page, or what matplotlib takes.
+In: files of pictures; rates as lists. Out: `Drawing`s for a study's page, or what matplotlib takes.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchproof.claims import Estimate
 from patchproof.report.tables import Drawing
 
 if TYPE_CHECKING:
@@ -27,19 +25,15 @@ def picture_sheet(
     files: Sequence[tuple[str, Path]],
     size_in: tuple[float, float],
     about: str = "",
-    per_line: int = 1,
     rows: Sequence[str] = (),
     columns: Sequence[str] = (),
 ) -> Drawing:
-    """PNGs under their titles, `per_line` side by side; `rows` and `columns` name equal parts of each picture."""
+    """PNGs below one another under their titles; `rows` and `columns` name equal parts of each picture."""
 
     def draw(figure: Figure) -> None:
         from matplotlib.image import imread
 
-        panels = figure.subplots(math.ceil(len(files) / per_line), per_line, squeeze=False).ravel()
-        for axes in panels[len(files) :]:
-            axes.set_axis_off()
-        for axes, (caption, path) in zip(panels, files, strict=False):
+        for axes, (caption, path) in zip(figure.subplots(len(files), 1, squeeze=False)[:, 0], files, strict=True):
             picture = imread(path)
             axes.imshow(picture)
             axes.set_title(caption, fontsize=8, loc="left", pad=2)
@@ -71,13 +65,6 @@ def number_grid(
     for row, column in framed:
         axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="red", linewidth=2))
     return image
-
-
-def whiskers(estimates: Sequence[Estimate | None]) -> tuple[list[float], np.ndarray]:
-    """Values and 2×N distances to the ends of their intervals, as matplotlib's error bars take them; NaN of None."""
-    known = [estimate or Estimate(math.nan, math.nan, math.nan, 0) for estimate in estimates]
-    reach = [(max(0.0, each.value - each.low), max(0.0, each.high - each.value)) for each in known]
-    return [each.value for each in known], np.array(reach).reshape(-1, 2).T
 
 
 def _middles(length: int, parts: int) -> list[float]:

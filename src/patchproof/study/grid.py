@@ -66,17 +66,10 @@ def with_tables(values: Values, tables: Tables) -> Values:
 
 def pairs(settings: GridSettings, base: Path) -> Iterator[Values]:
     """The values of every scene before every single network, whose name tables say, but for the seed."""
-    for values in teams(settings, base):
-        for network in values["networks"]:
-            yield values | {"networks": [network], "network": short_name(network)}
-
-
-def teams(settings: GridSettings, base: Path) -> Iterator[Values]:
-    """The values of every scene before all networks together, but for the seed."""
     for file in settings.scenes:
-        values = scene_values(file, base)
-        networks = list(settings.networks) or values["scene"]["target"]["models"]
-        yield values | {"networks": networks, "of_scene": not settings.networks}
+        values: Values = scene_values(file, base) | {"of_scene": not settings.networks}
+        for network in settings.networks or values["scene"]["target"]["models"]:
+            yield values | {"networks": [network], "network": short_name(network)}
 
 
 def cell_of(values: Values, seed: int, *words: str) -> Cell:

@@ -62,10 +62,10 @@ class Record:
 
     def gain(self, other: Record, network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
         """(rate, mean confidence) over those of `other`, paired by condition in the cells that both have."""
-        both = [key for key in self._cells if key in other._cells]
-        pairs = zip(self.confidences(network, both), other.confidences(network, both), strict=True)
+        shared = [key for key in self._cells if key in other._cells]
+        pairs = zip(self.confidences(network, shared), other.confidences(network, shared), strict=True)
         return (
-            difference(self.hits(network, both), other.hits(network, both)),
+            difference(self.hits(network, shared), other.hits(network, shared)),
             mean([own - others for own, others in pairs]),
         )
 

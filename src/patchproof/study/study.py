@@ -36,11 +36,9 @@ STUDIES: dict[str, str] = {
     "deceive": "patchproof.experiments.deceive",
     "detection": "patchproof.validation.detection",
     "envelope": "patchproof.validation.envelope.sweeps",
-    "gamut": "patchproof.validation.gamut",
     "harden": "patchproof.harden.folder",
     "layouts": "patchproof.validation.layouts",
     "ledger": "patchproof.validation.ledger_trials",
-    "mining": "patchproof.experiments.mining",
     "patch2d": "patchproof.experiments.patch2d",
     "patch3d": "patchproof.experiments.patch3d",
     "promises": "patchproof.validation.promises",
@@ -83,8 +81,8 @@ class Study:
 
     `cells(settings, base)` lists the work; paths in settings are relative to the config's folder `base`.
     `run(settings, base, cell)` does one cell: JSON values and, under keys that are file names, bytes to be kept.
-    `tables(settings, results)` and `figures(settings, results)` get the finished cells in the order of `cells`; some
-    may be missing. Whatever `run` needs at random follows from the settings' seed and the cell's values.
+    `tables(settings, results)` and, if any, `figures(settings, results)` get the finished cells in the order of
+    `cells`; some may be missing. Whatever `run` needs at random follows from the settings' seed and the cell's values.
     """
 
     name: str
@@ -92,7 +90,7 @@ class Study:
     cells: Callable[[Any, Path], Sequence[Cell]]
     run: Callable[[Any, Path, Cell], dict[str, Any]]
     tables: Callable[[Any, Sequence[Result]], Sequence[Table]]
-    figures: Callable[[Any, Sequence[Result]], Sequence[Drawing]]
+    figures: Callable[[Any, Sequence[Result]], Sequence[Drawing]] = lambda settings, results: ()
     files: str = "files"  # folder for what cells gave as bytes; "." is the study's own
     own_files: tuple[str, ...] = ("files",)  # patterns of names that --overwrite may replace besides
 

@@ -14,9 +14,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from patchproof.claims import Estimate
-from patchproof.classifier.load import load_classifier
 from patchproof.optimizer.problem import Problem
-from patchproof.strict import Refused, expand
 from patchproof.study.grid import GridSettings, Names, Tables, cell_of, scene_values, short_name, with_tables
 from patchproof.study.study import Cell, Result
 
@@ -29,24 +27,9 @@ class TrainedSettings(GridSettings):
     """Every scene in every way, before networks that train and test."""
 
     networks: Names = Field(...)  # to train on and to test
-    if_installed: tuple[str, ...] = ()  # networks that are left out where they cannot be loaded, such as `timm:` ones
     # By name: tables of the scene file with the keys that change.
     ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)
     n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
-
-
-def networks_of(settings: TrainedSettings, base: Path) -> tuple[str, ...]:
-    """The networks to train and test on: those named, and the optional ones that can be loaded here."""
-    names = list(settings.networks)
-    for name in settings.if_installed:
-        try:
-            load_classifier(expand(name, base), base)
-        except Exception:  # not installed, no weights: whatever the library raises
-            continue
-        names.append(name)
-    if len({short_name(name) for name in names}) < len(names):
-        raise Refused("networks whose files have different names", ", ".join(names), "rename one")
-    return tuple(names)
 
 
 def alone(networks: Sequence[str]) -> dict[str, Sequence[str]]:
@@ -63,7 +46,7 @@ def trained_cells(
     """A cell per scene, way, variant, row and seed; all networks test. `rows` names those that train (none: the
     original); a variant is tables of the scene to change, and what of it cells should say.
     """
-    networks, cells = networks_of(settings, base), []
+    networks, cells = settings.networks, []
     for file, (way, changed), (tables, more) in product(settings.scenes, settings.ways.items(), variants):
         values = with_tables(scene_values(file, base, changed, f", way {way}"), tables)
         for (row, trained), seed in product(rows(networks).items(), settings.seeds):
@@ -81,12 +64,6 @@ def trained_on(problem: Problem, cell: Cell) -> Problem:
 def tested_in(results: Sequence[Result]) -> list[str]:
     """All networks that some cell was tested on."""
     return list(dict.fromkeys(name for result in results for name in result.cell.values["networks"]))
-
-
-def left_out_note(settings: TrainedSettings, results: Sequence[Result]) -> str:
-    """Which optional networks could not be loaded, as a sentence; empty where all could."""
-    missing = [name for name in settings.if_installed if name not in tested_in(results)]
-    return f" Not loaded here and left out: {', '.join(missing)}." if missing else ""
 
 
 def verdict(gain: Estimate | None) -> str:

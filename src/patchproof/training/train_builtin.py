@@ -199,8 +199,7 @@ def _views(name: str, seed: int, rng: np.random.Generator) -> Tensor:
     half = VIEWS_PER_SHAPE // 2
     small = photograph(stage, None, conditions[:half], (INPUT_PX, INPUT_PX))
     large = photograph(stage, None, conditions[half:], (PHOTO_PX, PHOTO_PX))
-    both = torch.cat([small, center_square(large, INPUT_PX)])
-    return codes_of(both)
+    return codes_of(torch.cat([small, center_square(large, INPUT_PX)]))
 
 
 def _settings(rng: np.random.Generator) -> SceneSettings:

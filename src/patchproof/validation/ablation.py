@@ -32,17 +32,16 @@ from patchproof.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Views, see
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Table
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
 from patchproof.strict import Refused
-from patchproof.study.figures import whiskers
 from patchproof.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 ALL = "all"
 # What goes together, because alone it is too little to tell.
@@ -142,9 +141,10 @@ def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table
     for group in _groups(results):
         designs += [(*who(result), result.cell.values["effect"], *_means(result)) for result in group.values()]
     for effect in settings.effects:
-        both = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
-        if both:
-            rows.append((effect, len(both), *_earned(both), mean([whole.answers["cost"][effect] for whole, _ in both])))
+        compared = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
+        if compared:
+            costs = [whole.answers["cost"][effect] for whole, _ in compared]
+            rows.append((effect, len(compared), *_earned(compared), mean(costs)))
     start = ("scene", "network", "seed", "trained without", *head[2:])
     cost = "share of a step's time"
     return (
@@ -166,36 +166,14 @@ def _means(result: Result) -> list[float | None]:
     return [float(np.mean(some)) if some else None for some in figures]
 
 
-def _earned(both: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
+def _earned(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:
     """What the first of each pair is better by: rate and confidence in each world."""
     differences = [
         [None if a is None or b is None else a - b for a, b in zip(_means(whole), _means(less), strict=True)]
-        for whole, less in both
+        for whole, less in compared
     ]
     columns = ([value for value in column if value is not None] for column in zip(*differences, strict=True))
     return [mean(column) for column in columns]
 
 
-def figures(settings: AblationSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
-    """Confidence earned, by effect."""
-    rows = tables(settings, results)[0].rows
-    if not rows:
-        return ()
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for shift, at, label in ((-0.15, 3, "our renderer"), (0.15, 5, "path-traced")):
-            earned = {i + shift: value for i, row in enumerate(rows) if isinstance(value := row[at], Estimate)}
-            if earned:
-                values, reach = whiskers(list(earned.values()))
-                axes.errorbar(values, list(earned), xerr=reach, fmt="o", label=label, capsize=2)
-        axes.axvline(0, color="0.6", linewidth=1)
-        axes.set_yticks(range(len(rows)), [str(row[0]).replace(" + ", ",\n") for row in rows], fontsize=8)
-        axes.invert_yaxis()
-        axes.set_xlabel("confidence earned in the whole world (95 %)")
-        axes.legend(fontsize=8)
-
-    return (Drawing("earned", "What each effect earns", draw, (7.0, 1.5 + 0.38 * len(rows))),)
-
-
-STUDY = Study("ablation", AblationSettings, cells, run, tables, figures)
+STUDY = Study("ablation", AblationSettings, cells, run, tables)

@@ -3,12 +3,13 @@
 Also whether the stated uncertainty holds.
 In: a scene with wide ranges of view, light and camera. Out: by photograph its status and code, and against the
 renderer's truth the error of the design's corners; over all of them shares with Wilson intervals by tilt, distance,
-blur, noise, light, hiding and JPEG, and maps. The sheet carries noise in place of a design, since only markers are
+blur, noise, light, hiding and JPEG. The sheet carries noise in place of a design, since only markers are
 read here. In a share of the photographs a card of drawn size, place and color hides a part of the piece.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -31,7 +32,7 @@ from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pixels
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
@@ -63,7 +64,6 @@ _LABELS = {
     "hidden": "share of the piece hidden",
     "jpeg": "JPEG quality",
 }
-_COLORS = {"measured": "#2a9d6f", "judged": "#e0a030", "rejected": "#d1495b"}
 
 
 class DetectionSettings(Strict):
@@ -92,7 +92,7 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
     entry = measure(view_of(photo, None), "photo.jpg", surface, None, promised_ranges(())).entry
     geometry = entry.geometry
     px_per_mm, tilt_deg = local_scale(truth, surface.center_mm)
-    found = {
+    answers = {
         "tilt_deg": tilt_deg,
         "module_px": px_per_mm * scene.piece.module_mm,
         "blur_px": float(conditions.sensor.blur_px[0]),
@@ -108,13 +108,13 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "uncertainty_mm": geometry and geometry.corner_uncertainty_mm,
     }
     if geometry is None or geometry.homography_px_from_mm is None:
-        return found
+        return answers
     homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(surface.rect_mm)
     true_px = apply_homography(truth, corners)
     off_px = apply_homography(homography, corners) - true_px
     off_mm = apply_homography(np.linalg.inv(homography), true_px) - corners
     errors_px = np.linalg.norm(off_px, axis=1).tolist()
-    return found | {"error_mm": float(np.linalg.norm(off_mm, axis=1).max()), "error_px": errors_px}
+    return answers | {"error_mm": float(np.linalg.norm(off_mm, axis=1).max()), "error_px": errors_px}
 
 
 def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
@@ -168,100 +168,63 @@ def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 
 def tables(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Bounds over all photographs, shares by each quantity, and codes."""
-    found = [one.answers for one in results]
-    return (_bounds(found), _by_quantity(found), _codes(found))
+    shots = [result.answers for result in results]
+    return (_bounds(shots), _by_quantity(shots), _codes(shots))
 
 
-def within_bounds(found: Mapping) -> bool:
-    """Whether the bounds on errors are claimed for a photograph: measured, and taken at usual tilt and blur."""
-    usual = found["tilt_deg"] <= MEASURABLE_TILT_DEG and found["blur_px"] <= MEASURABLE_BLUR_PX
-    return usual and found["status"] == "measured" and found["error_mm"] is not None
+def _is_usual(shot: Mapping) -> bool:
+    return shot["tilt_deg"] <= MEASURABLE_TILT_DEG and shot["blur_px"] <= MEASURABLE_BLUR_PX
 
 
-def _bounds(found: Sequence[Mapping]) -> Table:
-    usual = [f for f in found if f["tilt_deg"] <= MEASURABLE_TILT_DEG and f["blur_px"] <= MEASURABLE_BLUR_PX]
-    claimed = [f for f in found if within_bounds(f)]
-    sharp = [f for f in claimed if f["module_px"] >= SHARP_MODULE_PX]
-    measured = [f for f in found if f["status"] == "measured" and f["error_mm"] is not None]
+def _measured(shots: Sequence[Mapping]) -> list[Mapping]:
+    return [shot for shot in shots if shot["status"] == "measured" and shot["error_mm"] is not None]
+
+
+def _bounds(shots: Sequence[Mapping]) -> Table:
+    usual, measured = [shot for shot in shots if _is_usual(shot)], _measured(shots)
+    claimed = _measured(usual)
+    sharp = [shot for shot in claimed if shot["module_px"] >= SHARP_MODULE_PX]
     rows = (
-        ("sheet identified", rate([f["status"] != "rejected" for f in usual])),
-        ("measured", rate([f["status"] == "measured" for f in usual])),
+        ("sheet identified", rate([shot["status"] != "rejected" for shot in usual])),
+        ("measured", rate([shot["status"] == "measured" for shot in usual])),
         (f"corner error at {SHARP_MODULE_PX:g} px per module or more, median, px", _median(sharp, "error_px")),
         ("corner error, median, px", _median(claimed, "error_px")),
         ("largest corner error, median, mm", _median(claimed, "error_mm")),
-        ("largest corner error of all, mm", max((f["error_mm"] for f in claimed), default=None)),
-        ("the same at any tilt and blur, mm", max((f["error_mm"] for f in measured), default=None)),
-        ("stated 95 % uncertainty covers the largest corner error", rate([_covered(f) for f in claimed])),
-        ("the same at any tilt and blur", rate([_covered(f) for f in measured])),
+        ("largest corner error of all, mm", max((shot["error_mm"] for shot in claimed), default=None)),
+        ("the same at any tilt and blur, mm", max((shot["error_mm"] for shot in measured), default=None)),
+        ("stated 95 % uncertainty covers the largest corner error", _covered(claimed)),
+        ("the same at any tilt and blur", _covered(measured)),
     )
-    about = f"{len(usual)} of {len(found)} photographs have tilt ≤ 70° and blur ≤ 1.5 px; corners are the design's four"
+    about = f"{len(usual)} of {len(shots)} photographs have tilt ≤ 70° and blur ≤ 1.5 px; corners are the design's four"
     return Table("bounds", "Errors against the truth", ("figure", "value"), rows, about)
 
 
-def _covered(found: Mapping) -> bool:
-    return found["error_mm"] <= found["uncertainty_mm"]
+def _covered(measured: Sequence[Mapping]) -> Estimate | None:
+    return rate([shot["error_mm"] <= shot["uncertainty_mm"] for shot in measured])
 
 
-def _median(found: Sequence[Mapping], name: str) -> Estimate | None:
-    return clustered_median(np.array([f[name] for f in found])) if found else None
+def _median(shots: Sequence[Mapping], name: str) -> Estimate | None:
+    return clustered_median(np.array([shot[name] for shot in shots])) if shots else None
 
 
-def _by_quantity(found: Sequence[Mapping]) -> Table:
+def _by_quantity(shots: Sequence[Mapping]) -> Table:
     rows = []
     for name, edges in _BINS.items():
         for low, high in pairwise(edges):
-            here = [f for f in found if f[name] is not None and low <= f[name] < high]
+            here = [shot for shot in shots if shot[name] is not None and low <= shot[name] < high]
             if here:
-                known = [f for f in here if f["status"] == "measured" and f["error_mm"] is not None]
-                identified, measured = (
-                    [f["status"] in kinds for f in here] for kinds in (("judged", "measured"), ("measured",))
-                )
-                span = f"{low:g} to {high:g}"
-                rows.append((_LABELS[name], span, rate(identified), rate(measured), rate([_covered(f) for f in known])))
+                identified = rate([shot["status"] != "rejected" for shot in here])
+                measured = rate([shot["status"] == "measured" for shot in here])
+                rows.append((_LABELS[name], f"{low:g} to {high:g}", identified, measured, _covered(_measured(here))))
     head = ("quantity", "range", "identified", "measured", "covered")
     about = "each with all other quantities over their whole ranges; light is known where markers were found"
     return Table("by_quantity", "By what a photograph was taken under", head, tuple(rows), about)
 
 
-def _codes(found: Sequence[Mapping]) -> Table:
-    counts: dict[tuple[str, str], int] = {}
-    for f in found:
-        key = (f["status"], f["code"] or "–")
-        counts[key] = counts.get(key, 0) + 1
+def _codes(shots: Sequence[Mapping]) -> Table:
+    counts = Counter((shot["status"], shot["code"] or "–") for shot in shots)
     rows = tuple((status, code, count) for (status, code), count in sorted(counts.items()))
     return Table("codes", "Status and code", ("status", "code", "photographs"), rows)
 
 
-def figures(settings: DetectionSettings, results: Sequence[Result]) -> Sequence[Drawing]:
-    """Maps of what was measured, judged and rejected, and errors against the stated uncertainty."""
-    found = [one.answers for one in results]
-    pairs = (("module_px", "tilt_deg"), ("module_px", "blur_px"), ("hidden", "tilt_deg"), ("noise", "jpeg"))
-    maps = [
-        Drawing(f"{x}_{y}", f"By {_LABELS[x]} and {_LABELS[y]}", lambda figure, x=x, y=y: _map(figure, found, x, y))
-        for x, y in pairs
-    ]
-    return (*maps, Drawing("uncertainty", "Stated and true", lambda figure: _stated(figure, found)))
-
-
-def _map(figure, found: Sequence[Mapping], x: str, y: str) -> None:
-    axes = figure.add_subplot()
-    for status, color in _COLORS.items():
-        here = [f for f in found if f["status"] == status]
-        axes.scatter([f[x] for f in here], [f[y] for f in here], s=18, color=color, label=f"{status} ({len(here)})")
-    axes.set_xlabel(_LABELS[x])
-    axes.set_ylabel(_LABELS[y])
-    axes.legend(frameon=False)
-
-
-def _stated(figure, found: Sequence[Mapping]) -> None:
-    axes, known = figure.add_subplot(), [f for f in found if f["status"] == "measured" and f["error_mm"] is not None]
-    stated = [f["uncertainty_mm"] for f in known]
-    axes.loglog(stated, [f["error_mm"] for f in known], ".", color="#2457c5")
-    if known:
-        ends = min(stated), max(stated)
-        axes.loglog(ends, ends, color="gray", linewidth=1)
-    axes.set_xlabel("stated 95 % uncertainty of the largest corner error, mm")
-    axes.set_ylabel("largest corner error, mm")
-
-
-STUDY = Study("detection", DetectionSettings, cells, run, tables, figures)
+STUDY = Study("detection", DetectionSettings, cells, run, tables)

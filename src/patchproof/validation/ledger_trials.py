@@ -10,6 +10,7 @@ printers are inkjets from `inkjets`, the other ICC profile, and dyes that faded.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -24,7 +25,6 @@ from torch import Tensor
 
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.claims import rate
-from patchproof.classifier import center_square
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.color import linear_from_srgb, srgb_from_linear
@@ -32,6 +32,7 @@ from patchproof.evidence.classify import target_indices
 from patchproof.evidence.ledger import LEAST_PHOTOS, usable
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options
+from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.run import load_run
 from patchproof.output import image_pixels
 from patchproof.render.photograph import expose
@@ -41,7 +42,6 @@ from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.reprints.inkjets import draw_inkjet
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.scene import PieceScene
-from patchproof.sheets.manifest import Manifest, Promise
 from patchproof.strict import Strict
 from patchproof.study.study import Cell, Result, Study
 
@@ -58,7 +58,6 @@ class LedgerSettings(Strict):
     runs: Annotated[tuple[str, ...], Field(min_length=1)]  # folders of finished runs
     trials: Annotated[int, Field(ge=1, le=10_000)] = 60  # over all runs
     photos: Annotated[int, Field(ge=5, le=100)] = 12  # in each trial
-    photo_px: tuple[int, int] | None = None  # their width, height; by default the scene's own, smaller is quicker
     seed: int = 0  # of everything that is drawn
 
 
@@ -71,35 +70,33 @@ def cells(settings: LedgerSettings, base: Path) -> list[Cell]:
 
 def run(settings: LedgerSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """What was put in, what it cost and what the ledger says; `outcome` is asked, weak or unreadable."""
-    hall = _hall(str(base / cell.values["run"]), settings.photo_px)
+    hall = _hall(str(base / cell.values["run"]))
     number, n = cell.values["number"], settings.photos
     conditions = hall.scene.draw("reprint", n, settings.seed, number * n)
     views = hall.views(conditions)
     plain = hall.confidence(hall.take(views, conditions))
     rng = np.random.default_rng([settings.seed, number])
-    found: dict[str, Any] = {}
+    answers: dict[str, Any] = {}
     for _ in range(_TRIES):
         trouble, printer, changed = _trouble(cell.values["culprit"], rng, conditions, hall)
         photos = hall.take(views, changed, printer)
         loss = hall.sign * (plain - hall.confidence(photos))
-        found = {"trouble": trouble, "outcome": "weak", "cost": float(loss.mean()), "photos": 0}
+        answers = {"trouble": trouble, "outcome": "weak", "cost": float(loss.mean()), "photos": 0}
         if loss.mean() >= LEAST_COST:
-            found |= hall.judged(photos, loss)
-        if found["outcome"] == "asked":
-            return found
-    return found
+            answers |= hall.judged(photos, loss)
+        if answers["outcome"] == "asked":
+            break
+    return answers
 
 
 @dataclass(frozen=True)
 class _Hall:
-    """A run's sheet, ready to be photographed, and its manifest as of photographs of `photo_px`."""
+    """A run's sheet, ready to be photographed, and what judges its photographs."""
 
     sheet: HungSheet
-    manifest: Manifest
     model: Classifier
     indices: tuple[int, ...]
     sign: int  # of what the patch should add to confidence
-    photo_px: tuple[int, int]
 
     @property
     def scene(self) -> PieceScene:
@@ -113,78 +110,52 @@ class _Hall:
     def views(self, conditions: Conditions) -> list[Views]:
         """What is rasterized once for all that is done to print, light and camera."""
         each = range(len(conditions))
-        return [see(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.photo_px) for i in each]
+        return [see(self.sheet.stage, self.sheet.piece, conditions[i : i + 1], self.scene.photo_px) for i in each]
 
     def take(self, views: Sequence[Views], conditions: Conditions, printed: Printed | None = None) -> list[bytes]:
         """A JPEG file for each condition of the piece as `printed` shows it (by default as promised)."""
         piece, photos = self.sheet.piece if printed is None else self.sheet.printed(printed), []
         for i, view in enumerate(views):
-            seen = replace(view, conditions=conditions[i : i + 1])
+            own = conditions[i : i + 1]
             with torch.no_grad():
-                photos.append(jpeg_of(expose(seen, piece, jpeg=False), seen.conditions))
+                photos.append(jpeg_of(expose(replace(view, conditions=own), piece, jpeg=False), own))
         return photos
 
     def confidence(self, photos: Sequence[bytes]) -> np.ndarray:
-        """Target confidence of each photograph's centered square."""
-        found = []
-        for photo in photos:
-            srgb = image_pixels(photo) / np.float32(255)
-            square = center_square(torch.from_numpy(srgb.transpose(2, 0, 1))[None], self.model.input_px)
-            with torch.inference_mode():
-                found.append(float(self.model.confidence(self.model.logits(square), self.indices)[0]))
-        return np.array(found)
+        """Target confidence of each photograph."""
+        with torch.inference_mode():
+            logits = [self.model.logits(from_pixels(image_pixels(photo))[None]) for photo in photos]
+            return self.model.confidence(torch.cat(logits), self.indices).numpy()
 
     def judged(self, photos: Sequence[bytes], loss: np.ndarray) -> dict[str, Any]:
         """What `verify` makes of the photographs, each of which lost so much."""
         with TemporaryDirectory() as folder:
             for i, photo in enumerate(photos):
                 (Path(folder) / f"{i:03d}.jpg").write_bytes(photo)
-            report = gather_evidence(folder, self.manifest, Options([self.model], self.sheet.printer))
+            report = gather_evidence(folder, self.sheet.manifest, Options([self.model], self.sheet.printer))
         ledger = report.ledger
         used = np.array([usable(entry.status, entry.code) for entry in report.photos])
-        codes = [entry.code or "fine" for entry in report.photos]
-        found = {"codes": {code: codes.count(code) for code in sorted(set(codes))}}
         if ledger is None or ledger.photos < LEAST_PHOTOS:
-            return found | {"outcome": "unreadable", "photos": 0 if ledger is None else ledger.photos}
+            return {"outcome": "unreadable", "photos": 0 if ledger is None else ledger.photos}
         shares = {step: share.share for step, share in ledger.shares.items()}
         whole = self.sign * (ledger.ideal - ledger.photo)
         cost = float(loss[used].mean())
-        return found | {
+        return {
             "outcome": "asked" if cost >= LEAST_COST else "weak",
             "cost": cost,
             "photos": ledger.photos,
             "named": ledger.culprit,
             "shares": shares,
-            "intervals": {step: share.interval for step, share in ledger.shares.items()},
             "sum_error": abs(sum(shares.values()) - whole),
         }
 
 
 @lru_cache(maxsize=8)
-def _hall(folder: str, photo_px: tuple[int, int] | None) -> _Hall:
+def _hall(folder: str) -> _Hall:
     made = load_run(folder)
-    sheet, own_px = hang_own(made, photo_px), made.scene.settings.camera.photo_px
-    manifest = _at_size(sheet.manifest, made.promise, photo_px or own_px, own_px)
-    model = load_classifier(made.promise.models[0].name, made.scene.base)
-    return _Hall(
-        sheet,
-        manifest,
-        model,
-        target_indices(model, made.promise, manifest.settings),
-        made.promise.target.goal.sign,
-        photo_px or own_px,
-    )
-
-
-def _at_size(manifest: Manifest, promise: Promise, photo_px: tuple[int, int], own_px: tuple[int, int]) -> Manifest:
-    """The manifest as of a camera whose photographs are of another size."""
-    scale = min(photo_px) / min(own_px)
-    conditions = tuple(
-        one.changed(**{k: v * scale for k in ("px_per_mm", "blur_px") if (v := getattr(one, k)) is not None})
-        for one in promise.conditions
-    )
-    settings = manifest.settings | {"camera": manifest.settings["camera"] | {"photo_px": photo_px}}
-    return manifest.changed(promise={"conditions": conditions}, settings=settings)
+    sheet, promise = hang_own(made), made.promise
+    model = load_classifier(promise.models[0].name, made.scene.base)
+    return _Hall(sheet, model, target_indices(model, promise, sheet.manifest.settings), promise.target.goal.sign)
 
 
 def _trouble(
@@ -220,61 +191,58 @@ def _wrong_printer(rng: np.random.Generator, hall: _Hall) -> tuple[str, Printed]
         name, light = f"faded {kept.round(2)}", lambda srgb: _faded(hall.sheet.printer, kept, srgb)
 
     def printed(pixels: Tensor) -> Tensor:
-        seen = light(pixels[0].permute(1, 2, 0).double().numpy())
-        return torch.from_numpy(srgb_from_linear(seen.clip(0, 1))).permute(2, 0, 1)[None].to(pixels)
+        reflected = light(pixels[0].permute(1, 2, 0).double().numpy())
+        return torch.from_numpy(srgb_from_linear(reflected.clip(0, 1))).permute(2, 0, 1)[None].to(pixels)
 
     return name, printed
 
 
 def _faded(printer: Printer, kept: np.ndarray, srgb: np.ndarray) -> np.ndarray:
     """Light of a print whose dyes keep these shares of their density; what is neutral is black ink and stays."""
-    seen = printer.apply(torch.from_numpy(srgb).float().permute(2, 0, 1)[None])[0].permute(1, 2, 0).double().numpy()
-    density = -np.log(np.clip(linear_from_srgb(seen), 1e-3, 1))
+    shown = printer.apply(torch.from_numpy(srgb).float().permute(2, 0, 1)[None])[0].permute(1, 2, 0).double().numpy()
+    density = -np.log(np.clip(linear_from_srgb(shown), 1e-3, 1))
     black = density.min(-1, keepdims=True)
     return np.exp(-(black + (density - black) * kept))
 
 
 def tables(settings: LedgerSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Rates by culprit, confusions, and every trial."""
-    asked = [one for one in results if one.answers["outcome"] == "asked"]
+    asked = [trial for trial in results if trial.answers["outcome"] == "asked"]
     return (_rates(results, asked), _confusions(asked), _trials(results))
+
+
+def _culprit(trial: Result) -> str:
+    return trial.cell.values["culprit"]
 
 
 def _rates(results: Sequence[Result], asked: Sequence[Result]) -> Table:
     rows = []
     for kind in (*STEP, None):
-        mine = [one for one in asked if kind in (None, one.cell.values["culprit"])]
-        outcomes = [one.answers["outcome"] for one in results if kind in (None, one.cell.values["culprit"])]
-        hits = [one.answers["named"] == STEP[one.cell.values["culprit"]] for one in mine]
+        mine = [trial for trial in asked if kind in (None, _culprit(trial))]
+        outcomes = [trial.answers["outcome"] for trial in results if kind in (None, _culprit(trial))]
+        hits = [trial.answers["named"] == STEP[_culprit(trial)] for trial in mine]
         rows.append((kind or "all", rate(hits), outcomes.count("weak"), outcomes.count("unreadable")))
     about = f"of trials that cost at least {LEAST_COST:.0%} of confidence; the shares' sum is the whole within "
-    about += f"{max((one.answers['sum_error'] for one in asked), default=0):.0e}"
+    about += f"{max((trial.answers['sum_error'] for trial in asked), default=0):.0e}"
     return Table("rates", "Culprits named", ("culprit", "named", "cost less", "unreadable"), tuple(rows), about)
 
 
 def _confusions(asked: Sequence[Result]) -> Table:
     names = ("print", "light_and_camera", "blur_and_noise", "print_light_and_camera", None)
-    rows = tuple(
-        (kind, *(sum(o.cell.values["culprit"] == kind and o.answers["named"] == n for o in asked) for n in names))
-        for kind in STEP
-    )
+    counts = Counter((_culprit(trial), trial.answers["named"]) for trial in asked)
+    rows = tuple((kind, *(counts[kind, name] for name in names)) for kind in STEP)
     return Table("confusions", "Put in and named", ("put in", *(n or "none" for n in names)), rows, "trials")
 
 
 def _trials(results: Sequence[Result]) -> Table:
     head = ("trial", "run", "culprit", "trouble", "outcome", "cost", "photographs", "named", "shares")
     rows = []
-    for one in results:
-        values, found = one.cell.values, one.answers
-        shares = "  ".join(f"{step} {share:+.2f}" for step, share in found.get("shares", {}).items())
-        said = (found["trouble"], found["outcome"], found["cost"], found["photos"], found.get("named") or "–", shares)
-        rows.append((values["number"], Path(values["run"]).name, values["culprit"], *said))
+    for trial in results:
+        values, answers = trial.cell.values, trial.answers
+        shares = "  ".join(f"{step} {share:+.2f}" for step, share in answers.get("shares", {}).items())
+        measured = (*(answers[key] for key in ("trouble", "outcome", "cost", "photos")), answers.get("named") or "–")
+        rows.append((values["number"], Path(values["run"]).name, values["culprit"], *measured, shares))
     return Table("trials", "Every trial", head, tuple(rows), "cost and shares in confidence")
 
 
-def figures(settings: LedgerSettings, results: Sequence[Result]) -> tuple[()]:
-    """None: the tables say it."""
-    return ()
-
-
-STUDY = Study("ledger", LedgerSettings, cells, run, tables, figures)
+STUDY = Study("ledger", LedgerSettings, cells, run, tables)

@@ -2,9 +2,8 @@
 
 Many runs are promised, printed, photographed by a renderer that is not ours, and verified.
 In: scene files, networks, printers, seeds. Out: for every combination the promised rate, the interval of counts that
-its photographs should show, and the count that they did show; the share of intervals that held, their widths, the bias
-of each scene, and what a correction would be worth: a shift of the promise's log odds, fitted on every other scene and
-judged on the rest. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
+its photographs should show, and the count that they did show; the share of intervals that held, their widths, and the
+bias of each scene. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
 
 Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; without
 `path_traced = true` they are ours, and only sampling and the page in between are tested.
@@ -37,8 +36,6 @@ from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_LOW, _HIGH = 1e-3, 1 - 1e-3  # rates whose odds are taken
 
 
 class PromisesSettings(GridSettings):
@@ -93,48 +90,26 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Shares that held, by scene and in all; the correction; every combination."""
-    return _shares(settings, results), _correction(results), _each(results)
+    """Shares that held, by scene and in all; every combination."""
+    return _shares(settings, results), _each(results)
 
 
 Count = Mapping[str, Any]  # what a cell counted: promised rate and its n, photographs judged and recognized
 
 
-def interval_of(count: Count, shift: float = 0.0) -> tuple[int, int]:
-    """Counts that the promise allows, with its log odds shifted."""
-    promised = round(float(shifted(count["rate"], shift)) * count["n"])
-    return prediction_interval(promised, count["n"], count["judged"])
+def interval_of(count: Count) -> tuple[int, int]:
+    """Counts that the promise allows."""
+    return prediction_interval(round(count["rate"] * count["n"]), count["n"], count["judged"])
 
 
-def held(count: Count, shift: float = 0.0) -> bool:
+def held(count: Count) -> bool:
     """Whether the count lies in the promise's interval."""
-    low, high = interval_of(count, shift)
+    low, high = interval_of(count)
     return low <= count["recognized"] <= high
 
 
-def shifted(rates, shift: float) -> np.ndarray:
-    """Rates with their log odds shifted; 0 and 1 keep to a thousandth."""
-    if shift == 0:
-        return np.asarray(rates, float)
-    rates = np.clip(rates, _LOW, _HIGH)
-    return 1 / (1 + (1 / rates - 1) * np.exp(-shift))
-
-
-def fitted_shift(counts: Sequence[Count]) -> float:
-    """The shift that makes the counts most likely."""
-    from scipy.optimize import fminbound
-
-    rates, hits, n = (np.array([count[key] for count in counts], float) for key in ("rate", "recognized", "judged"))
-
-    def unlikely(shift: float) -> float:
-        p = shifted(rates, shift or 1e-12)
-        return -float((hits * np.log(p) + (n - hits) * np.log(1 - p)).sum())
-
-    return float(np.asarray(fminbound(unlikely, -3, 3)))
-
-
-def _bias(counts: Sequence[Count], shift: float = 0.0) -> list[float]:
-    return [count["recognized"] / count["judged"] - float(shifted(count["rate"], shift)) for count in counts]
+def _bias(counts: Sequence[Count]) -> list[float]:
+    return [count["recognized"] / count["judged"] - count["rate"] for count in counts]
 
 
 def _width(counts: Sequence[Count]) -> float:
@@ -160,22 +135,6 @@ def _shares(settings: PromisesSettings, results: Sequence[Result]) -> Table:
     about = f"{settings.photos} {how} photographs for each promise; width: median, as a share of the photographs; "
     about += "bias: recognized minus promised rate"
     return Table("held", "Promises that held", ("scene", "held", "width", "bias"), rows, about)
-
-
-def _correction(results: Sequence[Result]) -> Table:
-    scenes = list(_by_scene(results).items())
-    halves = [[count for _, counts in scenes[i::2] for count in counts] for i in (0, 1)]
-    head = ("fitted on", "judged on", "shift of the log odds", "held without", "held with", "bias without", "bias with")
-    rows = []
-    for fit, judge in ((0, 1), (1, 0)):
-        if not halves[fit] or not halves[judge]:
-            continue
-        shift, others = fitted_shift(halves[fit]), halves[judge]
-        names = [", ".join(name for name, _ in scenes[half::2]) for half in (fit, judge)]
-        shares = [rate([held(count, by) for count in others]) for by in (0.0, shift)]
-        rows.append((*names, shift, *shares, *(mean(_bias(others, by)) for by in (0.0, shift))))
-    about = "one shift for all; verify does not use it"
-    return Table("correction", "What a correction would be worth", head, tuple(rows), about)
 
 
 def _each(results: Sequence[Result]) -> Table:

@@ -5,14 +5,14 @@ is a logistic between two levels; its breaking point is where it has lost half o
 is a quarter or more of what it began with. (Half of what it began with would be simpler, but an object that is
 recognized half of the time without its patch hovers there for ever.) Likelihood is maximized over a grid, which never
 fails to converge and shows where data leave the curve open: between two points of rate 1 and 0 the breaking point may
-lie anywhere, and the interval says so. All points share their conditions, and whole
-conditions are drawn anew for the bootstrap, so that what they have in common does not pass for precision.
+lie anywhere, and the interval says so. All points share their conditions, and whole conditions are drawn anew for the
+bootstrap, so that what they have in common does not pass for precision.
 
 A curve that falls is fitted whatever the data do. Whether they contradict it is tested apart: the distance from the
 best falling rates against that of bootstrap samples moved to where the rates do fall.
 
 Sources: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 13.3 (percentiles), 16.2 (null made true);
-Robertson, Wright and Dykstra, Order Restricted Statistical Inference, 1988, 1.4 (min-max formula).
+Robertson, Wright and Dykstra, Order Restricted Statistical Inference, 1988, 1.4 (the nearest falling rates).
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ BEYOND = 2.0  # stands for a breaking point that is not in the sweep
 class Break:
     """Positions in the sweep, `BEYOND` where the curve holds; None where nothing worked at the easy end.
 
-    `curve` is the best one at positions 0, 0.01, ... 1.
+    `rates` are those of the best curve at both ends.
     """
 
     value: float | None
     low: float | None
     high: float | None
     monotone_p: float
-    curve: tuple[float, ...]
+    rates: tuple[float, float]
 
 
 def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
@@ -53,15 +53,15 @@ def find_break(worked: np.ndarray, at: np.ndarray, seed: int = 0) -> Break:
     weights = rng.multinomial(n, np.full(n, 1 / n), DRAWS)
     counts = weights @ worked.astype(float)
     p = monotone_p(worked.mean(0), counts / n)
-    best = curve_at(_fit(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.linspace(0, 1, 101))
+    first, last = curve_at(_fit(worked.sum(0, keepdims=True).astype(float), n, at)[2][0], np.array([0.0, 1.0])).tolist()
     if wilson(int(worked[:, 0].sum()), n)[0] < LEAST_AT_EASY_END:
-        return Break(None, None, None, p, tuple(best.tolist()))
+        return Break(None, None, None, p, (first, last))
     low, high, _ = _fit(counts, n, at)
     middle = np.where(high < BEYOND, (low + high) / 2, low)
     value, low, high = (
         float(np.quantile(drawn, q, method="inverted_cdf")) for drawn, q in ((middle, 0.5), (low, 0.025), (high, 0.975))
     )
-    return Break(value, low, high, p, tuple(best.tolist()))
+    return Break(value, low, high, p, (first, last))
 
 
 def curve_at(curve: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -72,27 +72,22 @@ def curve_at(curve: np.ndarray, at: np.ndarray) -> np.ndarray:
     return floor + (top - floor) * expit((center - at) / width)
 
 
-def falling(rates: np.ndarray) -> np.ndarray:
-    """The nearest rates (least squares) along the last axis that never rise."""
-    sums = np.concatenate([np.zeros((*rates.shape[:-1], 1)), rates.cumsum(-1)], -1)
-    points, out = rates.shape[-1], np.empty(rates.shape)
-    for j in range(points):
-        # min over starts up to j of the max over ends from j of the mean between
-        means = [
-            np.stack([(sums[..., k + 1] - sums[..., i]) / (k + 1 - i) for k in range(j, points)], -1).max(-1)
-            for i in range(j + 1)
-        ]
-        out[..., j] = np.stack(means, -1).min(-1)
-    return out
-
-
 def monotone_p(rates: np.ndarray, drawn: np.ndarray) -> float:
     """How likely rates P that fall everywhere would look as unlike it as these; `drawn` B×P is their bootstrap."""
-    distance = lambda values: ((values - falling(values)) ** 2).sum(-1)  # noqa: E731
-    observed = distance(rates)
+    nearest = falling(rates)
+    observed = ((rates - nearest) ** 2).sum()
     if observed <= 1e-12:
         return 1.0
-    return float((1 + (distance(drawn - rates + falling(rates)) >= observed).sum()) / (1 + len(drawn)))
+    moved = drawn - rates + nearest
+    distances = np.array([((row - falling(row)) ** 2).sum() for row in moved])
+    return float((1 + (distances >= observed).sum()) / (1 + len(drawn)))
+
+
+def falling(rates: np.ndarray) -> np.ndarray:
+    """The nearest rates P (least squares) that never rise."""
+    from scipy.optimize import isotonic_regression
+
+    return isotonic_regression(rates, increasing=False).x
 
 
 @lru_cache(maxsize=1)

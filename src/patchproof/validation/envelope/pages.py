@@ -16,7 +16,7 @@ import numpy as np
 from patchproof.claims import Estimate, rate
 from patchproof.goal import Goal
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.study.figures import number_grid, whiskers
+from patchproof.study.figures import number_grid
 from patchproof.validation.envelope.axes import AXES
 from patchproof.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
 
@@ -74,7 +74,7 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
 
 
 def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
-    """The page to print, and the curves behind it."""
+    """The page to print."""
     sweeps, maps = _split(results)
     page = Drawing(
         "page",
@@ -84,22 +84,12 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
         "Bars run from the easy end to where half of what the sweep takes is lost; whiskers: 95 % intervals; →: it "
         "holds; !: not monotone; in brackets the fitted rates at both ends.",
     )
-    if not sweeps:
-        return (page,)
-    rows = -(-len(sweeps) // 3)
-    return page, Drawing(
-        "curves",
-        "Sweeps",
-        lambda figure: _draw_curves(figure, sweeps, rows),
-        (10.0, 2.4 * rows),
-        "Shares of conditions with Wilson intervals, the fitted falling curves, breaking points (dotted).",
-    )
+    return (page,)
 
 
 def _split(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
-    return [result for result in results if "y" not in result.cell.values], [
-        result for result in results if "y" in result.cell.values
-    ]
+    sweeps, maps = ([each for each in results if ("y" in each.cell.values) == is_map] for is_map in (False, True))
+    return sweeps, maps
 
 
 def worked(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -141,9 +131,7 @@ def _beyond_row(result: Result) -> tuple[Value, ...]:
     x, answers = result.cell.values["x"], result.answers
     where = answers["breaks"]["measured"]["value"]
     at = np.linspace(0, 1, x["points"])
-    beyond = [i for i in range(x["points"]) if at[i] > min(1.0 if where is None else where, 1 - 1e-9)]
-    if where is None:
-        beyond = list(range(x["points"]))
+    beyond = [i for i in range(x["points"]) if where is None or at[i] > min(where, 1 - 1e-9)]
     photos = [photo for i in beyond for photo in zip(answers["status"][i], answers["code"][i], strict=True)]
     status, codes = [status for status, _ in photos], [code for status, code in photos if status != "measured"]
     return AXES[x["axis"]].title, len(status), status.count("measured"), _counted(codes)
@@ -196,14 +184,8 @@ def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
     for row, result in enumerate(sweeps):
         x = result.cell.values["x"]
         for k, (stage, color) in enumerate(_COLORS.items()):
-            _draw_bar(
-                axes,
-                row + 0.24 * (k - 1),
-                x,
-                result.answers["breaks"][stage],
-                color,
-                STAGES[stage] if not row else None,
-            )
+            label = None if row else STAGES[stage]
+            _draw_bar(axes, row + 0.24 * (k - 1), x, result.answers["breaks"][stage], color, label)
         axis = AXES[x["axis"]]
         axes.text(-0.02, row, f"{axis.title}\n{axis.unit}", ha="right", va="center", fontsize=7.5)
         axes.text(0.0, row + 0.46, _short(x["easy"]), ha="left", va="center", fontsize=6, alpha=0.7)
@@ -224,8 +206,8 @@ def _draw_bar(axes: Axes, y: float, x: End, break_: Break, color: str, label: st
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)
         return
     axes.plot([low, min(high, 1.0)], [y, y], color="black", linewidth=0.9)
-    curve = break_["curve"]
-    text = f"{_short(_at(x, value))} ({curve[0]:.2f}–{curve[-1]:.2f})" + (" !" if _rises(break_) else "")
+    first, last = break_["rates"]
+    text = f"{_short(_at(x, value))} ({first:.2f}–{last:.2f})" + (" !" if _rises(break_) else "")
     axes.text(min(high, 1.0) + 0.01, y, text, va="center", fontsize=6.5)
 
 
@@ -242,39 +224,8 @@ def _draw_map(axes: Axes, result: Result) -> None:
     texts = [[f"{100 * a:.0f}" + ("×" if b < 0.5 else "") for a, b in zip(*row, strict=True)] for row in rows]
     number_grid(axes, share, texts, colors="RdYlGn", fontsize=6)
     axes.invert_yaxis()
-    for set_ticks, set_label, end in (
-        (axes.set_xticks, axes.set_xlabel, x),
-        (axes.set_yticks, axes.set_ylabel, y),
-    ):
+    for drawn, end in ((axes.xaxis, x), (axes.yaxis, y)):
         axis = AXES[end["axis"]]
         values = axis.values(end["easy"], end["hard"], end["points"])
-        set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
-        set_label(f"{axis.title}, {axis.unit}", fontsize=7)
-
-
-def _draw_curves(figure: Figure, sweeps: Sequence[Result], rows: int) -> None:
-    grid = figure.subplots(rows, 3, squeeze=False)
-    for axes, result in zip(grid.flat, sweeps, strict=False):
-        _draw_sweep(axes, result)
-    for axes in grid.flat[len(sweeps) :]:
-        axes.set_axis_off()
-    grid.flat[0].legend(fontsize=7, frameon=False)
-
-
-def _draw_sweep(axes: Axes, result: Result) -> None:
-    x, works = result.cell.values["x"], worked(result.answers)
-    at, fine = np.linspace(0, 1, x["points"]), np.linspace(0, 1, 101)
-    for k, (stage, color) in enumerate(_COLORS.items()):
-        values, reach = whiskers([rate(row.tolist()) for row in works[stage]])
-        here = at + 0.012 * (k - 1)
-        axes.errorbar(here, values, reach, fmt="o", ms=3, lw=0.8, color=color, label=STAGES[stage])
-        break_ = result.answers["breaks"][stage]
-        axes.plot(fine, break_["curve"], color=color, linewidth=1)
-        if break_["value"] is not None and break_["value"] < BEYOND:
-            axes.axvline(break_["value"], color=color, linestyle=":", linewidth=1)
-    axis = AXES[x["axis"]]
-    values = axis.values(x["easy"], x["hard"], x["points"])
-    axes.set_xticks(at, [_short(v) for v in values], fontsize=7)
-    axes.set_xlabel(f"{axis.title}, {axis.unit}", fontsize=8)
-    axes.set_ylim(-0.05, 1.05)
-    axes.spines[["top", "right"]].set_visible(False)
+        drawn.set_ticks(range(end["points"]), [_short(v) for v in values], fontsize=6)
+        drawn.set_label_text(f"{axis.title}, {axis.unit}", fontsize=7)

@@ -77,14 +77,14 @@ def cells(settings: EnvelopeSettings, base: Path) -> Sequence[Cell]:
     maps = settings.maps
     if maps is None:
         maps = tuple(Map(x=x, y=y) for x, y in MAPS if x in able and y in able)
-    for name in [sweep.axis for sweep in sweeps] + [name for one in maps for name in (one.x, one.y)]:
+    for name in [sweep.axis for sweep in sweeps] + [name for pair in maps for name in (pair.x, pair.y)]:
         if name not in able:
             raise Refused("an axis along which this scene can be varied", f'"{name}"', nearest(name, able))
-    if any(one.x == one.y for one in maps):
+    if any(pair.x == pair.y for pair in maps):
         raise Refused("two different axes for a map", "one twice", "name another")
     return [
         *(Cell(f"sweep-{sweep.axis}", _sweep_values(sweep, scene, settings)) for sweep in sweeps),
-        *(Cell(f"map-{one.x}-{one.y}", _map_values(one, scene)) for one in maps),
+        *(Cell(f"map-{pair.x}-{pair.y}", _map_values(pair, scene)) for pair in maps),
     ]
 
 
@@ -98,11 +98,11 @@ def _sweep_values(sweep: Sweep, scene, settings: EnvelopeSettings) -> dict[str, 
     return {"x": {"axis": sweep.axis, "easy": easy, "hard": hard, "points": points}}
 
 
-def _map_values(one: Map, scene) -> dict[str, Any]:
-    ends = {name: AXES[name].ends(scene) for name in (one.x, one.y)}
+def _map_values(pair: Map, scene) -> dict[str, Any]:
+    ends = {key: (name, *AXES[name].ends(scene)) for key, name in (("x", pair.x), ("y", pair.y))}
     return {
-        key: {"axis": name, "easy": ends[name][0], "hard": ends[name][1], "points": one.points}
-        for key, name in (("x", one.x), ("y", one.y))
+        key: {"axis": name, "easy": easy, "hard": hard, "points": pair.points}
+        for key, (name, easy, hard) in ends.items()
     }
 
 
@@ -118,9 +118,9 @@ def run(settings: EnvelopeSettings, base: Path, cell: Cell) -> dict[str, Any]:
         y, across = _values(cell.values["y"])
         points = [point | {y: value} for value in across for point in points]
     shown = max(n // 4, photos) if "jpeg" in points[0] else n
-    seen = recognized(world, points, drawn[:shown])
+    as_target = recognized(world, points, drawn[:shown])
     photographed = measured(world, points, drawn[:photos])
-    works = seen if world.scene.settings.target.goal.sign > 0 else ~seen
+    works = as_target if world.scene.settings.target.goal.sign > 0 else ~as_target
     answers = {
         "goal": world.scene.settings.target.goal,
         "label": str(world.scene.settings.target.label),

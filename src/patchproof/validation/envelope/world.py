@@ -33,7 +33,7 @@ from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, relit, see
 from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
-from patchproof.scene.conditions import Conditions, fields_of
+from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene, needs_mesh, needs_piece
 from patchproof.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
 from patchproof.validation.envelope.window import Frame, on_plain_ground, window
@@ -168,12 +168,11 @@ class _Views:
         if self._kept is None or self._kept[0] != _geometry(point):
             frame = self._frame_of(point, conditions)
             self._origin_px = frame.origin_px
-            seen = see(frame.stage, shown, conditions, frame.size_px)
+            views = see(frame.stage, shown, conditions, frame.size_px)
         else:
-            seen = self._kept[1]
-            seen = seen if _same(conditions, seen.conditions) else relit(seen, conditions)
-        self._kept = _geometry(point), seen
-        return expose(seen, shown, jpeg)
+            views = relit(self._kept[1], conditions)
+        self._kept = _geometry(point), views
+        return expose(views, shown, jpeg)
 
     def file(self, point: Point) -> tuple[np.ndarray, tuple[int, int]]:
         """The only picture as uint8 H×W×3, read back from a JPEG file of its quality, and where its corner lies."""
@@ -210,8 +209,3 @@ def _by_cost(points: Sequence[Point]) -> list[int]:
     """Points of one geometry together, and among them those that differ in their JPEG alone."""
     key = lambda i: (_geometry(points[i]), sorted((k, v) for k, v in points[i].items() if k != "jpeg"))  # noqa: E731
     return sorted(range(len(points)), key=key)
-
-
-def _same(a: Conditions, b: Conditions) -> bool:
-    others = fields_of(b)
-    return all(np.array_equal(values, others[name]) for name, values in fields_of(a).items())
