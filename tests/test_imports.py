@@ -43,7 +43,7 @@ MAY_IMPORT = {
     "experiments": WORLD | {"optimizer", "report", "study", "harden"},
     "validation": STUDIES,
     "training": WORLD,
-    "bench": STUDIES | {"training", "harden"},
+    "bench": STUDIES | {"training", "harden", "experiments"},
     "cli": STUDIES | {"harden", "bench", "training", "experiments", "validation"},
     "__init__": COMMANDS | {"journey"},
     "__main__": {"cli"},

@@ -96,7 +96,9 @@ def keys(
 
 
 def bench(
-    name: Annotated[str, typer.Argument(help="A benchmark: render, train, printer, detect, evidence, or all.")] = "all",
+    name: Annotated[
+        str, typer.Argument(help="A benchmark: render, train, printer, detect, evidence, peers, or all.")
+    ] = "all",
     quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchproof-bench"),
     overwrite: Overwrite = False,

@@ -70,8 +70,13 @@ class Patch3dSettings(GridSettings):
 
 
 def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:
-    """A cell per scene, network and seed. All objects with the first seed come first: an unfinished study says
-    something of each.
+    """A cell per scene, network and seed."""
+    return patch_cells(settings, base)
+
+
+def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network and seed; refused of scenes without a mesh or a printed patch. All objects with the
+    first seed come first: an unfinished study says something of each.
     """
     scenes = list(pairs(settings, base))
     for values in scenes:

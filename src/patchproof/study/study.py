@@ -41,6 +41,7 @@ STUDIES: dict[str, str] = {
     "ledger": "patchproof.validation.ledger_trials",
     "patch2d": "patchproof.experiments.patch2d",
     "patch3d": "patchproof.experiments.patch3d",
+    "peers": "patchproof.bench.peers",
     "promises": "patchproof.validation.promises",
     "robust": "patchproof.experiments.robust",
     "stress": "patchproof.experiments.stress",
