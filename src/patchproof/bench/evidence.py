@@ -1,6 +1,6 @@
-"""What evidence costs: how many markers a piece needs, and which model makes its photograph flat.
+"""What evidence costs: which model makes a piece's photograph flat.
 
-In: photographs of paper. Out: two charts. Errors are in millimeters of the paper, over the whole design.
+In: photographs of paper. Out: a chart. Errors are in millimeters of the paper, over the whole design.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from patchproof.bench.measure import clocked
 from patchproof.bench.paper import (
     DESIGN_MM,
     LENS,
-    MARKER_MM,
-    PIECE_MM,
     RADII_MM,
     SIZE_PX,
     Kind,
@@ -31,20 +29,15 @@ from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import DICTIONARY
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.unroll import explain, rolled, through_lens
-from patchproof.report.tables import Table
-from patchproof.sheets.piece import MODULES, lay_out_piece
 
 WRONG_PX = 4.0  # by which a marker is moved that was glued on again
-MARKERS = {1: (100,), 2: (100, 107), 4: (100, 102, 105, 107), 8: tuple(range(100, 108))}
-COVERED = 100  # the marker of the corner that something covers
 
 Corners = Mapping[int, np.ndarray]
 ToPx = Callable[[np.ndarray], np.ndarray]
 
 
 def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
-    """Markers, then models."""
-    yield markers_chart(6 if quick else 40, on_stage)
+    """Models."""
     yield models_chart(4 if quick else 24, on_stage)
 
 
@@ -56,44 +49,6 @@ def error_mm(model: ToPx, sheet: Sheet) -> float:
     by_mm = [(sheet.px(net + step) - sheet.px(net - step)) / 0.1 for step in 0.05 * np.eye(2)]
     off = np.linalg.solve(np.stack(by_mm, -1), (model(net) - sheet.px(net))[..., None])
     return float(np.linalg.norm(off[..., 0], axis=1).max())
-
-
-# How many markers
-
-
-def markers_chart(count: int, on_stage: OnStage) -> Chart:
-    """Markers in the frame against the error of the design, with all of them in view and with a corner covered."""
-    ways: dict[str, tuple[int, ...]] = {"all in view": (), "a corner covered": (COVERED,)}
-    errors: dict[tuple[str, int], list[float]] = {(way, n): [] for way in ways for n in MARKERS}
-    milliseconds: dict[int, list[float]] = {n: [] for n in MARKERS}
-    for seed in range(count):
-        sheet, rng = drawn_sheet("flat", seed)
-        photo = photographed(sheet, rng)
-        for n, ids in MARKERS.items():
-            places = {i: corners_mm()[i] for i in ids}
-            sightings, taken = clocked(partial(find_sheet, photo, frozenset(ids), places, DICTIONARY))
-            milliseconds[n].append(taken)
-            for way, covered in ways.items():
-                left = {i: px for i, px in sightings.corners_px.items() if i not in covered}
-                errors[way, n].append(error_mm(plane(left), sheet) if left else np.inf)
-        on_stage("markers", seed + 1, count)
-    default = len(lay_out_piece(DESIGN_MM[2:], MARKER_MM, "", "design").markers)
-    times = [(n, median(ms)) for n, ms in milliseconds.items()]
-    area = 100 * (MARKER_MM * (MODULES + 2) / MODULES) ** 2 / PIECE_MM**2
-    return Chart(
-        name="markers",
-        title="Markers in the frame",
-        cost="% of the piece's area that markers and their quiet zones take",
-        error="largest error on the design, mm (median)",
-        series={way: [Point(f"{n}", n * area, median(errors[way, n]), n == default) for n in MARKERS] for way in ways},
-        about=f"{count} photographs of {SIZE_PX[0]} × {SIZE_PX[1]} px of a piece of {PIECE_MM:g} mm with markers of "
-        f"{MARKER_MM:g} mm, tilt to 45°. 1: a corner, 2: two opposite corners, 4: all corners, 8: and the sides' "
-        "middles, which the frame has room for. With its only marker covered a sheet is not found: no point.",
-        tables=(Table("markers_time", "Time to find markers", ("markers", "ms"), tuple(times)),),
-    )
-
-
-# Which model
 
 
 def plane(corners_px: Corners) -> ToPx:
