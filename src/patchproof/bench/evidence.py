@@ -113,7 +113,7 @@ def models_chart(count: int, on_stage: OnStage) -> Chart:
         errors: dict[str, list[float]] = {name: [] for name in MODELS}
         milliseconds: dict[str, list[float]] = {name: [] for name in MODELS}
         for seed in range(count):
-            sheet, wrong = drawn_sheet(kind, seed)[0], COVERED + seed % len(corners_mm())
+            sheet, wrong = drawn_sheet(kind, seed)[0], sorted(corners_mm())[seed % len(corners_mm())]
             corners = {i: px + np.array([wrong_px * (i == wrong), 0]) for i, px in corners_found(kind, seed).items()}
             for name, model in MODELS.items():
                 fitted, taken = clocked(partial(model, corners))
