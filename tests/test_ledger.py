@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.channel.printer import identity_printer
+from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
-from patchproof.color import linear_from_srgb
+from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb
 from patchproof.evidence.ledger import _ledger, shapley
-from patchproof.evidence.print_fit import fit_print
+from patchproof.evidence.print_fit import LEAST_CELLS, fit_print
 from patchproof.evidence.reproject import Shot, deblurred, light_fit, shot_of
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.surface import Promised, piece_picture, promised_of, surface_of
@@ -23,7 +23,7 @@ from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import FrameLight
 from patchproof.report.plots import ledger_plot
 from patchproof.sheets.manifest import Manifest
-from test_photo_synthetic import CONDITION, make_manifest, page_raster, photograph, save, view
+from test_photo_synthetic import CONDITION, make_manifest, noisy_design, page_raster, photograph, save, view
 from test_verify_run import measured
 
 SIZE, PHOTOS = (640, 480), 5
@@ -64,21 +64,65 @@ def test_a_culprit_is_named_only_where_it_is_clear(costs, culprit):
     assert ledger(costs, photos=4).culprit is None and ledger(costs, photos=4).shares["print"].interval is None
 
 
-def test_the_print_is_read_from_swatches_and_needs_eight_of_them():
-    promised = linear_from_srgb(np.array(make_manifest().model_dump()["chart"][0]["srgb"]) * 0 + 0.5)
-    corners = np.array(list(product((0.02, 1.0), repeat=3)) + [(g, g, g) for g in (0.1, 0.3, 0.6)])
-    faded = 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)
-    seen = np.stack([faded, faded, np.full_like(faded, np.nan)])
+def shown_by(profile: str, srgb: np.ndarray) -> np.ndarray:
+    """Linear light H×W×3 of what a shipped printer makes of sRGB."""
+    seen = load_printer(profile).apply(torch.from_numpy(srgb).permute(2, 0, 1)[None].float())
+    return linear_from_srgb(seen[0].permute(1, 2, 0).double().numpy())
+
+
+def delta(a: np.ndarray, b: np.ndarray) -> float:
+    return float(ciede2000(lab_from_linear(a), lab_from_linear(b)).mean())
+
+
+INK = np.zeros((1, 1, 3))
+PRINTS = {
+    "same": lambda srgb: shown_by("coated", srgb),
+    "uncoated": lambda srgb: shown_by("uncoated", srgb),
+    "dot_gain": lambda srgb: shown_by("coated", srgb - srgb * (1 - srgb) / 4),  # midtones a fourth too dark
+    "weak_ink": lambda srgb: shown_by("coated", srgb) ** [1, 0.8, 0.55],  # magenta and yellow lack density
+}
+
+
+def cells_of_print(light: np.ndarray, seed: int) -> np.ndarray:
+    """16×16 cells of a photograph's design, with noise."""
+    cells = cv2.resize(light, (16, 16), interpolation=cv2.INTER_AREA)
+    return cells + np.random.default_rng(seed).normal(0, 0.004, cells.shape)
+
+
+@pytest.mark.parametrize(
+    ("change", "before", "after"),
+    [("same", 0.0, 0.3), ("uncoated", 5.0, 2.0), ("dot_gain", 3.1, 1.8), ("weak_ink", 9.5, 1.6)],
+)
+def test_a_known_print_is_read_from_a_noisy_design(change, before, after):
+    """ΔE00 in the mean over the design's own pixels, finer than any cell; other designs of that print as well."""
+    printed, (sent, other) = PRINTS[change], (noisy_design(seed) for seed in (0, 1))
+    promised, ink = shown_by("coated", sent), shown_by("coated", INK)[0, 0]
+    cells = [cells_of_print(printed(sent), i) for i in range(3)]
+    as_printed = fit_print(cells, promised.astype(np.float32), printed(INK)[0, 0], ink)
+    assert delta(printed(sent), promised) == pytest.approx(before, abs=0.1)
+    assert delta(printed(sent), as_printed(promised)) < after
+    assert delta(printed(other), as_printed(shown_by("coated", other))) < after
+    ends = as_printed(np.stack([np.ones(3), ink]))
+    assert ends == pytest.approx(np.stack([np.ones(3), printed(INK)[0, 0]]), abs=0.01)
+
+
+def test_black_that_is_lighter_in_photographs_is_print():
+    sent = noisy_design()
     ink = np.full(3, 0.02)
-    printed = fit_print(list(seen), corners, ink, ink)
-    assert printed(np.stack([ink, np.ones(3)])) == pytest.approx(np.stack([ink, np.ones(3)]), abs=0.01)
-    assert printed(corners) == pytest.approx(faded, abs=0.02)
-    assert printed(promised[None]) == pytest.approx(promised[None], abs=0.03)
-    few = faded.copy()
-    few[7:] = np.nan
-    assert fit_print([few], corners, ink, ink) is None
-    gray = fit_print([np.maximum(faded, 0.1)], corners, np.full(3, 0.1), ink)  # black became lighter, too
-    assert gray(ink[None]) == pytest.approx(np.full((1, 3), 0.1), abs=0.03)
+    as_printed = fit_print([cells_of_print(sent, 0)], sent.astype(np.float32), np.full(3, 0.1), ink)
+    assert as_printed(ink[None]) == pytest.approx(np.full((1, 3), 0.1), abs=0.03)
+
+
+def test_cells_too_few_or_too_much_alike_do_not_say_what_the_print_is():
+    ink, colorful, gray = np.full(3, 0.02), noisy_design(), noisy_design(colorful=False)
+    few = cells_of_print(colorful, 0)
+    for readable, told in ((LEAST_CELLS, True), (LEAST_CELLS - 1, False)):
+        cells = np.full_like(few, np.nan)
+        rows, columns = np.divmod(np.arange(readable), 14)
+        cells[rows + 1, columns + 1] = few[rows + 1, columns + 1]
+        assert (fit_print([cells, cells], colorful.astype(np.float32), ink, ink) is not None) == told
+    assert fit_print([cells_of_print(gray, 0)], gray.astype(np.float32), ink, ink) is None
+    assert fit_print([], colorful.astype(np.float32), ink, ink) is None
 
 
 @pytest.mark.parametrize(
@@ -93,8 +137,8 @@ def test_a_veil_is_no_lighter_than_the_darkest_place(darkest, ink, seen_ink):
     square = np.full((40, 40, 3), 150, np.uint8)
     square[:20] = darkest
     light = FrameLight(np.full(3, 0.8), np.full(3, ink), 0.8 - ink, 0.0)
-    shot = Shot("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((0, 3)), 1.0)
-    promised = Promised(np.ones((1, 1, 3)), np.zeros((0, 3)), np.full(3, 0.02))
+    shot = Shot("a.jpg", square, np.eye(3), light, 0.3, 0.0, np.zeros((16, 16, 3)), 1.0)
+    promised = Promised(np.ones((1, 1, 3)), np.full(3, 0.02))
     fit = light_fit(shot, promised)
     assert fit.apply(light.paper) == pytest.approx(np.ones(3))
     assert fit.apply(light.ink) == pytest.approx(np.full(3, seen_ink), abs=1e-6)
@@ -102,19 +146,27 @@ def test_a_veil_is_no_lighter_than_the_darkest_place(darkest, ink, seen_ink):
 
 @functools.cache
 def design() -> np.ndarray:
-    """Fine stripes of strong colors."""
-    rows = np.arange(128) // 2 % 2
-    return np.repeat(np.where(rows[:, None, None], [220, 40, 60], [30, 200, 90]), 128, axis=1).astype(np.uint8)
+    """Stripes of 1.5 mm in strong colors, reddish and greenish, which change every 10 mm."""
+    low, high = np.array([[140, 10, 20], [10, 140, 20]]), np.array([[250, 110, 200], [110, 250, 200]])
+    colors = np.random.default_rng(0).integers(low[:, None, None], high[:, None, None], (2, 14, 14, 3))
+    return striped(*colors.repeat(20, 1).repeat(20, 2))
+
+
+def striped(first, second) -> np.ndarray:
+    """uint8 280×280×3, three rows of the one color and three of the other in turn."""
+    rows = np.arange(280) // 3 % 2 == 1
+    return np.where(rows[:, None, None], first, second * np.ones((280, 280, 1))).astype(np.uint8)
 
 
 @functools.cache
-def sheet() -> Manifest:
+def sheet(two_colors: bool = False) -> Manifest:
     rng = np.random.default_rng(0)
     conditions = [CONDITION | dict(contrast=c, blur_px=0.3) for c in rng.uniform(0.6, 0.9, 50)]
     model = dict(name="net", sha256=None, rate=0.9, interval=[0.85, 0.93], confidence=0.8)
     target = dict(label="striped", indices=[0], goal="assist")
     promise = dict(target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=400)
-    return make_manifest(promise | dict(controls={}, conditions=conditions), design=design())
+    colors = striped([220, 40, 60], [30, 200, 90]) if two_colors else design()
+    return make_manifest(promise | dict(controls={}, conditions=conditions), design=colors)
 
 
 def stripes(pictures: torch.Tensor) -> torch.Tensor:
@@ -128,8 +180,8 @@ NET = Classifier("net", None, 240, ("striped", "plain"), stripes)
 
 
 @functools.cache
-def raster(faded: bool) -> np.ndarray:
-    page = page_raster(sheet(), True)
+def raster(faded: bool, two_colors: bool = False) -> np.ndarray:
+    page = page_raster(sheet(two_colors), True)
     if faded:  # paper white and marker black stay as they are
         page = 0.45 * page + 0.55 * page.mean(-1, keepdims=True)
     return page.astype(np.float32)
@@ -166,11 +218,10 @@ def test_known_culprits_are_named(tmp_path, change, culprit):
     assert "not explained" in ledger_plot(found.ledger.model_dump())
 
 
-def test_without_swatches_print_and_light_are_one_step(tmp_path):
+def test_of_two_colors_print_and_light_are_one_step(tmp_path):
     homography = view(5, 5, 280, size_px=SIZE)
-    save(photograph(raster(True), homography, SIZE, blur_px=0.3, fine=2, light=0.75), tmp_path / "a.png")
-    manifest = sheet().model_copy(update={"chart": ()})
-    found = gather_evidence(tmp_path, manifest, Options([NET], identity_printer()))
+    save(photograph(raster(True, True), homography, SIZE, blur_px=0.3, fine=2, light=0.75), tmp_path / "a.png")
+    found = gather_evidence(tmp_path, sheet(two_colors=True), Options([NET], identity_printer()))
     assert list(found.summary.ledger) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
     assert found.summary.ledger["print_light_and_camera"].share > 0.1
 
@@ -210,7 +261,7 @@ def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_le
 def test_the_piece_is_drawn_as_the_page_shows_it():
     surface = surface_of(sheet())
     promised = promised_of(sheet(), surface, identity_printer())
-    drawn = piece_picture(surface, promised.design, promised.swatches, promised.ink)
+    drawn = piece_picture(surface, promised.design, promised.ink)
     x, y, w, h = (round(v * 10) for v in surface.piece_mm)
     page = cv2.resize(
         page_raster(sheet(), True)[y : y + h, x : x + w], drawn.shape[1::-1], interpolation=cv2.INTER_AREA

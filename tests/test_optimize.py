@@ -29,7 +29,7 @@ from patchproof.strict import Refused, validated
 
 SCENE = {
     "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
-    "patch": {"side": "+z", "width_mm": 90, "height_mm": 90},
+    "patch": {"side": "+z", "width_mm": 115, "height_mm": 115},
     "target": {"label": "red", "models": ["module:fake_networks.red_against_blue"]},
     "view": {"azimuth_deg": [-30, 30], "elevation_deg": [0, 20], "distance_mm": [400, 500], "look_at_jitter": 0},
     "camera": {"photo_px": [1600, 1200]},

@@ -16,17 +16,14 @@ from patchproof.sheets.manifest import Manifest, design_sha256, png_base64
 PX_PER_MM = 10  # of the page raster: every edge of the page lies on a multiple of 0.1 mm
 PAGE_MM = (210.0, 297.0)
 CUT_MM = (35.0, 60.0, 140.0, 140.0)
-DESIGN_MM = (55.0, 80.0, 100.0, 100.0)
+DESIGN_MM = CUT_MM  # it fills the piece
 MARKER_MM, MODULE_MM = 14.0, 2.0
 PIECE_IDS, PAGE_IDS = tuple(range(100, 108)), (200, 201, 202)
-COLORS = [(r, g, b) for r in (0.0, 1.0) for g in (0.0, 1.0) for b in (0.0, 1.0)] + [
-    (v, v, v) for v in (0.2, 0.4, 0.6, 0.8)
-]
 CONDITION = dict(px_per_mm=None, tilt_deg=None, azimuth_deg=None, contrast=None, blur_px=None, recognized=True)
 
 
 def marker_squares() -> dict[int, tuple[float, float]]:
-    """Top-left mm of the eight piece markers (corners and middles of the frame) and three page markers."""
+    """Top-left mm of the eight piece markers (corners and middles of its sides) and three page markers."""
     x, y, w, _ = CUT_MM
     near, middle, far = 2.0, w / 2 - MARKER_MM / 2, w - 2.0 - MARKER_MM
     spots = [
@@ -43,17 +40,19 @@ def marker_squares() -> dict[int, tuple[float, float]]:
     return squares | {200: (20.0, 20.0), 201: (170.0, 20.0), 202: (20.0, 260.0)}
 
 
-def swatch_rects() -> list[tuple[float, float, float, float]]:
-    """Twelve 10 mm swatches between the frame's markers."""
-    x, y, w, _ = CUT_MM
-    across = [(x + dx, y + dy, 10.0, 10.0) for dy in (4.0, w - 14.0) for dx in (24.0, 42.0, 88.0, 106.0)]
-    return across + [(x + dx, y + dy, 10.0, 10.0) for dx in (4.0, w - 14.0) for dy in (24.0, 106.0)]
-
-
 def some_design(seed: int = 3) -> np.ndarray:
-    """A smooth colorful design, uint8 128×128×3."""
+    """A smooth colorful design, uint8 140×140×3."""
     rng = np.random.default_rng(seed)
-    return cv2.resize(rng.integers(20, 236, (8, 8, 3), np.uint8), (128, 128), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(rng.integers(20, 236, (8, 8, 3), np.uint8), (140, 140), interpolation=cv2.INTER_LINEAR)
+
+
+def noisy_design(seed: int = 0, colorful: bool = True) -> np.ndarray:
+    """As optimizers leave one: noise of all sizes down to 2 mm, in strong colors or grays; float64 140×140×3 sRGB."""
+    rng, total = np.random.default_rng(seed), np.zeros((140, 140, 3))
+    for n in (4, 8, 16, 32, 70):
+        noise = rng.normal(0, 1, (n, n, 3 if colorful else 1)) * np.ones(3)
+        total += cv2.resize(noise, (140, 140), interpolation=cv2.INTER_NEAREST)
+    return 1 / (1 + np.exp(-total))
 
 
 def make_manifest(promise: dict | None = None, first_id: int = 0, design: np.ndarray | None = None) -> Manifest:
@@ -62,17 +61,21 @@ def make_manifest(promise: dict | None = None, first_id: int = 0, design: np.nda
     for marker_id, (x, y) in marker_squares().items():
         corners = [(x, y), (x + MARKER_MM, y), (x + MARKER_MM, y + MARKER_MM), (x, y + MARKER_MM)]
         markers.append(dict(dictionary="DICT_5X5_1000", id=marker_id + first_id, corners_mm=corners, page=1))
-    chart = [dict(rect_mm=r, srgb=c, page=1) for r, c in zip(swatch_rects(), COLORS, strict=True)]
     return Manifest.model_validate(
         dict(
+            version=2,
             sheet_id="TESTSHEET0",
             kind="design",
             page_mm=PAGE_MM,
             design=dict(
-                sha256=design_sha256(design), rect_mm=DESIGN_MM, size_px=(128, 128), page=1, png=png_base64(design)
+                sha256=design_sha256(design),
+                rect_mm=DESIGN_MM,
+                size_px=design.shape[1::-1],
+                page=1,
+                png=png_base64(design),
             ),
             markers=markers,
-            chart=chart,
+            chart=(),
             cut_mm=CUT_MM,
             ruler_mm=(100.0, 100.0),
             tiles=(),
@@ -86,14 +89,14 @@ def page_raster(manifest: Manifest, only_piece: bool) -> np.ndarray:
     """The page as float32 linear light at 10 px/mm; `only_piece` leaves the rest of the page white paper out (gray)."""
     page = np.ones((round(PAGE_MM[1] * PX_PER_MM), round(PAGE_MM[0] * PX_PER_MM), 3), np.float32)
     printed = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
+    design = cv2.resize(manifest.design.pixels(), (1400, 1400), interpolation=cv2.INTER_NEAREST)
+    _paste(page, linear_from_srgb(design / 255.0), *DESIGN_MM[:2])
     for marker in manifest.markers:
         (x, y), side = marker.corners_mm[0], round(MARKER_MM * PX_PER_MM)
+        quiet = round((MARKER_MM + 2 * MODULE_MM) * PX_PER_MM)
         code = cv2.aruco.generateImageMarker(printed, marker.id, side)
+        _paste(page, np.ones((quiet, quiet, 3)), x - MODULE_MM, y - MODULE_MM)
         _paste(page, np.repeat(code[..., None] / 255.0, 3, 2), x, y)
-    for swatch in manifest.chart:
-        _paste(page, np.full((100, 100, 3), linear_from_srgb(np.array(swatch.srgb))), *swatch.rect_mm[:2])
-    design = cv2.resize(manifest.design.pixels(), (1000, 1000), interpolation=cv2.INTER_NEAREST)
-    _paste(page, linear_from_srgb(design / 255.0), *DESIGN_MM[:2])
     if only_piece:
         x, y, w, h = (round(v * PX_PER_MM) for v in CUT_MM)
         cut = page[y : y + h, x : x + w].copy()

@@ -205,7 +205,8 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
 
 
 def test_a_refused_bend_is_said_in_its_own_sentence(tmp_path):
-    other, sentence = scene_with(tmp_path).other_surface()
+    wide = {"patch__width_mm": 150, "patch__height_mm": 150}  # beyond the carton's rounded edges
+    other, sentence = scene_with(tmp_path, **wide).other_surface()
     assert other is None and sentence.startswith("bend = true is refused. Expected ")
 
 

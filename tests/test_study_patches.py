@@ -84,13 +84,13 @@ def test_the_flat_twin_is_as_large_in_its_pictures_as_the_patch_in_its_views(sce
 
 def test_a_patch_too_large_for_turned_pictures_is_shown_at_the_largest_size_that_fits(scene_file):
     wide = (-180.0, 180.0)
-    near = scene_file.read_text().replace("[500, 900]", "[240, 300]")
+    near = scene_file.read_text().replace("[500, 900]", "[240, 300]").replace("_mm = 90", "_mm = 115")
     scene_file.write_text(near)
     scene, settings = load_scene(scene_file), patch3d.Patch3dSettings(scenes=("scene.toml",), roll_deg=wide)
     share = patch3d.flat_settings(scene, settings).view.patch_share
     assert share[1] < np.quantile(patch3d.design_shares(scene), 0.95)
-    # 90 of 114.6 mm with the smallest frame, in a square turned by 45 degrees
-    assert share[1] == pytest.approx(90 / 114.571 / 2**0.5, abs=1e-3) and share[0] <= share[1]
+    # a square turned by 45 degrees
+    assert share[1] == pytest.approx(1 / 2**0.5, abs=1e-3) and share[0] <= share[1]
 
 
 def test_renders_show_the_bare_object_and_never_an_evaluated_view(scene_file, tmp_path):

