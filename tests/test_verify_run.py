@@ -186,7 +186,7 @@ def test_where_a_design_has_too_few_colors_paper_and_ink_fix_the_color(design):
         (lambda: shot(first_id=300), "rejected", "wrong_sheet"),
         (lambda: np.concatenate([shot(), shot()], 1), "rejected", "several_sheets"),
         (lambda: np.concatenate([shot(), shot(first_id=300)], 1), "rejected", "several_sheets"),
-        (lambda: shot(light=2.0), "judged", "clipped"),
+        (lambda: shot(light=3.0), "judged", "clipped"),
         (lambda: shot(82, 250), "judged", "tilted"),
     ],
 )
@@ -196,7 +196,12 @@ def test_each_trouble_has_its_code_and_advice(srgb, status, code):
     assert look.entry.remark.advice and look.counted == (status != "rejected")
 
 
-def test_a_corner_of_the_frame_identifies_the_sheet_but_is_not_measured():
+def test_what_is_not_clipped_is_measured_even_where_paper_is():
+    color = measured(shot(light=2.0)).entry.color
+    assert color.clipped_share == pytest.approx(0.36, abs=0.03) and color.delta_e00_mean < 1
+
+
+def test_a_corner_of_the_piece_identifies_the_sheet_but_is_not_measured():
     photo = shot(0, 400)
     photo[:, 330:] = 120  # only the left markers stay
     photo[200:] = 120

@@ -50,8 +50,8 @@ _BENT = "the markers lie neither in a plane nor on rolled paper: press the sheet
 
 @dataclass(frozen=True)
 class MeasuredPhoto:
-    """An entry without predictions, whether it is counted, pictures by kind, the light on the frame where it was read,
-    and what the networks will see of it by side, where it was asked for.
+    """An entry without predictions, whether it is counted, pictures by kind, the light on the markers where it was
+    read, and what the networks will see of it by side, where it was asked for.
     """
 
     entry: PhotoEntry
@@ -99,7 +99,7 @@ def measure(
     except CannotJudge as cannot:
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(cannot)), False)
     color, pictures = None, {}
-    # a page in tiles shows none of the design's frame, or a part of it
+    # a page in tiles shows none of the piece's markers, or a part of them
     if trouble is None and promised is not None and surface.piece_ids:
         color, pictures = appearance(srgb, fit.px_from_mm, surface, promised, light, geometry)
         if color.clipped_share > MOST_CLIPPED:

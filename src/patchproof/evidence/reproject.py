@@ -2,7 +2,7 @@
 
 In: a `Shot` (the centered square of a photograph as a network nearly sees it, and what was measured in it), the piece
 as it could have been printed, and a `Reference`: light and blur of one of the promise's own conditions. Out: the
-square with the piece replaced, frame and all. Light and blur fall on the surroundings, too: there they are undone as
+square with the whole piece replaced. Light and blur fall on the surroundings, too: there they are undone as
 far as noise allows (Wiener's filter for the known blur). Work is done at three times the network's size at most: finer
 detail is averaged away before the network sees it.
 

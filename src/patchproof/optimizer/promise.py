@@ -3,7 +3,7 @@ controls.
 
 In: a `Problem`, the design's pixels, and conditions. Out: the manifest's `Promise`. Controls are shown on the very same
 conditions, so that differences are paired: the bare object, and a mean-color, a gray and a noise design in the same
-printed frame. The set is drawn and looked at once, after the design is frozen.
+printed markers. The set is drawn and looked at once, after the design is frozen.
 """
 
 from __future__ import annotations

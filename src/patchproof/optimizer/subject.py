@@ -69,7 +69,7 @@ class Subject(Protocol):
         ...
 
     def shown(self, design: Tensor, kind: str = "design") -> Shown:
-        """What photographs show of a design, or of a control in the frame of its own sheet; differentiable."""
+        """What photographs show of a design, or of a control with the markers of its own sheet; differentiable."""
         ...
 
     def printed_by(self, printer: Printer) -> Self:

@@ -140,7 +140,7 @@ def hang_own(run: Run, photo_px: tuple[int, int] | None = None) -> HungSheet:
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
-    """A sheet's manifest and the scene with its template's frame; refused where the sheet is not of this run."""
+    """A sheet's manifest and the scene with its template; refused where the sheet is not of this run."""
     manifest = attached_manifest(pdf_path, run.scene.sheet_id)
     own = run.scene.settings.sheet.template
     scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", own))
