@@ -34,10 +34,10 @@ def test_all_but_the_markers_stays_white_paper(blank):
     path, manifest = blank
     assert manifest.design is None and manifest.promise is None and manifest.kind == "blank"
     assert attached_manifest(path) == manifest and manifest.cut_mm[2:] == (162.0, 162.0)
-    pixels, scale = piece_pixels(path, manifest, 100), 100 / 25.4
+    pixels, scale = piece_pixels(path, manifest, 200), 200 / 25.4
     dark = (pixels < 30).all(-1).mean()
     for marker in blank_piece(manifest).markers:
-        low, high = (np.array(marker.corners_mm)[[0, 2]] * scale).astype(int) + [[-1], [2]]
+        low, high = (np.array(marker.corners_mm)[[0, 2]] * scale).astype(int) + np.array([[-1], [2]])
         pixels[low[1] : high[1], low[0] : high[0]] = 255
     # PDFium counts coverage of the dashed line, which lies outside, in 1/256: one code value of it may show
     assert pixels.min() >= 254 and dark > 0.02  # and the markers were there
