@@ -28,7 +28,7 @@ from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheets.several import write_several
 from patchproof.sheets.template import load_template, template_names
-from patchproof.sheets.tiles import plan_tiles
+from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
 from patchproof.sheets.write import check_sheet, write_sheet
 from patchproof.strict import Refused, read_toml, shipped
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
@@ -219,9 +219,23 @@ def test_seams_are_even_and_spare_the_markers_and_their_white(piece_mm, marker_m
 
 
 def test_markers_too_large_for_tiles_are_refused():
-    piece = lay_out_piece((700, 700), 130, ID, "design")  # their corners are 168 mm wide, tiles at most 160
-    with pytest.raises(Refused, match="can be cut into tiles without cutting a marker, got markers of 130 mm on tiles"):
-        plan_tiles(load_template("a4_tiles").tiles, piece)
+    """Corners of 136 × 9/7 + 1 = 175.9 mm go on tiles of 177 mm, those of 137 mm markers are 177.1 mm wide."""
+    grid = load_template("a4_tiles").tiles
+    assert plan_tiles(grid, lay_out_piece((700, 700), 136, ID, "design"))
+    with pytest.raises(Refused, match="can be cut into tiles without cutting a marker, got markers of 137 mm on tiles"):
+        plan_tiles(grid, lay_out_piece((700, 700), 137, ID, "design"))
+
+
+def test_a_piece_with_more_markers_than_ids_is_refused_before_it_is_optimized():
+    template = load_template("a4_tiles")
+    for marker_mm, markers, fits in ((10, 36, True), (8, 44, False)):
+        piece = lay_out_piece((1000, 1000), marker_mm, ID, "design")
+        assert len(piece.markers) == markers and len(plan_tiles(template.tiles, piece)) == 24
+        if fits:
+            refuse_larger_than_page(template, piece)  # 36 + 4 + 5 × 24 = 160
+        else:
+            with pytest.raises(Refused, match="at most 166 markers on one sheet, got 168: use larger or fewer tiles"):
+                refuse_larger_than_page(template, piece)
 
 
 def test_tiles_of_the_former_kind_are_put_together_alike(tiled):
