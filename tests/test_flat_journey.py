@@ -33,17 +33,18 @@ from patchproof.scene.patch_scene import PatchScene, load_mesh_scene
 from patchproof.scene.placement import place_card
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.rects import grown
 from patchproof.strict import Refused, shipped
 from test_journey import command
 
 PHOTO_PX = (800, 600)
 PHOTOS, REPRINTS = 6, 3
-DESIGN_MM, MARKER_MM = 80, 14
+PIECE_MM, MARKER_MM = 120, 14
 
 WORLD = SceneSettings.model_validate(
     {
         "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
-        "patch": {"side": "+z", "width_mm": DESIGN_MM, "height_mm": DESIGN_MM},
+        "patch": {"side": "+z", "width_mm": PIECE_MM, "height_mm": PIECE_MM},
         "target": {"label": "carton", "models": ["builtin"]},
         "view": {
             "azimuth_deg": (-30, 30),
@@ -98,7 +99,10 @@ def few_views():
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
     text = shipped("print_templates", "blank_a4.toml").read_text(encoding="utf-8")
-    for old, new in (("design_mm = [110.0, 110.0]", f"design_mm = [{DESIGN_MM}, {DESIGN_MM}]"), ("= 19.0", "= 14.0")):
+    for old, new in (
+        ("piece_mm = [162.0, 162.0]", f"piece_mm = [{PIECE_MM}, {PIECE_MM}]"),
+        ("= 19.0", f"= {MARKER_MM}"),
+    ):
         assert old in text
         text = text.replace(old, new)
     (folder / "small_blank.toml").write_text(text, encoding="utf-8")
@@ -117,7 +121,7 @@ def images(tmp_path_factory):
     shoot(world, None, conditions, folder / "images")
     rows = [f"photo_{i}.jpg,carton" for i in range(8)]
     (folder / "labels.csv").write_text("\n".join(["file,label", *rows]), encoding="utf-8")
-    tables = 'images = "images"\nlabels = "labels.csv"', "width_mm = 90\nheight_mm = 90", "deceive"
+    tables = 'images = "images"\nlabels = "labels.csv"', "width_mm = 135\nheight_mm = 135", "deceive"
     return optimized(folder, world, conditions, *tables)
 
 
@@ -156,13 +160,17 @@ def as_taken(scene, n: int):
 
 
 def design_pixels(homography, scene, size_px) -> np.ndarray:
-    """Boolean H×W: pixels a little inside of the design."""
+    """Boolean H×W: pixels a little inside of the design, and outside of what belongs to markers."""
     import cv2
 
-    x, y, w, h = scene.piece.design_rect_mm
     mask = np.zeros(size_px[::-1], np.uint8)
-    corners = apply_homography(homography, rect_corners((x + 3, y + 3, w - 6, h - 6)))
-    cv2.fillConvexPoly(mask, np.round(corners - 0.5).astype(np.int32), 1)
+    for rect, value in [
+        (grown((0, 0, *scene.piece.size_mm), -3), 1),
+        *((grown(r, 3), 0) for r in scene.piece.reserved_mm),
+    ]:
+        cv2.fillConvexPoly(
+            mask, np.round(apply_homography(homography, rect_corners(rect)) - 0.5).astype(np.int32), value
+        )
     return mask.astype(bool)
 
 
@@ -271,7 +279,7 @@ def test_another_page_keeps_the_piece_and_its_promise_or_is_refused(photos, tmp_
     before = load_manifest(photos.folder / "SHEET.json")
     after = sheet_of(photos.run, tmp_path / "other.pdf", template=str(tmp_path / "other.toml"))
     assert after.cut_mm[2:] == before.cut_mm[2:] and after.promise == before.promise
-    with pytest.raises(Refused, match="Expected a template that holds the blank's piece of 120"):
+    with pytest.raises(Refused, match=r"Expected a piece of at most 99\.6 × 99\.6 mm on this page, got 120 × 120 mm"):
         sheet_of(photos.run, tmp_path / "small.pdf", template=str(tmp_path / "small.toml"))
     assert not (tmp_path / "small.pdf").exists()
 

@@ -86,14 +86,13 @@ def test_the_whole_piece_lies_in_the_square_at_the_drawn_size(tmp_path, size_px)
     scene = load_image_scene(settings_of(), folder_of(tmp_path), 0)
     conditions = scene.draw("promise", 200)
     piece = rect_corners((0, 0, *scene.piece.size_mm))
-    design = rect_corners(scene.piece.design_rect_mm)
     side = min(size_px)
     low = (np.array(size_px) - side) / 2
     shares, places = [], []
     for where in scene.piece_homographies(conditions, size_px):
         corners = apply_homography(where, piece)
         assert (corners > low - 1e-9).all() and (corners < low + side + 1e-9).all()
-        a, b, c, _ = apply_homography(where, design)
+        a, b, c, _ = corners
         assert np.linalg.norm(b - a) / np.linalg.norm(c - b) == pytest.approx(60 / 40)  # a similarity
         shares.append(np.linalg.norm(b - a) / side)
         places.append(corners.mean(0) / side)
@@ -199,10 +198,14 @@ def test_markers_are_as_large_as_views_need_and_pictures_hold(tmp_path):
     large = load_image_scene(settings_of(camera={"photo_px": (1600, 1200)}), folder, 0)
     assert 8 <= large.piece.module_mm * 7 < 8.75 and large.unreadable_share <= 0.06
     small = load_image_scene(settings_of(), folder, 0)
-    assert small.piece.module_mm * 7 == pytest.approx(12)  # a fifth of the design's longer side
+    assert small.piece.marker_mm == pytest.approx(8.2)  # 0.29 × 40 = 11.6 mm for a corner; (11.6 - 1) × 7/9 = 8.24
     assert small.unreadable_share > 0.5 and "unreadable" in small.warnings[-1]
-    tight = load_image_scene(settings_of(view={"patch_share": (0.1, 0.68), "roll_deg": (0, 0)}), folder, 0)
-    assert tight.piece.size_mm[0] == pytest.approx(60 / 0.68, abs=0.3)  # the picture holds no more
+    whole = load_image_scene(settings_of(view={"patch_share": (0.1, 1.0), "roll_deg": (0, 0)}), folder, 0)
+    assert whole.piece.size_mm == small.piece.size_mm == (60, 40)  # up to the whole square the piece stays as asked
+    with pytest.raises(Refused, match=r"at least 39 mm, beside 8 mm markers, got 60 × 38\.9 mm"):
+        load_image_scene(settings_of(patch={"width_mm": 60, "height_mm": 38.9}), folder, 0)
+    with pytest.raises(Refused, match=r"at most 166\.6 × 179\.6 mm on this page, got 170 × 40 mm"):
+        load_image_scene(settings_of(patch={"width_mm": 170, "height_mm": 40}), folder, 0)
 
 
 def test_a_line_without_a_label_is_refused(tmp_path):

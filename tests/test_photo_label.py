@@ -24,7 +24,7 @@ from patchproof.sheets.write import write_sheet
 
 def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):
     design = np.random.default_rng(seed).integers(0, 256, (16, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
-    content = PrintedPiece(lay_out_piece((90, 90), 16.0, identity, kind), identity, kind, design)
+    content = PrintedPiece(lay_out_piece((136, 136), 16.0, identity, kind), identity, kind, design)
     return write_sheet(path, load_template("a4"), content)
 
 
@@ -109,7 +109,7 @@ def test_a_page_of_several_designs_is_each_ones_own_and_nobody_elses(tmp_path):
 
     def page(name, *designs):
         each = [
-            PrintedPiece(lay_out_piece((40, 40), 8, identity, "design"), identity, "design", pixels, None, {})
+            PrintedPiece(lay_out_piece((64, 64), 8, identity, "design"), identity, "design", pixels, None, {})
             for identity, pixels in designs
         ]
         manifests = write_several(tmp_path / f"{name}.pdf", template, each)

@@ -120,11 +120,10 @@ def still(scene, n: int):
 
 
 def test_geometry_light_blur_and_noise_are_recovered(world, scene):
-    """Corners of the design within 0.1 px, light over the design within 2 %, blur within 0.3 px, noise within 15 %."""
+    """Corners of the piece within 0.1 px, light over it within 2 %, blur within 0.3 px, noise within 15 %."""
     conditions = still(scene, len(VIEWS))
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
-    x, y, w, h = scene.piece.design_rect_mm
-    terms = quadratic_terms([x, y] + grid * [w, h], scene.piece.size_mm)
+    terms = quadratic_terms(grid * scene.piece.size_mm, scene.piece.size_mm)
     found = zip(
         scene.piece_homographies(conditions, SIZE),
         scene.piece_light(conditions),
@@ -132,7 +131,7 @@ def test_geometry_light_blur_and_noise_are_recovered(world, scene):
         world.truth.values(),
         strict=True,
     )
-    corners = rect_corners((x, y, w, h))
+    corners = rect_corners((0, 0, *scene.piece.size_mm))
     for where, light, blur, noise, (true_where, true_light, true_blur) in found:
         miss = np.linalg.norm(apply_homography(where, corners) - apply_homography(true_where, corners), axis=1)
         assert miss.max() < 0.1
@@ -142,11 +141,12 @@ def test_geometry_light_blur_and_noise_are_recovered(world, scene):
 
 
 def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
-    blank = lay_out_piece((110.0, 110.0), 19.0, world.manifest.sheet_id, "blank")
-    assert scene.piece.size_mm == pytest.approx(blank.size_mm) and scene.piece.swatches == blank.swatches
-    assert [m.corners_mm for m in scene.piece.markers] == [m.corners_mm for m in blank.markers]
+    blank = lay_out_piece((162.0, 162.0), 19.0, world.manifest.sheet_id, "blank")
+    assert scene.piece.size_mm == blank.size_mm and len(scene.piece.markers) == 4
+    for mine, printed in zip(scene.piece.markers, blank.markers, strict=True):
+        assert np.array(mine.corners_mm) == pytest.approx(np.array(printed.corners_mm), abs=2e-6)
     assert {m.id for m in scene.piece.markers} != {m.id for m in blank.markers}
-    assert (scene.settings.patch.width_mm, scene.settings.patch.height_mm) == (110.0, 110.0)
+    assert (scene.settings.patch.width_mm, scene.settings.patch.height_mm) == (162.0, 162.0)
     assert all("unreadable" in warning for warning in scene.warnings)
     # the id follows from the settings with the blank's size filled in, as a run keeps them, and from the photographs
     digest = _digest(scene.base / scene.settings.object.photos)
@@ -225,11 +225,11 @@ def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_
     name, (where, _, blur) = next(iter(world.truth.items()))
     pixels = np.asarray(Image.open(world.folder / "photos" / name))[:, 160:640]  # 480 × 600
     Image.fromarray(pixels).resize((960, 1200), Image.Resampling.BICUBIC).save(tmp_path / "tall.png")
-    piece = lay_out_piece((110.0, 110.0), 19.0, "A1B2C3D4E5", "design")
+    piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "design")
     seen = see(tmp_path / "tall.png", world.manifest, piece, (640, 480))
     # (x - 160, y) in 480 × 600 has its square from y = 60 on; 480 px of it become 480
     expected = np.array([[1, 0, -160 + 80], [0, 1, -60], [0, 0, 1.0]]) @ where
-    corners = rect_corners(piece.design_rect_mm)
+    corners = rect_corners((0, 0, *piece.size_mm))
     found = apply_homography(seen.photo_from_piece, corners)
     assert np.abs(found - apply_homography(expected, corners)).max() < 0.1
     assert seen.blur_px == pytest.approx(blur, abs=0.3)
@@ -238,7 +238,7 @@ def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_
 
 def test_glare_and_shadow_do_not_move_the_light():
     """A highlight on a tenth and a shadow's edge on a tenth of the paper: within 2 % of the light elsewhere."""
-    piece = lay_out_piece((110.0, 110.0), 19.0, "A1B2C3D4E5", "blank")
+    piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "blank")
     width, height = (round(4 * side) for side in piece.size_mm)
     px_from_piece = np.diag([width / piece.size_mm[0], height / piece.size_mm[1], 1.0])
     rows, columns = np.mgrid[:height, :width] + 0.5
@@ -255,7 +255,7 @@ def test_glare_and_shadow_do_not_move_the_light():
 
 
 def test_overexposed_paper_is_clipped():
-    piece = lay_out_piece((110.0, 110.0), 19.0, "A1B2C3D4E5", "blank")
+    piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "blank")
     with pytest.raises(CannotJudge, match="clipped: the paper is overexposed"):
         paper_light(np.full((400, 400, 3), 255, np.uint8), np.diag([2.0, 2.0, 1.0]), piece, 0.5)
 
@@ -287,7 +287,7 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
     [
         (
             {"patch": {"width_mm": 90, "height_mm": 110}},
-            r"as large as the blank sheet's \(110 × 110 mm\), got 90 × 110",
+            r"as large as the blank sheet's \(162 × 162 mm\), got 90 × 110",
         ),
         ({"patch": {"bend": True}}, r"got bend = true: give a mesh"),
         ({"object": {"photos": "nowhere", "sheet": "BLANK.json"}}, r"got 0 usable of 0"),
@@ -303,7 +303,7 @@ def test_a_page_too_small_for_the_blank_s_piece_is_refused(world, tmp_path):
     text = shipped("print_templates", "a4.toml").read_text(encoding="utf-8")
     assert "167.0, 180.0]" in text
     (tmp_path / "small.toml").write_text(text.replace("167.0, 180.0]", "120.0, 120.0]"), encoding="utf-8")
-    with pytest.raises(Refused, match=r"holds the blank's piece of 162\.9 × 162\.9 mm, got .*small\.toml with room"):
+    with pytest.raises(Refused, match=r"at most 119\.6 × 119\.6 mm on this page, got 162 × 162 mm"):
         load_photo_scene(settings_of(world, sheet={"template": str(tmp_path / "small.toml")}), world.folder, 0)
 
 
@@ -316,7 +316,7 @@ def test_a_sheet_with_a_design_is_refused(world, tmp_path):
 
 
 def test_each_unusable_photograph_has_its_code(world, tmp_path):
-    piece = lay_out_piece((110.0, 110.0), 19.0, "A1B2C3D4E5", "design")
+    piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "design")
     sharp = np.asarray(Image.open(world.folder / "photos" / "0.png"))
     markers = world.manifest.markers
     free = sorted(set(range(1000)) - {m.id for m in markers})

@@ -11,13 +11,15 @@ import trimesh
 
 from conftest import SCENE
 from patchproof import geometry
+from patchproof.channel.printer import identity_printer
+from patchproof.render.designs import PrintedPiece
 from patchproof.render.photograph import expose, photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.piece import MODULES, frame_image
+from patchproof.sheets.piece import MODULES, marker_image, with_ids
 from patchproof.strict import Refused
 
 QUIET = """
@@ -35,26 +37,26 @@ def scene_of(tmp_path, text):
 
 
 def piece_of(scene, design_px=(180, 180)):
-    frame = frame_image(scene.piece, design_px)
-    x0, y0, width, height = frame.design_box_px
-    srgb = torch.tensor(np.asarray(frame.srgb), dtype=torch.float32)
-    return PiecePicture(srgb, frame.piece_box_px, (x0, y0, x0 + width, y0 + height))
+    """Its markers, and middle gray between them."""
+    image, reserved = marker_image(scene.piece, design_px)
+    return PiecePicture(torch.tensor(np.where(reserved[..., None], image, np.float32(0.5))))
 
 
 def test_a_scene_knows_its_piece_card_and_id(scene_file):
     scene = load_scene(scene_file)
     assert scene.placement.size_mm == scene.piece.size_mm
-    assert scene.piece.size_mm[0] > 90 and len(scene.piece.markers) >= 4
+    assert scene.piece.size_mm == scene.settings.patch.size_mm == (90, 90) and len(scene.piece.markers) == 4
     assert load_scene(scene_file).sheet_id == scene.sheet_id != load_scene(scene_file, seed=1).sheet_id
 
 
 def test_markers_follow_from_the_views(tmp_path):
-    """Twice the distance needs markers twice as large, until the page or the object cannot hold them."""
+    """Twice the distance needs markers twice as large, until they would leave the design too little."""
     near = scene_of(tmp_path, SCENE.replace("[500, 900]", "[400, 450]"))
     far = scene_of(tmp_path, SCENE.replace("[500, 900]", "[4000, 9000]"))
     assert near.piece.module_mm * MODULES < far.piece.module_mm * MODULES
     assert near.unreadable_share <= 0.05 < far.unreadable_share
-    assert any("unreadable" in warning for warning in far.warnings)
+    assert far.piece.marker_mm == pytest.approx(19.5)  # 0.29 × 90 = 26.1 mm for a corner; (26.1 - 1) × 7/9 = 19.52
+    assert any("markers of 19.5 mm, the largest that fit, will be unreadable" in warning for warning in far.warnings)
 
 
 def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(tmp_path, monkeypatch):
@@ -74,7 +76,9 @@ def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(t
         ("width_mm = 90", "widht_mm = 90", r'got "patch.widht_mm": did you mean "width_mm"'),
         ("length_mm = 300", "length_mm = nan", r"length_mm.*nan.*finite"),
         ("[-40, 40]", "[40, -40]", r"low <= high"),
-        ("width_mm = 90", "width_mm = 900", r"Expected a piece no larger|Expected .* design"),
+        ("width_mm = 90", "width_mm = 900", r"Expected a piece no larger"),
+        ("height_mm = 90", "height_mm = 38.9", r"piece of at least 39 mm, beside 8 mm markers, got 90 × 38\.9 mm"),
+        ("length_mm = 300", 'length_mm = 900\n[sheet]\ntemplate = "label_102x152"', r"piece of at most \d+"),
         ('"primitive:carton"', '"no_such.glb"', r"no_such\.glb"),
         ('"primitive:carton"', '"primitive:cartoon"', r'did you mean "carton"'),
         ("[500, 900]", "[50, 90]", r"cameras outside the object"),
@@ -103,7 +107,7 @@ def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
     trimesh.creation.box((300, 300, 300)).export(tmp_path / "box.ply")  # the carton's ridge hides some of the edge
     scene = scene_of(tmp_path, SCENE.replace("primitive:carton", "box.ply"))
     stage, conditions = set_stage(scene), scene.draw("promise", 5)
-    piece = PiecePicture(torch.ones(64, 64, 3), (0, 0, 64, 64), (0, 0, 64, 64))
+    piece = PiecePicture(torch.ones(64, 64, 3))
     for size in ((800, 600), (300, 300)):
         seen = see(stage, piece, conditions, size)
         homographies = scene.piece_homographies(conditions, size)
@@ -159,16 +163,28 @@ def test_views_seen_once_can_be_shaded_with_another_design(tmp_path, scene_file)
 
 
 def test_the_gradient_reaches_the_texels_that_were_seen_and_no_other(scene_file):
+    """Up to the cut line, but for what belongs to the markers."""
     scene = load_scene(scene_file)
-    stage, conditions, piece = set_stage(scene), scene.draw("train", 2), piece_of(scene)
-    colors = piece.srgb.clone().requires_grad_()
-    picture = photograph(stage, replace(piece, srgb=colors), conditions, (96, 96))
-    (gradient,) = torch.autograd.grad(picture.sum(), colors)
-    x0, y0, x1, y1 = piece.design_px
-    touched = gradient.abs().sum(-1) > 0
-    assert touched[y0:y1, x0:x1].float().mean() > 0.99
-    assert not touched[: y0 // 2].any() and not touched[:, (x1 + touched.shape[1]) // 2 :].any()  # the frame's markers
+    stage, conditions = set_stage(scene), scene.draw("train", 2)
+    design = torch.full((3, 120, 120), 0.5, requires_grad=True)
+    shown = PrintedPiece(scene.piece, scene.sheet_id, identity_printer(), torch.device("cpu")).shown(design)
+    (gradient,) = torch.autograd.grad(photograph(stage, shown, conditions, (96, 96)).sum(), design)
+    _, reserved = marker_image(scene.piece, (120, 120))
+    touched = (gradient.abs().sum(0) > 0).numpy()
+    assert touched[~reserved].mean() > 0.99 and not touched[reserved].any()
+    assert touched[[0, -1], 60].all() and touched[60, [0, -1]].all() and reserved[0, 0]
     assert bool(torch.isfinite(gradient).all())
+
+
+@pytest.mark.parametrize("kind", ["design", "noise"])
+def test_a_printed_piece_shows_the_markers_of_its_kind_whatever_the_design_has_there(scene_file, kind):
+    scene = load_scene(scene_file)
+    printed = PrintedPiece(scene.piece, scene.sheet_id, identity_printer(), torch.device("cpu"))
+    image, reserved = marker_image(with_ids(scene.piece, scene.sheet_id, kind), (120, 96))
+    for design in (torch.rand(3, 96, 120, generator=torch.Generator().manual_seed(0)), torch.zeros(3, 96, 120)):
+        shown = printed.shown(design, kind).srgb.numpy()
+        assert np.abs(shown[reserved] - image[reserved]).max() < 1e-6
+        assert np.array_equal(shown[~reserved], design.permute(1, 2, 0).numpy()[~reserved])
 
 
 def test_what_trains_and_what_is_photographed_agree_in_rate(tmp_path):

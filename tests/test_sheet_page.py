@@ -8,7 +8,8 @@ import pytest
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.page import largest_piece_mm, lay_out_page, qr_rects_mm
-from patchproof.sheets.piece import KINDS, lay_out_piece, marker_size_mm
+from patchproof.sheets.piece import KINDS, lay_out_piece, marker_rect, marker_size_mm
+from patchproof.sheets.rects import holds, meet
 from patchproof.sheets.template import TextLine, load_template
 from patchproof.strict import Refused, shipped
 
@@ -17,30 +18,36 @@ WHITE = np.full((4, 4, 3), 255, np.uint8)
 PAGE, MARGIN = (210.0, 297.0), 7.0
 
 
-def page_of(template, design_mm, needed_mm=20.0, kind="design"):
-    marker = marker_size_mm(needed_mm, design_mm, largest_piece_mm(template))
-    return lay_out_page(template, PrintedPiece(lay_out_piece(design_mm, marker, ID, kind), ID, kind, WHITE))
+def page_of(template, piece_mm, needed_mm=20.0, kind="design", bends=False):
+    piece = lay_out_piece(piece_mm, marker_size_mm(needed_mm, piece_mm), ID, kind, bends)
+    return lay_out_page(template, PrintedPiece(piece, ID, kind, WHITE))
 
 
-@pytest.mark.parametrize("design_mm", [(110, 110), (40, 40), (60, 140), (140, 50), (142, 155), (10, 10)])
+@pytest.mark.parametrize("piece_mm", [(110, 110), (40, 40), (60, 140), (140, 50), (166.6, 179.6), (39, 39)])
 @pytest.mark.parametrize("kind", ["design", "shuffled"])
-def test_a4_holds_small_large_and_oblong_designs(design_mm, kind):
-    page = page_of(load_template("a4"), design_mm, kind=kind)
-    assert page.designs_mm[0][2:] == design_mm
-    # the design is in the middle of the piece
-    assert page.designs_mm[0][0] - page.cuts_mm[0][0] == pytest.approx(
-        (page.cuts_mm[0][2] - design_mm[0]) / 2, abs=2e-6
-    )
-    assert len({m.id for m in page.markers}) == len(page.markers) == (8 if min(design_mm) > 20 else 4) + 4
+@pytest.mark.parametrize("bends", [False, True])
+def test_a4_holds_small_large_and_oblong_pieces(piece_mm, kind, bends):
+    template = load_template("a4")
+    page = page_of(template, piece_mm, kind=kind, bends=bends)
+    assert page.cuts_mm[0][2:] == piece_mm
+    # the piece is in the middle of its zone, and holds its markers
+    x, y, w, h = template.piece.zone_mm
+    corner = np.array([x + w / 2, y + h / 2]) - np.array(piece_mm) / 2
+    assert np.array(page.cuts_mm[0][:2]) == pytest.approx(corner, abs=1e-3)
+    assert len({m.id for m in page.markers}) == len(page.markers)
+    own, others = page.markers[:-4], page.markers[-4:]
+    assert all(holds(page.cuts_mm[0], marker_rect(m)) for m in own)
+    assert not any(meet(page.cuts_mm[0], marker_rect(m)) for m in others)
+    assert len(own) >= 4 + 4 * (bends and min(piece_mm) >= 110)
 
 
-def test_a4_holds_110_mm_with_20_mm_markers():
-    assert marker_size_mm(20, (110, 110), largest_piece_mm(load_template("a4"))) == 20
+def test_a4_holds_a_piece_of_its_zone_less_the_cut_line():
+    assert largest_piece_mm(load_template("a4")) == pytest.approx((166.6, 179.6))
 
 
 def test_kinds_share_no_marker_even_with_the_page_s_own():
     template = load_template("a4")
-    ids = [m.id for kind in KINDS for m in page_of(template, (60, 60), kind=kind).markers]
+    ids = [m.id for kind in KINDS for m in page_of(template, (120, 120), kind=kind, bends=True).markers]
     assert len(ids) == len(set(ids)) == 6 * 12
 
 
@@ -96,20 +103,19 @@ def test_a_template_whose_parts_collide_is_refused(tmp_path, old, new, what):
     path = tmp_path / "mine.toml"
     path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(Refused) as refusal:
-        page_of(load_template(path), (110, 110))
+        page_of(load_template(path), (162, 162))
     assert refusal.match("move")
     told = str(refusal.value)
     assert what in told or " over ".join(reversed(what.split(" over "))) in told
 
 
-def test_a_design_too_large_is_refused_with_the_largest_that_fits():
-    template = load_template("a4")
-    piece = lay_out_piece((120, 110), 20, ID, "design")
+@pytest.mark.parametrize(("piece_mm", "got"), [((166.7, 100), "166.7 × 100"), ((100, 179.7), "100 × 179.7")])
+def test_a_piece_too_large_is_refused_with_the_largest_that_fits(piece_mm, got):
     with pytest.raises(Refused) as refusal:
-        lay_out_page(template, PrintedPiece(piece, ID, "design", WHITE))
-    # 166.6 - 2 (20 × 9/7 + 2) = 111.17; 179.6 - 55.43 = 124.17; with 8 mm: 166.6 - 24.571 = 142.03, 155.03
-    assert "at most 111 × 124 mm with 20 mm markers or 142 × 155 mm with 8 mm markers" in str(refusal.value)
-    assert "got 175.4 × 165.4 mm" in str(refusal.value)
+        page_of(load_template("a4"), piece_mm)
+    told = str(refusal.value)
+    assert told.startswith(f"Expected a piece of at most 166.6 × 179.6 mm on this page, got {got} mm: choose")
+    assert "one with tiles (a3_tiles, a4_tiles, letter_tiles), or a smaller patch" in told and "\n" not in told
 
 
 def test_unknown_word_in_a_text_is_refused():

@@ -23,12 +23,12 @@ from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.piece import lay_out_piece
+from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheets.several import write_several
 from patchproof.sheets.template import load_template, template_names
-from patchproof.sheets.tiles import plan_tiles
+from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
 from patchproof.sheets.write import check_sheet, write_sheet
 from patchproof.strict import Refused, read_toml, shipped
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
@@ -37,14 +37,17 @@ NAMES = template_names()
 DESIGN = cv2.resize(sample_design(12, 12), (120, 120), interpolation=cv2.INTER_CUBIC)
 
 
-def write(path, name, design_mm=None, marker_mm=None, design=DESIGN, **more):
+PIECE = lay_out_piece((680, 680), 30, ID, "design", bends=True)  # in tiles
+
+
+def write(path, name, piece_mm=None, marker_mm=None, design=DESIGN, **more):
     if is_board(name):
         return board_sheet(name, path)
     template = load_template(name)
     if template.piece is None:
         return chart_sheet(template, path)
-    design_mm = design_mm or ((300, 300) if template.tiles else (70, 70))
-    piece = lay_out_piece(design_mm, marker_mm or (20 if template.tiles else 8), ID, "design")
+    piece_mm = piece_mm or ((350, 350) if template.tiles else (90, 90))
+    piece = lay_out_piece(piece_mm, marker_mm or (20 if template.tiles else 8), ID, "design", bends=True)
     return write_sheet(path, template, PrintedPiece(piece, ID, "design", design), **more)
 
 
@@ -128,7 +131,7 @@ def test_charts_have_the_colors_that_they_promise(tmp_path):
 @pytest.fixture(scope="module")
 def tiled(tmp_path_factory):
     path = tmp_path_factory.mktemp("tiles") / "s.pdf"
-    return path, write(path, "a4_tiles", (600, 600), 30)
+    return path, write(path, "a4_tiles", PIECE.size_mm, 30)
 
 
 def scanned(page, seed):
@@ -162,7 +165,7 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimete
     assert max(errors) < 0.5
 
 
-def test_assembled_tiles_are_the_design_and_its_whole_frame(tiled):
+def test_assembled_tiles_are_the_design_and_all_its_markers(tiled):
     path, manifest = tiled
     pixels = piece_pixels(path, manifest, 50)
     scale = pixels.shape[1] / manifest.cut_mm[2]
@@ -174,7 +177,8 @@ def test_assembled_tiles_are_the_design_and_its_whole_frame(tiled):
     at = (np.arange(120) + 0.5) / 120
     columns = ((x - manifest.cut_mm[0] + at * w) * scale).astype(int)
     rows = ((y - manifest.cut_mm[1] + at * h) * scale).astype(int)
-    assert np.abs(pixels[np.ix_(rows, columns)].astype(int) - DESIGN).mean() < 4
+    free = ~marker_image(PIECE, (120, 120))[1]
+    assert np.abs(pixels[np.ix_(rows, columns)].astype(int) - DESIGN)[free].mean() < 4 and free.mean() > 0.8
     measured = measure(view_of(Photo(pixels, None), None), "p", surface, None, promised_ranges(()))
     assert measured.counted and measured.entry.markers_found == 8  # glued together it is no page check
 
@@ -194,17 +198,62 @@ def test_a_scan_of_the_first_page_is_a_page_check(tiled):
     assert measured.entry.code is None and not measured.counted
 
 
-def test_seams_are_even_and_spare_the_markers():
-    template, piece = load_template("a4_tiles"), lay_out_piece((600, 600), 30, ID, "design")
+@pytest.mark.parametrize(
+    ("piece_mm", "marker_mm", "bends"),
+    [((650, 650), 30, True), ((600, 650), 30, False), ((1500, 200), 15, False), ((330, 1400), 12.5, False)],
+)
+def test_seams_are_even_and_spare_the_markers_and_their_white(piece_mm, marker_mm, bends):
+    template, piece = load_template("a4_tiles"), lay_out_piece(piece_mm, marker_mm, ID, "design", bends)
     tiles = plan_tiles(template.tiles, piece)
     area = sum(t.part_mm[2] * t.part_mm[3] for t in tiles)
     assert area == pytest.approx(piece.size_mm[0] * piece.size_mm[1], rel=1e-6)
     for axis in (0, 1):
         seams = sorted({t.part_mm[axis] for t in tiles} - {0.0})
         assert max(b - a for a, b in pairwise([0.0, *seams, piece.size_mm[axis]])) <= template.tiles.zone_mm[2 + axis]
-        for marker in piece.markers:
-            low, high = marker.corners_mm[0][axis], marker.corners_mm[2][axis]
-            assert not any(low < seam < high for seam in seams)
+        for rect in piece.reserved_mm:
+            # to a hundredth of a millimeter, to which seams are laid
+            assert not any(rect[axis] + 0.006 < seam < rect[axis] + rect[axis + 2] - 0.006 for seam in seams)
+        even = piece.size_mm[axis] / (len(seams) + 1)
+        widest = max(rect[axis + 2] for rect in piece.reserved_mm)
+        assert all(abs(seam - even * (i + 1)) <= widest / 2 + 0.01 for i, seam in enumerate(seams))
+
+
+def test_markers_too_large_for_tiles_are_refused():
+    """Corners of 136 × 9/7 + 1 = 175.9 mm go on tiles of 177 mm, those of 137 mm markers are 177.1 mm wide."""
+    grid = load_template("a4_tiles").tiles
+    assert plan_tiles(grid, lay_out_piece((700, 700), 136, ID, "design"))
+    with pytest.raises(Refused, match="can be cut into tiles without cutting a marker, got markers of 137 mm on tiles"):
+        plan_tiles(grid, lay_out_piece((700, 700), 137, ID, "design"))
+
+
+def test_a_piece_with_more_markers_than_ids_is_refused_before_it_is_optimized():
+    template = load_template("a4_tiles")
+    for marker_mm, markers, fits in ((10, 36, True), (8, 44, False)):
+        piece = lay_out_piece((1000, 1000), marker_mm, ID, "design")
+        assert len(piece.markers) == markers and len(plan_tiles(template.tiles, piece)) == 24
+        if fits:
+            refuse_larger_than_page(template, piece)  # 36 + 4 + 5 × 24 = 160
+        else:
+            with pytest.raises(Refused, match="at most 166 markers on one sheet, got 168: use larger or fewer tiles"):
+                refuse_larger_than_page(template, piece)
+
+
+def test_tiles_of_the_former_kind_are_put_together_alike(tiled):
+    """Their design lay 44 mm inside of the cut, and tiles said where it does, not where the piece does."""
+    path, manifest = tiled
+    x, y, w, h = manifest.design.rect_mm
+    tiles = [
+        tile.changed(page_from_design_mm=tuple((a, b, c + 44) for a, b, c in tile.page_from_design_mm))
+        for tile in manifest.tiles
+    ]
+    former = manifest.changed(
+        version=1, design=manifest.design.changed(rect_mm=(x + 44, y + 44, w - 88, h - 88)), tiles=tuple(tiles)
+    )
+    assert np.array_equal(piece_pixels(path, former, 20), piece_pixels(path, manifest, 20))
+    now, before = surface_of(manifest), surface_of(former)
+    assert before.piece_ids == now.piece_ids and before.piece_mm == now.piece_mm
+    for i, corners in now.corners_mm.items():
+        assert before.corners_mm[i] == pytest.approx(corners, abs=1e-6)
 
 
 def test_copies_are_pages_of_the_same(tmp_path):
@@ -213,9 +262,9 @@ def test_copies_are_pages_of_the_same(tmp_path):
     assert np.array_equal(pages[0], pages[1]) and np.array_equal(pages[0], pages[2])
 
 
-def designs(*ids, design_mm=(60, 60)):
+def designs(*ids, piece_mm=(84, 84)):
     return [
-        PrintedPiece(lay_out_piece(design_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
+        PrintedPiece(lay_out_piece(piece_mm, 8, i, "design"), i, "design", np.roll(DESIGN, n), None, {})
         for n, i in enumerate(ids)
     ]
 
@@ -227,7 +276,8 @@ def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
         assert load_manifest(tmp_path / f"s_{number}.json") == manifest
         assert attached_manifest(tmp_path / "s.pdf", manifest.sheet_id) == manifest
         surface = surface_of(manifest)
-        assert len(surface.piece_ids) == 8 and len(surface.page_ids) > 4
+        assert len(surface.piece_ids) == 4 and len(surface.page_ids) > 4
+        assert manifest.design.rect_mm == manifest.cut_mm and manifest.version == 2
         for marker in manifest.markers:
             assert np.abs(found[marker.id] / PX_PER_MM - np.array(marker.corners_mm)).max() < 0.1
         assert len(piece_pixels(tmp_path / "s.pdf", manifest, 50)) > 100
@@ -238,7 +288,7 @@ def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
 def test_two_times_is_the_same_bytes(tmp_path):
     for folder in ("1", "2"):
         write(tmp_path / folder / "t.pdf", "letter_tiles")
-        write_several(tmp_path / folder / "s.pdf", load_template("a4"), designs(ID, "B1B2C3D4E5", design_mm=(50, 50)))
+        write_several(tmp_path / folder / "s.pdf", load_template("a4"), designs(ID, "B1B2C3D4E5", piece_mm=(74, 74)))
         chart_sheet(load_template("chart_a4"), tmp_path / folder / "c.pdf")
     for name in ("t.pdf", "t.json", "s.pdf", "s_1.json", "s_2.json", "c.pdf"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
@@ -284,5 +334,5 @@ def test_check_says_of_each_kind_of_page_what_is_cut(tmp_path, tiled):
     plan = PlanPage(None, (("How to photograph it", ("From all sides.",)),))
     one = write(tmp_path / "p.pdf", "a4", plan=plan)
     assert one.plan_page == 2 and "Page 2 is for people" in told(one)
-    assert "Cut the piece of 94.6 × 94.6 mm" in told(one)
+    assert "Cut the piece of 90.0 × 90.0 mm" in told(one)
     assert "Page 2" not in told(write(tmp_path / "q.pdf", "a4"))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from patchproof.render.pixels import DESIGN_TAPS
-from patchproof.render.texture import footprint, joined, layout, look_up, texel_table
+from patchproof.render.texture import footprint, layout, look_up, texel_table
 from tolerances import FLOAT32
 
 
@@ -220,31 +220,6 @@ def test_the_gradient_reaches_each_texel_that_was_seen_and_no_other():
     # the last texel passes on what its copies beyond the border have seen
     (gradient,) = torch.autograd.grad(look(texture, torch.tensor([[1.2, 1.2]]), near, far).sum(), texture)
     assert float(gradient[-1, -1].sum()) == pytest.approx(3)
-
-
-def test_what_is_not_learned_gets_no_gradient_but_is_seen():
-    texture = torch.rand(8, 8, 3, requires_grad=True)
-    where, uv, (dx, dy) = layout([(8, 8)], False), centers(8, 8), per_pixel(8, 8)
-    halves = torch.arange(32), torch.arange(32, 64)
-    parts = [
-        (
-            half,
-            footprint(
-                where,
-                torch.zeros(32, dtype=torch.long),
-                uv[half],
-                dx.expand(32, 2),
-                dy.expand(32, 2),
-                2,
-                learned=learned,
-            ),
-        )
-        for half, learned in zip(halves, (True, False), strict=True)
-    ]
-    seen = look_up(joined(parts, 64), texel_table([texture], False))
-    torch.testing.assert_close(seen.view(8, 8, 3), texture.detach())
-    (gradient,) = torch.autograd.grad(seen.sum(), texture)
-    assert bool((gradient[:4] > 0.99).all()) and not gradient[4:].any()
 
 
 @pytest.mark.parametrize("scale", [0.4, 1.5, 6])

@@ -25,11 +25,11 @@ from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see
 from patchproof.scene.conditions import with_poses_of, with_values
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.piece import frame_image
+from patchproof.sheets.piece import marker_image
 from patchproof.strict import Refused
 from tolerances import FLOAT32
 
-WHITE = PiecePicture(torch.ones(64, 64, 3), (0, 0, 64, 64), (0, 0, 64, 64))
+WHITE = PiecePicture(torch.ones(64, 64, 3))
 
 
 def scene_of(folder, *changes, tables=""):
@@ -55,11 +55,9 @@ def posed(scene, n=1, **values):
 
 
 def piece_of(scene, side=180):
-    frame = frame_image(scene.piece, (side, side))
-    x0, y0, width, height = frame.design_box_px
-    return PiecePicture(
-        torch.tensor(np.asarray(frame.srgb), dtype=torch.float32), frame.piece_box_px, (x0, y0, x0 + width, y0 + height)
-    )
+    """Its markers, and middle gray between them."""
+    image, reserved = marker_image(scene.piece, (side, side))
+    return PiecePicture(torch.tensor(np.where(reserved[..., None], image, np.float32(0.5))))
 
 
 def outline(scene, conditions, size_px):
@@ -349,7 +347,7 @@ def test_pictures_change_as_little_as_the_pose_does(tmp_path, share):
     """
     stage, far = set_stage(box_scene(tmp_path)), np.geomspace(500, 4000, 48)
     srgb = torch.rand(256, 256, 3, generator=torch.Generator().manual_seed(0))
-    noise = PiecePicture(srgb, (0, 0, 256, 256), (0, 0, 256, 256))
+    noise = PiecePicture(srgb)
     a, b = (
         shade(see(stage, noise, posed(stage.scene, 48, distance_mm=far * k, azimuth_deg=30), (96, 96)), noise)
         for k in (1, 1 + share)
@@ -394,7 +392,7 @@ def test_a_bent_piece_is_hidden_where_the_mug_is_in_front(tmp_path, side, family
     assert scene.placement.family == family
     conditions = posed(scene, 5, azimuth_deg=[0, 60, 90, 120, 180], elevation_deg=[40, 10, 5, 0, 20], distance_mm=260)
     v, u = torch.meshgrid(*((torch.arange(256) + 0.5) / 256,) * 2, indexing="ij")
-    where = PiecePicture(torch.stack([u, v, u], -1), (0, 0, 256, 256), (0, 0, 256, 256))
+    where = PiecePicture(torch.stack([u, v, u], -1))
     seen = see(set_stage(scene), where, conditions, (128, 128))
     at = look_up(seen.piece.texels, texel_table([where.srgb], False))[:, :2].numpy() * scene.placement.size_mm
     poses = scene.camera_from_world(conditions)[seen.piece.view.numpy()]

@@ -2,9 +2,8 @@
 others.
 
 In: a finished run. Out: SHEET.pdf and SHEET.json. The piece is the same on every template that has room for it, but for
-the ids of its markers. The last page of a template with `plan_page`
-says where the piece goes and how to photograph it. Before there is a run, `blank_page` writes the pages of blanks,
-charts and boards.
+the ids of its markers. The last page of a template with `plan_page` says where the piece goes and how to photograph it.
+Before there is a run, `blank_page` writes the pages of blanks, charts and boards.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
     height, width, _ = piece.srgb.shape
     where, texture = layout([(width, height)], wrap=False, device=at.device), at.new_zeros(len(at), dtype=torch.long)
-    return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True, learned=True)
+    return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
 
 
 def object_pixels(

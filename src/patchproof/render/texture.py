@@ -42,12 +42,11 @@ class Layout:
 
 @dataclass(frozen=True)
 class Group:
-    """Fragments G with as many taps each: the `texel` and `weight` G×J they see; gradients pass where `learned`."""
+    """Fragments G with as many taps each: the `texel` and `weight` G×J they see."""
 
     fragment: Tensor | None  # None: all of them, in order
     texel: Tensor
     weight: Tensor
-    learned: bool
 
 
 @dataclass(frozen=True)
@@ -111,13 +110,11 @@ def footprint(
     uv_dy: Tensor,
     taps: int,
     blocks: bool = False,
-    learned: bool = True,
 ) -> Footprint:
     """What P fragments of `texture` (P, index into the layout) see; `uv_dx`, `uv_dy` P×2: uv change per pixel.
 
     At most `taps` along the footprint's shorter side and twice as many along the longer one; one in all where `taps` is
-    1. Texels are points to interpolate between, or `blocks` of one color, as printed pixels are. Gradients pass to what
-    is `learned` only.
+    1. Texels are points to interpolate between, or `blocks` of one color, as printed pixels are.
     """
     most = 2 * taps if taps > 1 else 1
     size, _ = where.place(texture, 0)
@@ -127,7 +124,7 @@ def footprint(
     size, offset = where.place(texture, level)
     at = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
     if most == 1:
-        return Footprint((Group(None, *_taps(*at, 1, 1, where.wrap, blocks), learned),), len(uv))
+        return Footprint((Group(None, *_taps(*at, 1, 1, where.wrap, blocks)),), len(uv))
     texel_span = torch.exp2(-level.float())
     across, down = ((side * texel_span).ceil().clamp(1, most).long() for side in (across, down))
     count = across * (most + 1) + down
@@ -137,7 +134,7 @@ def footprint(
         center, dx, dy, level_size, first = (values.index_select(0, fragment) for values in at)
         columns, rows = divmod(key, most + 1)
         texel, weight = _taps(center, dx, dy, level_size, first, columns, rows, where.wrap, blocks)
-        groups.append(Group(fragment, texel, weight, learned))
+        groups.append(Group(fragment, texel, weight))
     return Footprint(tuple(groups), len(uv))
 
 
@@ -236,8 +233,6 @@ class _LookUp(torch.autograd.Function):
         (gradient,) = gradients
         out = gradient.new_zeros(3, ctx.texels)
         for group in ctx.footprint.groups:
-            if not group.learned:
-                continue
             weight, texel = group.weight.to(gradient.dtype), group.texel.flatten()
             own = gradient if group.fragment is None else gradient[group.fragment]
             for channel, part in zip(out, own.unbind(1), strict=True):

@@ -2,9 +2,9 @@
 
 In: a folder of images and a CSV of file names and labels. Out: `ImageScene`. Only images of the target's class are
 used: an assistive patch helps them, a deceptive one hides them. The whole printed piece lies inside of the centered
-square, turned by `view.roll_deg`, its design as large as `view.patch_share` says. In training, a random box of the
-picture below it may be erased, so that the patch does not lean on one feature. White paper is sRGB white, and nothing
-else is modeled: what is promised holds for a patch pasted into such images, not for a print in the world.
+square, turned by `view.roll_deg`, as large as `view.patch_share` says. In training, a random box of the picture below
+it may be erased, so that the patch does not lean on one feature. White paper is sRGB white, and nothing else is
+modeled: what is promised holds for a patch pasted into such images, not for a print in the world.
 
 With `SPLIT_FROM` images or more, training and selection see one half and promise, reprint and evaluation the other.
 

@@ -37,6 +37,7 @@ from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.piece import Piece, sheet_id, with_ids
+from patchproof.sheets.rects import holds, moved
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, expand
@@ -170,7 +171,8 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
     blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
     height, width = picture.srgb.shape[:2]
     picture_from_photo = np.linalg.inv(flat.photo_from((width, height), photo_px))
-    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
+    swatches = [moved(s.rect_mm, (-x, -y)) for s in manifest.chart if holds(manifest.cut_mm, s.rect_mm)]
+    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur, swatches)
     return BasePhoto(path.name, picture, photo_from_piece, light, blur)
 
 

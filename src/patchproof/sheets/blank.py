@@ -3,8 +3,8 @@
 In: a template. Out: a PDF and its JSON; the sheet id is a hash of the template, so equal templates give equal pages.
 A template with a [blank] table has a piece with markers alone: photographs of the object with it show where a design of
 the same size would lie and what light falls on it, all that a photographed scene needs. Its cut line and markers say
-all about the piece: `blank_piece` reads it back. A template without a place for a piece is a
-chart, printed to learn what a printer does to colors; nothing is cut, but its `cut_mm` is what photographs are to show.
+all about the piece: `blank_piece` reads it back. A template without a place for a piece is a chart, printed to learn
+what a printer does to colors; nothing is cut, but its `cut_mm` is what photographs are to show.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from patchproof.strict import Refused
 
 CUT_LINE_MM = 0.2  # drawn wholly outside the cut, so that no ink of it stays on the piece
 BETWEEN_MM = 4.0  # of white paper from piece to piece, for scissors
-MOST_TILES = 30  # 5 markers each, beside the piece's 8 and the page's 4, out of a kind's 166
+MOST_TILES = 30  # 5 markers each, beside the piece's and the page's, out of a kind's 166
 QR_QUIET = 4  # modules of white that a QR code asks for on each side (ISO/IEC 18004)
 
 

@@ -62,7 +62,7 @@ def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tup
 
 def _piece_from_page(manifest: Manifest, tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
     """A point of a tile's page in piece millimeters."""
-    # the cut line and the first tile's design lie on one page: they differ by the frame
+    # the cut line and the first tile's design lie on one page: they differ by the frame that pieces once had
     frame = np.array(manifest.tiles[0].page_from_design_mm)[:, 2] - manifest.cut_mm[:2]
     return np.array(point_mm) - np.array(tile.page_from_design_mm)[:, 2] + frame
 
