@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from trimesh.triangles import closest_point
 
 import patchproof as pp
 from fake_networks import Bright
+from patchproof.classifier.load import load_classifier
 from patchproof.optimizer import place_files, places, run
 from patchproof.optimizer.place_files import read_place, save_place
 from patchproof.optimizer.places import choose_place, default_passes, place_lines
@@ -31,6 +34,7 @@ SETTINGS = {
     "camera": {"photo_px": [64, 64]},
     "optimize": {"steps": 2, "gamut": 0.0},
 }
+SHARP = {"camera__photo_px": [1600, 1200]}  # photographs in which small markers are read: a piece hardly larger
 
 
 def open_scene(base=".", mesh=None, seed=0, **changes):
@@ -52,10 +56,10 @@ def few_views_for_the_size_of_markers(monkeypatch):
 def a_small_search(monkeypatch):
     """Few places and a short draft: for tests of files, not of choices."""
     monkeypatch.setattr(places, "PLACES", 3)
-    monkeypatch.setattr(places, "DRAFT_STEPS", 1)
+    monkeypatch.setattr(places, "SHARE", 0)
     monkeypatch.setattr(places, "HELD_OUT_VIEWS", 4)
     monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
-    monkeypatch.setattr(place_files, "_SIDE_PX", 48)
+    monkeypatch.setattr(place_files, "_SIDE_PX", 64)
 
 
 class Counted(Bright):
@@ -97,43 +101,46 @@ def test_what_is_to_be_kept_free_is_kept_free(tmp_path):
     middles = mesh.triangles_center
     forbidden = np.flatnonzero((middles[:, 2] > 9) & (middles[:, 0] < 0) & (middles[:, 1] > 0))
     (tmp_path / "free.txt").write_text("\n".join(map(str, forbidden)))
-    everywhere = Ground(open_scene(mesh=mesh)).spots(100)
-    rest = Ground(open_scene(tmp_path, mesh=mesh, patch__search={"keep_off_faces": "free.txt"})).spots(100)
+    everywhere = Ground(open_scene(mesh=mesh, **SHARP)).spots(100)
+    rest = Ground(open_scene(tmp_path, mesh, patch__search={"keep_off_faces": "free.txt"}, **SHARP)).spots(100)
     assert covers(everywhere, mesh, forbidden) and not covers(rest, mesh, forbidden) and len(rest) > 5
 
 
 def covers(spots, mesh, faces):
-    """Whether a piece's middle or a corner, drawn in by 5 mm, lies over one of the faces."""
-    points = [spot.placement.world(np.array([[5.0, 5], [95, 5], [95, 95], [5, 95], [50, 50]])) for spot in spots]
-    _, _, face = trimesh.proximity.closest_point(mesh, np.concatenate(points))
-    return bool(np.isin(face, faces).any())
+    """Whether a piece's middle or a corner, drawn in by a tenth, lies over one of the faces."""
+    inner = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9], [0.5, 0.5]])
+    points = np.concatenate([spot.placement.world(inner * spot.placement.size_mm) for spot in spots])
+    triangles = mesh.triangles[faces]
+    over = [closest_point(triangles, np.broadcast_to(point, (len(faces), 3))) for point in points]
+    return bool((np.linalg.norm(np.array(over) - points[:, None], axis=2).min(1) < 1).any())
 
 
 def test_places_fit_are_apart_and_the_same_for_the_same_seed():
-    scene = open_scene(mesh=trimesh.creation.icosphere(3, 150))
+    ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
+    scene = open_scene(mesh=ball, **small)
     spots = Ground(scene).spots(12)
     assert 3 < len(spots) <= 12
     for spot in spots:
         assert spot.placement.overhang_share <= WARN_OVERHANG_SHARE and not spot.placement.warnings
     middles = np.array([spot.placement.center_mm for spot in spots])
     distances = np.linalg.norm(middles[:, None] - middles, axis=2) + 1e9 * np.eye(len(spots))
-    assert distances.min() > APART * 60 / 2
+    assert distances.min() > APART * 30 / 2
     assert [spot.at_mm for spot in Ground(scene).spots(12)] == [spot.at_mm for spot in spots]
-    other = Ground(open_scene(mesh=trimesh.creation.icosphere(3, 150), seed=1)).spots(12)
+    other = Ground(open_scene(mesh=ball, seed=1, **small)).spots(12)
     assert [spot.at_mm for spot in other] != [spot.at_mm for spot in spots]
 
 
 def test_a_gap_is_no_larger_than_asked():
-    ball = trimesh.creation.icosphere(4, 150)
-    largest = max(spot.placement.gap_mm for spot in Ground(open_scene(mesh=ball)).spots(12))
+    ball, small = trimesh.creation.icosphere(4, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
+    least = min(spot.placement.gap_mm for spot in Ground(open_scene(mesh=ball, **small)).spots(12))
     with pytest.raises(Refused, match=r"Expected a place for a piece of .* mm that views face, got none"):
-        Ground(open_scene(mesh=ball, patch__search={"gap_mm": largest / 2})).spots(12)
+        Ground(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
 
 
 def test_a_piece_that_fits_only_in_one_spot_finds_it():
     """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
-    size = Ground(open_scene()).size_mm
-    spots = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)))).spots(12)
+    size = Ground(open_scene(**SHARP)).size_mm
+    spots = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP)).spots(12)
     assert [spot for spot in spots if np.abs(spot.at_mm[:2]).max() < 4]
 
 
@@ -144,15 +151,17 @@ def test_upright_means_no_turns():
 
 
 def test_views_do_not_turn_with_the_place():
-    scene = open_scene(mesh=trimesh.creation.box((200, 200, 200)))
+    around = {"azimuth_deg": [-60, 60], "elevation_deg": [0, 60], "distance_mm": [600, 700]}
+    box = trimesh.creation.box((300, 300, 300))
+    scene = open_scene(mesh=box, **SHARP, **{f"view__{key}": value for key, value in around.items()})
     conditions = scene.draw("train", 4)
     poses = scene.camera_from_world(conditions)
-    for at_mm in ((100, 0, 0), (0, 100, 0), (20, 30, 100)):
+    for at_mm in ((150, 0, 0), (0, 150, 0), (20, 30, 150)):
         hung = scene.at(at_mm, 45)
         np.testing.assert_array_equal(hung.camera_from_world(conditions), poses)
         np.testing.assert_array_equal(hung.frame.normal, [0, 0, 1])  # lights count from here, too
         assert hung.settings.patch.place == "given" and hung.settings.view.front == "+z"
-    np.testing.assert_allclose(scene.at((100, 0, 0), 0).placement.normal, [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(scene.at((150, 0, 0), 0).placement.normal, [1, 0, 0], atol=1e-12)
 
 
 def test_with_front_left_out_views_face_the_patch_as_before():
@@ -165,11 +174,13 @@ def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     network = Counted()
     classifier = pp.classifier_of(network, 32, ["bright", "dark"], "python:bright")
     network.passes = 0
+    load_classifier(classifier, Path())
+    doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
     place = choose_place(open_scene(), models=[classifier])
-    assert place.passes == network.passes and place.run_share == place.passes / default_passes()
+    assert place.passes == network.passes - doubting and place.run_share == place.passes / default_passes()
     screens = (places.PLACES + 3 * places.TURNED) * 2 * places.SCREEN_VIEWS + places.SCREEN_VIEWS
-    drafted = 2 * places.DRAFT_STEPS * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS
-    assert place.passes <= screens + places.DRAFTS * drafted + places.HELD_OUT_VIEWS <= default_passes() / 4
+    drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
+    assert screens + drafts <= default_passes() / 4 and default_passes() / 5 < place.passes <= default_passes() / 4
     assert default_passes() == 240 * 4 * 2 + 8 * 64
 
 

@@ -80,8 +80,9 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
                 quad = geometry.project(scene.matrix_px(size), pose, corners)
                 draw.polygon([*map(tuple, quad)], color, (0, 0, 0))
                 if candidate.draft is not None:
-                    label = {"anchor": "mm", "fill": (0, 0, 0), "stroke_width": 2, "stroke_fill": (255, 255, 255)}
-                    draw.text(tuple(quad.mean(0)), str(rank + 1), font=ImageFont.load_default(18), **label)
+                    x, y = quad.mean(0)
+                    font, white = ImageFont.load_default(18), (255, 255, 255)
+                    draw.text((x, y), f"{rank + 1}", (0, 0, 0), font, "mm", stroke_width=2, stroke_fill=white)
         outline = scene.placement.world(_border(scene.placement.size_mm))
         if scene.placement.normal @ (_eye(pose) - scene.placement.center_mm) > 0:
             draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN, 4, "curve")

@@ -2,8 +2,8 @@
 
 In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
 (one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically); where the place was
-searched for also `place.json` and `place.png`, while run.json has it like one that was given. Nothing in it depends on the time
-of day, so that the same seed gives the same bytes on one machine with one thread count and device.
+searched for also `place.json` and `place.png`, while run.json has it like one that was given. Nothing in it depends on
+the time of day, so that the same seed gives the same bytes on one machine with one thread count and device.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from patchproof.optimizer.subject import read_png
 from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.patch_scene import OpenScene
-from patchproof.scene.scene import Scene, build_scene, load_scene, needs_texture
+from patchproof.scene.scene import Scene, build_scene, load_scene, needs_patch, needs_texture
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
 from patchproof.strict import Refused, validated
@@ -85,19 +85,19 @@ def optimize_scene(
     out = Path(out)
     if not resume:
         check_folder(out, OWN, overwrite)
-    stated = scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     place = None
-    if isinstance(stated, OpenScene):
-        place = read_place(out, stated) if resume else None
-        place = place or choose_place(stated, models=models, loss=loss, device=device, on_pass=on_place)
-        scene = stated.at(place.at_mm, place.spin_deg)
+    if isinstance(scene, OpenScene):
+        place = read_place(out, scene) if resume else None
+        place = place or choose_place(scene, models=models, loss=loss, device=device, on_pass=on_place)
+        scene = scene.at(place.at_mm, place.spin_deg)
     on_scene(scene)
     problem = set_problem(scene, device, models, loss)
     if not resume:
         _clear(out)
     make_folder(out)
     if place is not None:
-        save_place(place, scene, out)
+        save_place(place, needs_patch(scene), out)
     state = _resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
     problem.subject.save(design, out)

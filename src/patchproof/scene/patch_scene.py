@@ -174,6 +174,7 @@ def load_mesh_scene(
         mesh,
         view_frame(mesh, settings),
         load_backgrounds(settings.background, base),
+        notes=mesh.warnings,
         known=known,
         camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
         given_glb=given_glb,
@@ -183,7 +184,7 @@ def load_mesh_scene(
         own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*mesh.warnings, *canvas.warnings)}
         return TextureScene(**vars(bare) | own)
     if settings.patch.place == "auto":
-        return OpenScene(**vars(bare) | {"notes": mesh.warnings})
+        return OpenScene(**vars(bare))
     return _with_piece(bare)
 
 

@@ -186,14 +186,14 @@ class Ground:
 
     def _touches_forbidden(self, laid: Placement) -> bool:
         """Whether a point of the piece lies nearest to one that is to be kept free, of those that face as it does."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         points, normals, _ = self._samples
         below = normals @ laid.normal > 0
         if not (self._forbidden & below).any():
             return False
         paper = laid.world(net(self.size_mm, _NET) * [1, -1] + np.array(self.size_mm) / 2)
-        return bool(self._forbidden[below][cKDTree(points[below]).query(paper)[1]].any())
+        return bool(self._forbidden[below][KDTree(points[below]).query(paper)[1]].any())
 
 
 def _eyes(scene: OpenScene) -> np.ndarray:
