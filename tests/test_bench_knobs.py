@@ -55,8 +55,8 @@ def test_one_front_spans_all_series():
 
 def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     seen = []
-    score = loop._score
-    monkeypatch.setattr(loop, "_score", lambda *a: seen.append(len(a[1])) or score(*a))
+    score = loop.score
+    monkeypatch.setattr(loop, "score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     train.trained(with_optimize(problem, OptimizeSettings(views=3, steps=2)), [2])
     assert sum(seen) == loop.views_seen(OptimizeSettings(views=3, steps=2))

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from patchproof.goal import Goal as Goal
     from patchproof.journey.verify import verify_photos as verify
     from patchproof.optimizer.evaluate import evaluate_run as evaluate
+    from patchproof.optimizer.places import Place as Place
+    from patchproof.optimizer.places import choose_place as choose_place
     from patchproof.optimizer.run import Run as Run
     from patchproof.optimizer.run import load_run as load_run
     from patchproof.optimizer.run import optimize_scene as optimize
@@ -45,6 +47,7 @@ _HOME = {
     "Conditions": "scene.conditions:Conditions",
     "Goal": "goal:Goal",
     "Manifest": "sheets.manifest:Manifest",
+    "Place": "optimizer.places:Place",
     "Printer": "channel.printer:Printer",
     "Promise": "sheets.manifest:Promise",
     "Refused": "strict:Refused",
@@ -53,6 +56,7 @@ _HOME = {
     "Scene": "scene.scene:Scene",
     "SceneSettings": "settings:SceneSettings",
     "Stage": "render.stage:Stage",
+    "choose_place": "optimizer.places:choose_place",
     "classifier_of": "classifier.custom:classifier_of",
     "evaluate": "optimizer.evaluate:evaluate_run",
     "load_classifier": "classifier.load:load_classifier",
@@ -74,6 +78,7 @@ __all__ = [
     "Conditions",
     "Goal",
     "Manifest",
+    "Place",
     "Printer",
     "Promise",
     "Refused",
@@ -82,6 +87,7 @@ __all__ = [
     "Scene",
     "SceneSettings",
     "Stage",
+    "choose_place",
     "classifier_of",
     "evaluate",
     "load_classifier",

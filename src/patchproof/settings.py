@@ -56,6 +56,15 @@ class ObjectSettings(Strict):
         return self
 
 
+class SearchSettings(Strict):
+    """Where and how the piece may lie with `place = "auto"`; it never overhangs the object by more than 2 %."""
+
+    upright: bool = False  # never turned in its plane
+    keep_off: tuple[str, ...] = ()  # names of materials that the piece may not lie on
+    keep_off_faces: str | None = None  # a text file of numbers of the faces that the piece may not lie on
+    gap_mm: Positive | None = None  # largest distance from piece to surface; 15 % of the piece's shorter edge
+
+
 class PatchSettings(Strict):
     """What is optimized. A patch has a size and a place; `offset_mm` is [right, up] as one faces the side. A texture
     covers the object's own UV map or vertices, `masked` only what mask, materials or faces name.
@@ -64,7 +73,10 @@ class PatchSettings(Strict):
     width_mm: Positive | None = None  # of the piece that is cut out; the design fills it, but for its markers
     height_mm: Positive | None = None  # likewise
     kind: Literal["patch", "texture", "masked"] = "patch"  # a printed piece, or the object's own texture
-    side: Side = "+x"  # of the object, that the patch hangs on
+    # As side, offset_mm, at_mm and spin_deg say, or the one on the object where drafts of the design reach most.
+    place: Literal["given", "auto"] = "given"
+    search: SearchSettings = SearchSettings()
+    side: Side = "+x"  # of the object, that the patch hangs on; with place = "auto" the one that azimuth 0 faces
     offset_mm: tuple[Finite, Finite] = (0.0, 0.0)  # [right, up] from the side's middle as one faces it
     at_mm: tuple[Finite, Finite, Finite] | None = None  # a point in the scene instead of a side's middle
     spin_deg: Finite = 0.0  # turn of the patch in its plane, clockwise
@@ -97,6 +109,17 @@ class PatchSettings(Strict):
             raise ValueError("takes bend with patches only")
         return self
 
+    @model_validator(mode="after")
+    def _fits_place(self):
+        if self.place == "auto":
+            if self.kind != "patch":
+                raise ValueError('takes place = "auto" with kind = "patch" only')
+            if self.at_mm is not None or any(self.offset_mm) or self.spin_deg:
+                raise ValueError('takes at_mm, offset_mm and spin_deg with place = "given" only')
+        elif self.search != SearchSettings():
+            raise ValueError('takes search with place = "auto" only')
+        return self
+
 
 class SheetSettings(Strict):
     """The page that the piece is printed on."""
@@ -118,7 +141,8 @@ class ViewSettings(Strict):
 
     look_at: Literal["object", "patch"] = "object"  # whose middle the camera looks at
     look_at_jitter: Share = 0.05  # how far it looks past that, as a share of the object's length
-    azimuth_deg: Range = (-60.0, 60.0)  # of the camera about the vertical; 0 faces the patch's side
+    front: Literal["patch"] | Side = "patch"  # what azimuth 0 faces, of cameras and lights: the patch or a side
+    azimuth_deg: Range = (-60.0, 60.0)  # of the camera about the vertical
     elevation_deg: Annotated[Range, within(-89, 89)] = (2.0, 27.0)  # of the camera above the horizontal
     distance_mm: PositiveRange = (440.0, 800.0)  # from the camera's center to what it looks at
     roll_deg: Range = (-5.0, 5.0)  # of the camera about its axis
@@ -234,6 +258,13 @@ class SceneSettings(Strict):
         if self.patch.kind != "patch" and self.object.mesh is None:
             raise ValueError(
                 f'name object.mesh, or leave out patch.kind = "{self.patch.kind}": only a mesh has a texture'
+            )
+        if self.patch.place == "auto" and self.object.mesh is None:
+            raise ValueError('name object.mesh, or leave out patch.place = "auto": only a mesh has other places')
+        if self.patch.place == "auto" and (self.view.look_at != "object" or self.view.front != "patch"):
+            raise ValueError(
+                'leave out view.look_at and view.front with patch.place = "auto": all places share the views of'
+                " patch.side"
             )
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")

@@ -21,7 +21,7 @@ from typing_extensions import Self
 from patchproof.color import tinted_white
 from patchproof.settings import SceneSettings
 
-# The sun and lamps stand within these angles of the patch's side: from behind, nothing on the patch could be seen.
+# The sun and lamps stand within these angles of the scene's front: from behind, nothing on a patch there could be seen.
 _AZIMUTH_DEG, _ELEVATION_DEG = (-90.0, 90.0), (10.0, 80.0)
 _UNIT = (0.0, 1.0)
 # Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
@@ -63,7 +63,7 @@ def off(value: Any = 0.0) -> Any:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pose(Rows):
     """What a view has to be rasterized for: camera, background, and the size of the print. Angles are relative to the
-    patch's side, offsets are shares of the object's length.
+    scene's front, offsets are shares of the object's length.
     """
 
     azimuth_deg: np.ndarray = off()

@@ -74,6 +74,8 @@ def optimize(
     ] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
+    from patchproof.optimizer.place_files import read_place
+    from patchproof.optimizer.places import place_lines
     from patchproof.optimizer.run import optimize_scene
     from patchproof.report.summary import promise_lines
 
@@ -88,10 +90,12 @@ def optimize(
             resume=resume,
             overwrite=overwrite,
             on_scene=lambda loaded: warn(loaded.warnings),
+            on_place=lambda done, total: bar("place", done, total),
             on_step=lambda step, total: bar("optimize", step.state.number, total),
             on_promise=lambda done, total: bar("promise", done, total),
         )
-    say(*promise_lines(run.promise), f"run: {out}")
+    place = read_place(out)
+    say(*promise_lines(run.promise), *([] if place is None else place_lines(place)), f"run: {out}")
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
 
 

@@ -23,6 +23,7 @@ from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.views import Views
+from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
 
@@ -107,10 +108,19 @@ def best_design(problem: Problem) -> np.ndarray:
     return problem.subject.pixels(state.best)
 
 
+def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
+    """The design after a step on every `views` rows of the conditions, untried on the selection set."""
+    state = start(problem)
+    for first in range(0, len(conditions), views):
+        drawn, shown = conditions[first : first + views], problem.subject.shown(state.design)
+        state = _step(problem, state, problem.see(shown, drawn, problem.training_px)).state
+    return state.design
+
+
 def _step(problem: Problem, state: State, seen: Views) -> Step:
     design = state.design.clone().requires_grad_()
     pictures = expose(seen, problem.subject.shown(design))
-    losses, confidences, rates = _score(problem, pictures)
+    losses, confidences, rates = score(problem, pictures)
     (gradient,) = torch.autograd.grad(losses, design)
     largest, penalty = float(gradient.abs().max()), problem.subject.penalty(design)
     if not math.isfinite(largest):  # one such step would turn the design into nothing for good
@@ -141,7 +151,7 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 
-def _score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
+def score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
     """Mean loss over classifiers and pictures; mean confidence and rate of the same."""
     losses, confidence, rate = [], 0.0, 0.0
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
@@ -168,7 +178,7 @@ def _select(problem: Problem, selection: list[Views], step: Step) -> Step:
     printed = from_pixels(as_pixels(state.design), problem.device)
     with torch.no_grad():
         shown = problem.subject.shown(printed)
-        scores = [_score(problem, expose(seen, shown)) for seen in selection]
+        scores = [score(problem, expose(seen, shown)) for seen in selection]
     loss = sum(float(score[0]) for score in scores) / len(scores)
     rate = sum(score[2] for score in scores) / len(scores)
     if loss < state.best_loss:

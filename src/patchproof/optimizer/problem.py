@@ -23,8 +23,10 @@ from patchproof.optimizer.subject import Subject
 from patchproof.optimizer.texture import Texture
 from patchproof.render.pixels import Shown
 from patchproof.render.stage import Stage, set_stage
+from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
@@ -64,6 +66,12 @@ class Problem:
         classifiers, indices = (tuple(each[i] for i in chosen) for each in (self.classifiers, self.indices))
         return replace(self, classifiers=classifiers, indices=indices)
 
+    def hung(self, scene: PatchScene) -> Problem:
+        """The same with the piece at another place, as `scene` has it; the object's tensors are shared."""
+        stage = replace(self.stage, scene=scene, piece=piece_surface(scene, self.device))
+        subject = Patch(scene, self.printer, scene.design_px(self.network_px), self.device)
+        return replace(self, scene=scene, stage=stage, subject=subject)
+
     @property
     def patch(self) -> Patch:
         """What is optimized, as a printed patch; refused of textures."""
@@ -71,10 +79,15 @@ class Problem:
             return self.subject
         raise Refused("a printed patch", "the object's own texture", 'leave patch.kind out, or "patch"')
 
+    @property
+    def network_px(self) -> int:
+        """The largest input size."""
+        return max(classifier.input_px for classifier in self.classifiers)
+
     def _view_px(self, at_least: int) -> int:
         """The smallest whole multiple of the largest input size that is no smaller, at most the photograph's."""
-        network_px = max(classifier.input_px for classifier in self.classifiers)
-        return min(network_px * math.ceil(at_least / network_px), min(self.scene.settings.camera.photo_px))
+        multiple = self.network_px * math.ceil(at_least / self.network_px)
+        return min(multiple, min(self.scene.settings.camera.photo_px))
 
     @property
     def device(self) -> torch.device:

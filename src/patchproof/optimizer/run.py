@@ -1,7 +1,8 @@
 """A run's folder: what an optimization leaves behind, written so that a kill at any moment loses 120 views at most.
 
 In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
-(one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically). Nothing in it depends on
+(one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically); where the place was
+searched for also `place.json` and `place.png`, while run.json has it like one that was given. Nothing in it depends on
 the time of day, so that the same seed gives the same bytes on one machine with one thread count and device.
 """
 
@@ -26,12 +27,15 @@ from patchproof.color import codes_of
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.patch import DESIGN_FILE
+from patchproof.optimizer.place_files import PLACE_FILES, read_place, save_place
+from patchproof.optimizer.places import choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, make_promise
 from patchproof.optimizer.subject import read_png
 from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
 from patchproof.output import check_folder, make_folder, write_whole
-from patchproof.scene.scene import Scene, build_scene, load_scene, needs_texture
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.scene import Scene, build_scene, load_scene, needs_patch, needs_texture
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
 from patchproof.strict import Refused, validated
@@ -40,7 +44,7 @@ from patchproof.version import __version__
 _CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
-OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *_RESULTS, "evaluate.json", ".*.part")
+OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
 
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
@@ -70,21 +74,30 @@ def optimize_scene(
     on_step: Callable[[Step, int], None] = lambda step, total: None,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
+    on_place: Callable[[int, int], None] = lambda done, total: None,
 ) -> Run:
     """Optimize the patch of a scene or its file into the folder `out` and promise its rate.
 
     `models` (names, or classifiers in memory) and `loss` replace the scene's networks and its goal's loss; `seed`
-    replaces the file's; `resume` goes on from the checkpoint. A page names the best of `controls`, one at least.
+    replaces the file's; `resume` goes on from the checkpoint, at the place that was chosen. A page names the best of
+    `controls`, one at least. `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
     """
     out = Path(out)
     if not resume:
         check_folder(out, OWN, overwrite)
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    place = None
+    if isinstance(scene, OpenScene):
+        place = read_place(out, scene) if resume else None
+        place = place or choose_place(scene, models=models, loss=loss, device=device, on_pass=on_place)
+        scene = scene.at(place.at_mm, place.spin_deg)
     on_scene(scene)
     problem = set_problem(scene, device, models, loss)
     if not resume:
         _clear(out)
     make_folder(out)
+    if place is not None:
+        save_place(place, needs_patch(scene), out)
     state = _resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
     problem.subject.save(design, out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from patchproof.optimizer.places import place_lines
 from patchproof.plan.cost import Cost
 from patchproof.plan.errors import TermError
 from patchproof.plan.plan import Markers, Plan, Resolution, Surface
@@ -12,6 +13,8 @@ from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 def plan_lines(plan: Plan) -> list[str]:
     """A plan for the terminal."""
     lines = [f"{plan.scene}: {plan.target}, {plan.kind}, seen by {', '.join(plan.models)}"]
+    if plan.place is not None:
+        lines += ["place", *(f"  {line}" for line in place_lines(plan.place))]
     lines += ["surface", *_surface_lines(plan.surface)]
     lines += ["resolution", *_resolution_lines(plan.resolution)]
     if plan.markers is not None:

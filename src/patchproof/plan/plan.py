@@ -1,9 +1,10 @@
 """`plan`: what of a scene is modeled, what is not, and why, each time with the figure that decided it.
 
-In: a scene file. Out: `Plan`: where the piece lies and what a simpler or richer surface would do, the pixels that views
-have for design and markers, the error that each term of light, camera and renderer would leave, what chance leaves, and
-the cost of a step. All of it comes from the code that optimizes: a draft of a few steps is what the terms are measured
-with, because a classifier that a design says nothing to would miss none of them.
+In: a scene file. Out: `Plan`: where the piece lies (searched for first, where the scene asks for that) and what a
+simpler or richer surface would do, the pixels that views have for design and markers, the error that each term of
+light, camera and renderer would leave, what chance leaves, and the cost of a step. All of it comes from the code that
+optimizes: a draft of a few steps is what the terms are measured with, because a classifier that a design says nothing
+to would miss none of them.
 
 Left out on purpose: deciding for the user. The plan says what can go; the scene file says what is modeled.
 """
@@ -19,10 +20,12 @@ from torch import Tensor
 
 from patchproof.optimizer.loop import SELECT_VIEWS, selects, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.places import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.plan.cost import Cost, measure_cost
 from patchproof.plan.errors import Terms, measure_terms
 from patchproof.plan.samples import Sample, sample_plan
+from patchproof.scene.patch_scene import OpenScene
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.scene import PieceScene, load_scene, needs_piece
 from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
@@ -82,6 +85,7 @@ class Plan(Strict):
     kind: str
     target: str
     models: tuple[str, ...]
+    place: Place | None  # the search for it, where the scene asks for one
     surface: Surface
     resolution: Resolution
     markers: Markers | None
@@ -102,7 +106,10 @@ def plan_scene(
     on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Plan:
     """Plan a scene, its terms over `views` views; without `timing`, all but the cost, which differs from run to run."""
-    scene = load_scene(scene_path)
+    scene, place = load_scene(scene_path), None
+    if isinstance(scene, OpenScene):
+        place = choose_place(scene, device=device, on_pass=partial(on_stage, "place"))
+        scene = scene.at(place.at_mm, place.spin_deg)
     problem = set_problem(scene, device)
     other, sentence = scene.other_surface()
     design, draft = _draft(problem, on_stage)
@@ -115,6 +122,7 @@ def plan_scene(
         kind=scene.description(),
         target=f"{target.goal} {target.label}",
         models=tuple(classifier.name for classifier in problem.classifiers),
+        place=place,
         surface=Surface(**scene.lies(), other=sentence),
         resolution=resolution_plan(problem),
         markers=marker_plan(needs_piece(scene)) if scene.HAS_PIECE else None,

@@ -22,6 +22,7 @@ from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.placement import patch_frame
 from patchproof.settings import BackgroundSettings
 from patchproof.sheets.plan_page import Hung
 from patchproof.sheets.template import Template
@@ -34,6 +35,8 @@ ROOM = 1.06  # of the object's extent
 
 def hang(scene: PatchScene, template: Template) -> Hung:
     """The object seen straight from the piece's side, with the piece's outline and, in tiles, its seams."""
+    # cameras may count their angles from another side
+    scene = replace(scene, frame=patch_frame(scene.mesh, scene.settings.patch))
     frame, placement = scene.frame, scene.placement
     axes = np.stack([frame.right, -frame.up])  # millimeters right and down, from the middle of the object
 

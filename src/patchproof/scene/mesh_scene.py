@@ -20,7 +20,7 @@ from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
-from patchproof.scene.placement import Frame, patch_frame
+from patchproof.scene.placement import Frame, view_frame
 from patchproof.scene.texture import Canvas
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused
@@ -33,7 +33,7 @@ class MeshScene(Scene):
     """An object with a mesh before its backgrounds; by itself, with nothing on it."""
 
     mesh: Mesh
-    frame: Frame
+    frame: Frame  # from which azimuths count, of cameras and lights
     backgrounds: Backgrounds
 
     HAS_OBJECT = True
@@ -129,12 +129,12 @@ class TextureScene(MeshScene):
 
 def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) -> MeshScene:
     """An object with no piece on it, to be photographed as it is."""
-    frame, seed = patch_frame(mesh, settings.patch), settings.optimize.seed
+    frame, seed = view_frame(mesh, settings), settings.optimize.seed
     return MeshScene(settings, Path(), seed, "", mesh, frame, backgrounds, notes=mesh.warnings)
 
 
 def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarray:
-    """`camera_from_world` N×4×4: on an orbit about what the camera looks at, azimuth 0 facing the patch's side."""
+    """`camera_from_world` N×4×4: on an orbit about what the camera looks at, azimuth 0 facing the scene's front."""
     center, frame = np.zeros(3) if scene.settings.view.look_at == "object" else patch_mm, scene.frame
     targets = center + pose.look_at_offset * scene.length_mm
     directions = geometry.orbit(pose.azimuth_deg, pose.elevation_deg, frame.normal, frame.up)

@@ -2,7 +2,7 @@
 
 In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
 layout of the printed piece (the design and its markers, whose size follows from the views) and where the piece lies;
-or a `TextureScene`, where the object's own texture is what changes.
+an `OpenScene`, whose piece has no place yet; or a `TextureScene`, where the object's own texture is what changes.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import SCALE_VIEWS, PieceScene
 from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
-from patchproof.scene.placement import Placement, patch_frame, place_card
+from patchproof.scene.placement import Placement, patch_frame, place_card, view_frame
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.texture import texture_canvas
-from patchproof.settings import SceneSettings, identifying
+from patchproof.settings import SceneSettings, SearchSettings, identifying
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
@@ -124,7 +124,7 @@ class PatchScene(PieceScene, MeshScene):
         patch, placement = self.settings.patch, self.placement
         place, flag = (place_card, "false") if patch.bend else (place_bent, "true")
         try:
-            other = place(self.mesh, self.frame, self.piece.size_mm, patch.spin_deg)
+            other = place(self.mesh, patch_frame(self.mesh, patch), self.piece.size_mm, patch.spin_deg)
         except Refused as refused:
             return None, f"bend = {flag} is refused. {refused}"
         if other.family == placement.family:
@@ -133,9 +133,31 @@ class PatchScene(PieceScene, MeshScene):
         return other, f"bend = {flag} would be a {other.family} (stretch {other.stretch:.2%}), {gaps}"
 
 
+@dataclass(frozen=True)
+class OpenScene(MeshScene):
+    """An object whose piece has no place yet (`patch.place = "auto"`); by itself, the bare object."""
+
+    def description(self) -> str:
+        """As in `Scene.description`."""
+        return f'{super().description()} with patch.place = "auto"'
+
+    def given(self, at_mm: tuple[float, float, float], spin_deg: float) -> SceneSettings:
+        """The settings of a scene file that gives this place itself and keeps the views."""
+        patch = {"place": "given", "search": SearchSettings(), "at_mm": at_mm, "spin_deg": spin_deg}
+        return self.settings.changed(patch=patch, view={"front": self.settings.patch.side})
+
+    def at(self, at_mm: tuple[float, float, float], spin_deg: float) -> PatchScene:
+        """The scene with its piece at a place, its views as they were; refused where the piece cannot hang there. It is
+        the one of a file that gives this place itself.
+        """
+        settings = self.given(at_mm, spin_deg)
+        identity = sheet_id(identifying(settings) | dict(self.known), self.seed)
+        return _with_piece(replace(self, settings=settings, sheet_id=identity))
+
+
 def load_mesh_scene(
     settings: SceneSettings, base: Path, seed: int, identity: str | None = None, given_glb: bytes | None = None
-) -> TextureScene | PatchScene:
+) -> TextureScene | PatchScene | OpenScene:
     """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
     settings_object, camera = settings.object, settings.camera
     if settings_object.mesh is None or settings_object.length_mm is None:
@@ -148,8 +170,9 @@ def load_mesh_scene(
         seed,
         identity or sheet_id(identifying(settings) | known, seed),
         mesh,
-        patch_frame(mesh, settings.patch),
+        view_frame(mesh, settings),
         load_backgrounds(settings.background, base),
+        notes=mesh.warnings,
         known=known,
         camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
         given_glb=given_glb,
@@ -158,21 +181,28 @@ def load_mesh_scene(
         canvas = texture_canvas(mesh, settings.patch, base)
         own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*mesh.warnings, *canvas.warnings)}
         return TextureScene(**vars(bare) | own)
-    piece, placement, unreadable, notes = _hang(bare)
+    if settings.patch.place == "auto":
+        return OpenScene(**vars(bare))
+    return _with_piece(bare)
+
+
+def _with_piece(scene: MeshScene) -> PatchScene:
+    piece, placement, unreadable, notes = _hang(scene)
     own = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
-    return PatchScene(**vars(bare) | own)
+    return PatchScene(**vars(scene) | own)
 
 
 def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     """The piece with markers as large as the views need, where it lies, the share of views in which they are too small,
     and what a reader should know.
     """
-    settings, mesh, frame = scene.settings, scene.mesh, scene.frame
+    settings, mesh = scene.settings, scene.mesh
+    frame = patch_frame(mesh, settings.patch)
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
     placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
     scales = _smallest_scales(scene, placement)
     if not len(scales):
-        raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch's side")
+        raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
     needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
     marker_mm = marker_size_mm(float(needed_mm), patch.size_mm)
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)

@@ -7,14 +7,14 @@ card wider or higher than the object's side, or with nothing under it, is refuse
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.surface import Chart, heights
-from patchproof.settings import PatchSettings
-from patchproof.strict import Refused
+from patchproof.settings import PatchSettings, SceneSettings
+from patchproof.strict import Refused, Side
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer
@@ -92,21 +92,41 @@ class Frame:
 
 def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:
     """The frame of the patch's side, or of the surface point nearest to `at_mm`."""
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     if patch.at_mm is None:
-        up, normal = (np.array(v, float) for v in _SIDES[patch.side])
-        right = np.cross(up, normal)
-        middle = (low + high) / 2 + normal * (np.abs(normal) @ (high - low)) / 2
+        frame = side_frame(mesh, patch.side)
     else:
-        middle, normal = _nearest_surface(mesh, np.array(patch.at_mm, float))
-        level = np.array([0.0, 1, 0]) if abs(normal[1]) < 0.99 else np.array([0.0, 0, -1])
-        right = np.cross(level, normal)
-        right /= np.linalg.norm(right)
-        up = np.cross(normal, right)
-    origin = middle + patch.offset_mm[0] * right + patch.offset_mm[1] * up
-    spread = mesh.vertices @ np.stack([right, up], 1)
-    wide, high = np.ptp(spread, axis=0).tolist()
-    return Frame(right, up, normal, origin, (wide, high))
+        frame = surface_frame(mesh, *_nearest_surface(mesh, np.array(patch.at_mm, float)))
+    origin = frame.origin_mm + patch.offset_mm[0] * frame.right + patch.offset_mm[1] * frame.up
+    return replace(frame, origin_mm=origin)
+
+
+def view_frame(mesh: Mesh, settings: SceneSettings) -> Frame:
+    """The frame from which azimuths count, of cameras and lights: the patch's own, or that of `view.front`. A piece
+    that is still to be placed is seen as on its side.
+    """
+    front = settings.view.front
+    return patch_frame(mesh, settings.patch) if front == "patch" else side_frame(mesh, front)
+
+
+def side_frame(mesh: Mesh, side: Side) -> Frame:
+    """The frame in the middle of a side of the object's bounding box."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    up, normal = (np.array(v, float) for v in _SIDES[side])
+    middle = (low + high) / 2 + normal * (np.abs(normal) @ (high - low)) / 2
+    return _frame(mesh, np.cross(up, normal), up, normal, middle)
+
+
+def surface_frame(mesh: Mesh, point_mm: np.ndarray, normal: np.ndarray) -> Frame:
+    """The frame at a point of the surface with that unit normal, as level as it can be."""
+    level = np.array([0.0, 1, 0]) if abs(normal[1]) < 0.99 else np.array([0.0, 0, -1])
+    right = np.cross(level, normal)
+    right /= np.linalg.norm(right)
+    return _frame(mesh, right, np.cross(normal, right), normal, point_mm)
+
+
+def _frame(mesh: Mesh, right: np.ndarray, up: np.ndarray, normal: np.ndarray, origin_mm: np.ndarray) -> Frame:
+    wide, high = np.ptp(mesh.vertices @ np.stack([right, up], 1), axis=0).tolist()
+    return Frame(right, up, normal, origin_mm, (wide, high))
 
 
 def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Placement:
@@ -200,6 +220,10 @@ def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     from trimesh.triangles import closest_point, normals
 
     triangles = mesh.vertices[mesh.faces]
+    # a triangle whose box is farther off than another's corner is not the nearest
+    outside = np.maximum(np.maximum(triangles.min(1) - point, point - triangles.max(1)), 0)
+    nearest_corner = ((triangles - point) ** 2).sum(-1).min()
+    triangles = triangles[(outside**2).sum(-1) <= nearest_corner]
     places = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
     best = int(np.argmin(((places - point) ** 2).sum(1)))
     return places[best], normals(triangles[best : best + 1])[0][0]

@@ -17,7 +17,7 @@ from patchproof.scene.image_scene import load_image_scene
 from patchproof.scene.interface import PieceScene as PieceScene
 from patchproof.scene.interface import Scene as Scene
 from patchproof.scene.mesh_scene import MeshScene, TextureScene
-from patchproof.scene.patch_scene import PatchScene, load_mesh_scene
+from patchproof.scene.patch_scene import OpenScene, PatchScene, load_mesh_scene
 from patchproof.scene.photo_scene import load_photo_scene
 from patchproof.settings import SceneSettings, load_scene_settings
 from patchproof.strict import Refused, validated
@@ -63,6 +63,7 @@ def needs_piece(scene: Scene, do: str = "take object.glb and textures from the r
     """The scene as one with a printed piece; refused where there is only the object's own texture."""
     if isinstance(scene, PieceScene):
         return scene
+    _refuse_open(scene)
     raise Refused("a run of a patch", "one of the object's own texture", do)
 
 
@@ -70,6 +71,7 @@ def needs_texture(scene: Scene) -> TextureScene:
     """The scene as one whose object's own texture may change; refused of any other."""
     if isinstance(scene, TextureScene):
         return scene
+    _refuse_open(scene)
     raise Refused("a scene of the object's own texture", "one of a patch", 'set patch.kind = "texture"')
 
 
@@ -84,7 +86,17 @@ def needs_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") 
     """The scene as one with a piece that lies on a mesh; refused of any other."""
     if isinstance(scene, PatchScene):
         return scene
+    _refuse_open(scene)
     raise Refused(expected, scene.description(), 'name object.mesh, and leave patch.kind out or "patch"')
+
+
+def needs_open(scene: Scene) -> OpenScene:
+    """The scene as one whose piece has no place yet; refused of any other."""
+    if isinstance(scene, OpenScene):
+        return scene
+    raise Refused(
+        'a scene with patch.place = "auto"', scene.description(), "ask for it, or use the place that is given"
+    )
 
 
 def needs_pictures(scene: Scene) -> FlatScene:
@@ -92,3 +104,9 @@ def needs_pictures(scene: Scene) -> FlatScene:
     if isinstance(scene, FlatScene):
         return scene
     raise Refused("a scene of pictures", "one with a mesh", "name object.photos or object.images")
+
+
+def _refuse_open(scene: Scene) -> None:
+    if isinstance(scene, OpenScene):
+        do = "choose one with choose_place, or give one"
+        raise Refused("a scene whose piece has its place", 'patch.place = "auto"', do)

@@ -80,15 +80,22 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
 
 def _chosen(mesh: Mesh, patch: PatchSettings, base: Path) -> np.ndarray:
     """Which faces F the settings name."""
-    if patch.materials:
-        names = [material.name for material in mesh.materials]
-        for name in patch.materials:
-            if name not in names:
-                raise Refused("the name of a material", f'"{name}"', nearest(name, dict.fromkeys(names)))
-        return np.isin(mesh.face_material, [i for i, name in enumerate(names) if name in patch.materials])
-    chosen = np.full(len(mesh.faces), patch.faces is None)
-    if patch.faces is not None:
-        chosen[_read_faces(Path(expand(patch.faces, base)), len(chosen))] = True
+    if patch.materials or patch.faces is not None:
+        return named_faces(mesh, patch.materials, patch.faces, base)
+    return np.ones(len(mesh.faces), bool)
+
+
+def named_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base: Path) -> np.ndarray:
+    """Which faces F have a material of these names, or their number in that text file, whose path is relative to
+    `base`.
+    """
+    names = [material.name for material in mesh.materials]
+    for name in materials:
+        if name not in names:
+            raise Refused("the name of a material", f'"{name}"', nearest(name, dict.fromkeys(names)))
+    chosen = np.isin(mesh.face_material, [i for i, name in enumerate(names) if name in materials])
+    if faces is not None:
+        chosen[_read_faces(Path(expand(faces, base)), len(chosen))] = True
     return chosen
 
 
@@ -110,7 +117,7 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
             raise Refused(f"a face number or a range a-b from 0 to {count - 1}", got, "mend that line")
         ranges.append(np.arange(ends[0], ends[-1] + 1))
     if len(ranges) == 1:
-        raise Refused("face numbers, one per line", f"none in {path.name}", "name the faces that may change")
+        raise Refused("face numbers, one per line", f"none in {path.name}", "name some, or leave the file out")
     return np.concatenate(ranges)
 
 

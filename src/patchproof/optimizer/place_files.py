@@ -1,0 +1,155 @@
+"""What a run keeps of the search for its place: `place.json`, and `place.png` for the eye.
+
+In: a `Place` and the scene with the piece there. Out: both files, and the place read back. The picture shows the object
+from four directions across the scene's azimuths, each place as a small square from yellow (the best) to purple (the
+worst), those that were drafted with their rank, and the chosen piece's outline at its size.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from patchproof import geometry
+from patchproof.channel.effects import Light, Pose
+from patchproof.color import photo_codes_of, srgb_from_linear
+from patchproof.optimizer.places import Candidate, Place
+from patchproof.output import write_whole
+from patchproof.render.raster import rasterize
+from patchproof.render.stage import Stage, set_stage
+from patchproof.render.views import cameras, near_mm, see
+from patchproof.scene.backgrounds import load_backgrounds
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.patch_scene import OpenScene, PatchScene
+from patchproof.scene.placement import patch_frame, spun
+from patchproof.settings import BackgroundSettings
+from patchproof.strict import Refused, validated
+
+PLACE_FILES = _RECORD, _PICTURE = ("place.json", "place.png")
+_DIRECTIONS, _SIDE_PX = 4, 420
+_ROOM = 1.05  # of the object's diagonal
+_DOT = 0.3  # of the piece's size
+_IN_FRONT_MM = 2.0  # a middle that lies no deeper than that below the surface is seen
+_COLORS = np.array([(253, 231, 37), (33, 145, 140), (68, 1, 84)], float)  # of viridis: legible to the color-blind
+_CHOSEN = (230, 0, 90)
+
+
+def save_place(place: Place, scene: PatchScene, folder: Path) -> None:
+    """Write both files; `scene` has the piece at the place."""
+    write_whole(folder / _RECORD, place.model_dump_json(indent=1) + "\n")
+    picture = _picture(place, scene)
+    write_whole(folder / _PICTURE, lambda path: picture.save(path, "PNG"))
+
+
+def read_place(folder: Path, scene: OpenScene | None = None) -> Place | None:
+    """The place that a search left in a run's folder; None without one, refused where it is not of that `scene`."""
+    path = folder / _RECORD
+    if not path.is_file():
+        return None
+    try:
+        place = validated(Place, json.loads(path.read_text(encoding="utf-8")), str(path))
+    except (OSError, ValueError) as error:
+        raise Refused(
+            "the record of a search", f"{path} that cannot be read", "start anew in another folder"
+        ) from error
+    if scene is not None and place.sheet_id != scene.sheet_id:
+        do = "resume with the same scene file and seed, or start anew in another folder"
+        raise Refused("the place of this scene and seed", f"one of another in {folder}", do)
+    return place
+
+
+def _picture(place: Place, scene: PatchScene) -> Image.Image:
+    scene, conditions = _plain(scene)
+    stage, size, poses = set_stage(scene), (_SIDE_PX, _SIDE_PX), scene.camera_from_world(conditions)
+    with torch.no_grad():
+        light = see(stage, None, conditions, size, supersample=2).bare
+    pictures = photo_codes_of(srgb_from_linear(light.clamp(0, 1)).reshape(len(poses), _SIDE_PX, _SIDE_PX, 3).numpy())
+    panels = []
+    for pose, picture in zip(poses, pictures, strict=True):
+        panel, depth = Image.fromarray(picture), _depth(stage, scene, pose)
+        draw = ImageDraw.Draw(panel)
+        for rank, candidate, corners in _dots(place, scene):
+            if _seen(scene, pose, depth, corners):
+                color = _color(rank / max(len(place.candidates) - 1, 1))
+                quad = geometry.project(scene.matrix_px(size), pose, corners)
+                draw.polygon([*map(tuple, quad)], color, (0, 0, 0))
+                if candidate.draft is not None:
+                    x, y = quad.mean(0)
+                    font, white = ImageFont.load_default(18), (255, 255, 255)
+                    draw.text((x, y), f"{rank + 1}", (0, 0, 0), font, "mm", stroke_width=2, stroke_fill=white)
+        outline = scene.placement.world(_border(scene.placement.size_mm))
+        if scene.placement.normal @ (_eye(pose) - scene.placement.center_mm) > 0:
+            draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN, 4, "curve")
+        panels.append(np.asarray(panel))
+    return Image.fromarray(np.concatenate(panels, 1))
+
+
+def _plain(scene: PatchScene) -> tuple[PatchScene, Conditions]:
+    """The scene in even light on white, all of the object in its pictures, and the directions it is seen from."""
+    view = scene.settings.view
+    distance = sum(view.distance_mm) / 2
+    half = float(np.linalg.norm(np.ptp(scene.mesh.vertices, axis=0))) / 2 * _ROOM
+    fov = float(np.degrees(2 * np.arctan(half / distance)))
+    settings = scene.settings.changed(view={"fov_deg": fov}, camera={"photo_px": (_SIDE_PX, _SIDE_PX), "file": None})
+    white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
+    (low, high), every = view.azimuth_deg, np.ones(_DIRECTIONS)
+    pose = Pose(
+        azimuth_deg=low + (high - low) * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS,
+        elevation_deg=every * sum(view.elevation_deg) / 2,
+        distance_mm=every * distance,
+    )
+    light = Light(ambient=every * 0.55, directional=every * 0.45, light_elevation_deg=every * 45)
+    return replace(scene, settings=settings, backgrounds=white, camera=None), Conditions(pose=pose, light=light)
+
+
+def _dots(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.ndarray]]:
+    """(rank from 0, candidate, 4×3 corners of its small square in the world), the worst first."""
+    half_mm = _DOT / 2 * min(scene.placement.size_mm)
+    for rank, candidate in reversed([*enumerate(place.candidates)]):
+        patch = scene.settings.patch.changed(at_mm=candidate.at_mm)
+        right, up = spun(frame := patch_frame(scene.mesh, patch), candidate.spin_deg)
+        signs = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
+        yield rank, candidate, frame.origin_mm + half_mm * signs @ np.stack([right, up])
+
+
+def _seen(scene: PatchScene, pose: np.ndarray, depth: np.ndarray, corners: np.ndarray) -> bool:
+    """Whether the middle of a square faces the camera and nothing stands before it."""
+    middle, normal = corners.mean(0), np.cross(corners[0] - corners[1], corners[2] - corners[1])
+    if normal @ (_eye(pose) - middle) <= 0:
+        return False
+    x, y = np.floor(geometry.project(scene.matrix_px(depth.shape[::-1]), pose, middle[None])[0]).astype(int)
+    inside = 0 <= x < depth.shape[1] and 0 <= y < depth.shape[0]
+    return inside and bool((pose[:3] @ [*middle, 1])[2] < depth[y, x] + _IN_FRONT_MM)
+
+
+def _depth(stage: Stage, scene: PatchScene, pose: np.ndarray) -> np.ndarray:
+    """H×W distances of the object from the camera along its axis, infinite where there is none."""
+    surface, size = stage.object_surface, (_SIDE_PX, _SIDE_PX)
+    placed = cameras(pose[None], scene.matrix_px(size)[None], size, stage)
+    fragments = rasterize(surface.vertices, surface.faces, placed, near_mm(scene))
+    depth = np.full(_SIDE_PX * _SIDE_PX, np.inf)
+    depth[fragments.pixel.numpy()] = fragments.depth.numpy()
+    return depth.reshape(_SIDE_PX, _SIDE_PX)
+
+
+def _eye(pose: np.ndarray) -> np.ndarray:
+    return -pose[:3, :3].T @ pose[:3, 3]
+
+
+def _border(size_mm: tuple[float, float]) -> np.ndarray:
+    """Points along a piece's border and back to the first: bent paper has bent edges."""
+    corners, steps = geometry.rect_corners((0, 0, *size_mm)), np.linspace(0, 1, 16, endpoint=False)[:, None]
+    border = [a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+    return np.concatenate([*border, corners[:1]])
+
+
+def _color(share: float) -> tuple[int, int, int]:
+    """Yellow at 0, purple at 1."""
+    red, green, blue = (round(float(np.interp(share, (0, 0.5, 1), column))) for column in _COLORS.T)
+    return red, green, blue

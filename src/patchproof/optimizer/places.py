@@ -1,0 +1,265 @@
+"""`place = "auto"`: where on the object a design reaches most, found with a quarter of what a run costs.
+
+In: an `OpenScene` and its networks. Out: `Place`. Places all over the surface (see `scene.places`) are compared in the
+same views, those of `patch.side`, in three steps. Screening: what a gray design costs at each place, and what its
+gradient promises to win back. Turns: the same for the other spins of the few best. Drafts: the best get a few steps of
+the real loop, and views that none has seen decide. Screening and drafts see draws of the train stream, the decision
+those of the select stream; the promise's are never touched. The same scene and seed give the same place.
+
+Left out on purpose: whether the runner-up would win with more steps or another seed. The interval is over views alone,
+and as the best of a few is named for being it, it flatters a little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from patchproof.claims import student_mean
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.goals import Loss
+from patchproof.optimizer.loop import draft, score, start, views_seen
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.responses import responses
+from patchproof.render.photograph import expose
+from patchproof.render.pixels import Shown
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.places import APART, Ground, Spot
+from patchproof.scene.scene import Scene, needs_open
+from patchproof.settings import OptimizeSettings
+from patchproof.strict import Refused, Side, Strict
+
+# Of a default run's passes: pictures that go through a network, and once more those that gradients come back through.
+SHARE = 0.25
+PLACES, SCREEN_VIEWS = 24, 4  # 192 of 608 passes, and 4 of the bare object
+TURNED = 4  # of the best places, with at most three turns each: 96
+# What is left, 18 steps at least. Of as many views, 18 steps of 2 got 0.02 to 0.03 further than 9 of 4 (two places of
+# the demo's truck).
+DRAFTS, DRAFT_VIEWS, HELD_OUT_VIEWS = 3, 2, 24
+_REACH = 0.1  # of sRGB's range: so far a gradient is believed
+
+
+class Candidate(Strict):
+    """A place that was tried. Losses are less the bare object's in the same views: lower is better for the goal.
+    `outlook` is `gray` less what the gradient promises, `draft` that of a drafted design in held-out views.
+    """
+
+    at_mm: tuple[float, float, float]
+    spin_deg: float
+    family: str
+    gap_mm: float
+    overhang_share: float
+    gray: float
+    outlook: float
+    draft: float | None = None
+
+
+class Lead(Strict):
+    """How much lower the chosen draft's loss is than the runner-up's in the same held-out views, with its 95 %
+    interval, and whether that leaves chance no room.
+    """
+
+    value: float
+    interval: tuple[float, float]
+    sure: bool
+
+
+class Place(Strict):
+    """The place that a search chose, as the keys `patch.at_mm`, `patch.spin_deg` and `view.front` say it. Candidates
+    run from the best to the worst. `passes` are those of each network, `run_share` is their share of a default run's.
+    """
+
+    sheet_id: str  # of the scene that was searched
+    front: Side
+    at_mm: tuple[float, float, float]
+    spin_deg: float
+    lead: Lead | None  # None where no other place was drafted
+    passes: int
+    run_share: float
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A spot, the problem with the piece there, and what screening said."""
+
+    spot: Spot
+    problem: Problem
+    gray: float
+    outlook: float
+
+
+def choose_place(
+    scene: Scene,
+    *,
+    models: Sequence[str | Classifier] | None = None,
+    loss: Loss | None = None,
+    device: str = "cpu",
+    on_pass: Callable[[int, int], None] = lambda done, total: None,
+) -> Place:
+    """Search the object of a scene with `patch.place = "auto"` for the piece's place; `models` and `loss` as in
+    `optimize`. `scene.at(place.at_mm, place.spin_deg)` has the piece there. Refused where there is no place at all.
+    """
+    scene = needs_open(scene)
+    search, ground = _Search(scene, models, loss, device, on_pass), Ground(scene)
+    trials = search.screened(ground.spots(PLACES))
+    leaders = sorted(trials, key=lambda trial: trial.outlook)[:TURNED]
+    trials += search.screened([turn for leader in leaders for turn in ground.turned(leader.spot)])
+    trials.sort(key=lambda trial: trial.outlook)
+    finalists = _finalists(trials, min(ground.size_mm))
+    drafts = search.drafted(finalists)
+    order = sorted(range(len(finalists)), key=lambda i: float(drafts[i].mean()))
+    candidates = [_candidate(finalists[i], float(drafts[i].mean())) for i in order]
+    candidates += [_candidate(trial) for trial in trials if trial not in finalists]
+    search.end()
+    return Place(
+        sheet_id=scene.sheet_id,
+        front=scene.settings.patch.side,
+        at_mm=candidates[0].at_mm,
+        spin_deg=candidates[0].spin_deg,
+        lead=_lead(drafts[order[1]] - drafts[order[0]]) if len(order) > 1 else None,
+        passes=search.passes,
+        run_share=search.passes / default_passes(),
+        candidates=tuple(candidates),
+    )
+
+
+def place_lines(place: Place) -> list[str]:
+    """The choice for the terminal: the place as a scene file would say it, how sure it is, and what it cost."""
+    x, y, z = place.at_mm
+    where = f'at_mm = [{x:g}, {y:g}, {z:g}], spin_deg = {place.spin_deg:g}, view.front = "{place.front}"'
+    drafted = sum(candidate.draft is not None for candidate in place.candidates)
+    cost = f"{len(place.candidates)} tried, {drafted} drafted, {place.run_share:.0%} of a default run's passes"
+    if place.lead is None:
+        return [f"chosen: {where}", f"the only place; {cost}"]
+    low, high = place.lead.interval
+    sure = "surely" if place.lead.sure else "not surely"
+    lead = f"{sure} better than the next: loss lower by {place.lead.value:.2f} [{low:.2f}, {high:.2f}]"
+    return [f"chosen: {where}", f"{lead}; {cost}"]
+
+
+def default_passes() -> int:
+    """A network's passes in a run of default length: all its views, and those of training once more."""
+    settings = OptimizeSettings()
+    return views_seen(settings) + settings.steps * settings.views
+
+
+class _Search:
+    """A search under way, which counts its networks' passes."""
+
+    def __init__(self, scene: OpenScene, models, loss: Loss | None, device: str, on_pass: Callable[[int, int], None]):
+        self.passes, self._budget = 0, int(SHARE * default_passes())
+        self._scene, self._on_pass = scene, on_pass
+        self._first: Problem | None = None
+        self._bare: float | None = None
+        self._stated = models, loss, device
+
+    def screened(self, spots: Sequence[Spot]) -> list[_Trial]:
+        """The spots where the piece can hang, with what gray costs there and its gradient promises."""
+        conditions, hung = self._scene.draw("train", SCREEN_VIEWS), self._hung(spots)
+        if self._bare is None and hung:
+            self._bare = float(self._losses(hung[0][1], None, conditions).mean())
+        return [_Trial(spot, problem, *self._screen(problem, conditions)) for spot, problem in hung]
+
+    def drafted(self, trials: Sequence[_Trial]) -> list[np.ndarray]:
+        """N losses of a draft at each place in the held-out views, less the bare object's there; the drafts take as
+        many steps as the budget has left.
+        """
+        held_out, losses = self._scene.draw("select", HELD_OUT_VIEWS), []
+        left = self._budget - self.passes - (len(trials) + 1) * HELD_OUT_VIEWS
+        steps = max(1, left // (len(trials) * 2 * DRAFT_VIEWS))
+        conditions = self._scene.draw("train", steps * DRAFT_VIEWS, start=SCREEN_VIEWS)
+        bare = self._losses(trials[0].problem, None, held_out)
+        for problem in (trial.problem for trial in trials):
+            design = draft(problem, conditions, DRAFT_VIEWS)
+            self._count(2 * len(conditions))
+            shown = problem.subject.shown(from_pixels(as_pixels(design), problem.device))
+            losses.append(self._losses(problem, shown, held_out) - bare)
+        return losses
+
+    def end(self) -> None:
+        """Say that no more will come."""
+        self._on_pass(self.passes, self.passes)
+
+    def _hung(self, spots: Sequence[Spot]) -> list[tuple[Spot, Problem]]:
+        """The spots' problems; where the piece can hang at none of them, the last refusal is the user's."""
+        hung, refusal = [], None
+        for spot in spots:
+            try:
+                scene = self._scene.at(spot.at_mm, spot.spin_deg)
+            except Refused as refused:
+                refusal = refused
+                continue
+            if self._first is None:
+                models, loss, device = self._stated
+                self._first = set_problem(scene, device, models, loss)
+            hung.append((spot, self._first.hung(scene)))
+        if refusal is not None and self._first is None:
+            raise refusal
+        return hung
+
+    def _screen(self, problem: Problem, conditions: Conditions) -> tuple[float, float]:
+        """(what gray costs, that less the decrease that its gradient promises)."""
+        design = start(problem).design.requires_grad_()
+        shown = problem.subject.shown(design)
+        loss, *_ = score(problem, expose(problem.see(shown, conditions, problem.training_px), shown))
+        (gradient,) = torch.autograd.grad(loss, design)
+        self._count(2 * len(conditions))
+        coarse = problem.subject.levels(gradient)[-1]
+        promise = _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
+        gray = float(loss.detach()) - (self._bare or 0.0)
+        return gray, gray - promise
+
+    def _losses(self, problem: Problem, shown: Shown, conditions: Conditions) -> np.ndarray:
+        """N losses, means over the networks."""
+        answers = responses(problem, {"": shown}, conditions, problem.training_px)
+        self._count(len(conditions))
+        return answers[""].loss.mean(0)
+
+    def _count(self, passes: int) -> None:
+        self.passes += passes
+        self._on_pass(self.passes, self._budget)
+
+
+def _finalists(trials: Sequence[_Trial], edge_mm: float) -> list[_Trial]:
+    """The best, a whole piece apart: screening may be wrong about a part of the object. Only where that gives too few,
+    as near to each other as places are.
+    """
+    far, near = _apart(trials, edge_mm), _apart(trials, APART * edge_mm)
+    return [*far, *(trial for trial in near if trial not in far)][:DRAFTS]
+
+
+def _apart(trials: Sequence[_Trial], apart_mm: float) -> list[_Trial]:
+    """The trials without those next to a better one on the same side: a place counts once, at its best spin."""
+    kept: list[_Trial] = []
+    for trial in trials:
+        laid, others = trial.spot.placement, [other.spot.placement for other in kept]
+        near = [np.linalg.norm(laid.center_mm - other.center_mm) < apart_mm for other in others]
+        alike = [laid.normal @ other.normal > 0.5 for other in others]
+        if not np.logical_and(near, alike).any():
+            kept.append(trial)
+    return kept
+
+
+def _lead(differences: np.ndarray) -> Lead:
+    mean = student_mean(differences)
+    return Lead(value=mean.value, interval=(mean.low, mean.high), sure=mean.low > 0)
+
+
+def _candidate(trial: _Trial, draft_loss: float | None = None) -> Candidate:
+    laid = trial.spot.placement
+    return Candidate(
+        at_mm=trial.spot.at_mm,
+        spin_deg=trial.spot.spin_deg,
+        family=laid.family,
+        gap_mm=round(laid.gap_mm, 2),
+        overhang_share=round(laid.overhang_share, 4),
+        gray=trial.gray,
+        outlook=trial.outlook,
+        draft=draft_loss,
+    )

@@ -1,0 +1,218 @@
+"""Where on an object a piece can lie: places all over its surface, evenly spread.
+
+In: an `OpenScene`, whose `patch.search` says what is wanted. Out: `Spot`s, each good for `OpenScene.at`. Points are
+sampled evenly over the surface (the same ones for the same seed) and left out where hardly any view faces them. From
+each, the piece is moved until one level part of the surface lies under it, and laid down there as a given piece is.
+What is refused, overhangs, stands too far off or lies on what is to be kept free is no place.
+Left out on purpose: what stands before a place. The networks will tell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from patchproof.scene.bend import place_bent
+from patchproof.scene.mesh_scene import camera_poses
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.placement import (
+    WARN_GAP_SHARE,
+    WARN_OVERHANG_SHARE,
+    Frame,
+    Placement,
+    patch_frame,
+    place_card,
+    spun,
+    surface_frame,
+)
+from patchproof.scene.surface import Chart, crop, heights, net
+from patchproof.scene.texture import named_faces
+from patchproof.strict import Refused
+
+APART = 0.5  # of the piece's shorter edge between two places
+_POOL_APART, _POOL = 0.25, 96  # the same between points that are tried, and how many at most
+_SAMPLES_APART, _SAMPLES = 1 / 16, 100_000  # and between those that stand for the surface
+_VIEWS, _FACING_SHARE, _FACING_COSINE = 64, 0.1, 0.17  # a tenth of the views at least, less than 80° from the normal
+_NET, _MOVES = 17, 4  # points along each edge under which a place is leveled, and how often the piece is moved
+_COARSE_OVERHANG = 0.07  # of these points: one row of 17 may just miss the edge
+_SAME_SIDE = 0.97  # cosine of 15°: a point that is moved onto what faces elsewhere is no place
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A place for the piece, as the keys `at_mm` and `spin_deg` say it, and how it lies there."""
+
+    at_mm: tuple[float, float, float]
+    spin_deg: float
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class Ground:
+    """An object's surface, where a piece looks for a place."""
+
+    scene: OpenScene
+
+    def spots(self, most: int) -> tuple[Spot, ...]:
+        """At most `most` places, one spin each, at least `APART` from each other and as far as their number allows;
+        refused where there is none.
+        """
+        fitting = [spot for frame in self._tried if (spot := self._first(frame)) is not None]
+        if not fitting:
+            expected = f"a place for a piece of {self.size_mm[0]:.0f} × {self.size_mm[1]:.0f} mm that views face"
+            do = "make it smaller, let it bend, or ask less of patch.search"
+            raise Refused(expected, "none", do)
+        middles = np.array([spot.placement.center_mm for spot in fitting])
+        normals = np.array([spot.placement.normal for spot in fitting])
+        return tuple(fitting[i] for i in _spread(middles, normals, min(self.size_mm), APART, most))
+
+    def turned(self, spot: Spot) -> tuple[Spot, ...]:
+        """About the same place with the other spins that fit there."""
+        frame = self._frame_at(spot.at_mm)
+        turns = (self._fitting(frame, spin) for spin in self._spins if spin != spot.spin_deg)
+        return tuple(turn for turn in turns if turn is not None)
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """The piece's."""
+        return self.scene.settings.patch.size_mm
+
+    @property
+    def _spins(self) -> tuple[float, ...]:
+        """Turns that differ: a design may be drawn upside down, and on a square sideways, too."""
+        width, height = self.size_mm
+        if self.scene.settings.patch.search.upright:
+            return (0.0,)
+        return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
+
+    def _first(self, frame: Frame) -> Spot | None:
+        """The piece near a frame's origin, upright if it fits so, else a quarter turned."""
+        return next((spot for spin in self._spins[:2] if (spot := self._fitting(frame, spin)) is not None), None)
+
+    def _fitting(self, frame: Frame, spin_deg: float) -> Spot | None:
+        """The piece near a frame's origin; None where it does not fit."""
+        middle = self._leveled(frame, spin_deg)
+        if middle is None:
+            return None
+        at_mm = _rounded(middle)
+        there, patch = self._frame_at(at_mm), self.scene.settings.patch
+        if there.normal @ frame.normal < _SAME_SIDE:
+            return None
+        place = place_bent if patch.bend else place_card
+        try:
+            laid = place(self.scene.mesh, there, self.size_mm, spin_deg)
+        except Refused:
+            return None
+        fits = laid.gap_mm <= self._gap_mm and laid.overhang_share <= WARN_OVERHANG_SHARE
+        return Spot(at_mm, spin_deg, laid) if fits and not self._touches_forbidden(laid) else None
+
+    def _leveled(self, frame: Frame, spin_deg: float) -> np.ndarray | None:
+        """The frame's origin, moved until what lies under the piece is as high as its middle; None where that fails."""
+        right, up = spun(frame, spin_deg)
+        reach = float(np.hypot(*self.size_mm)) / 2
+        near, points, middle = crop(self._triangles, frame.origin_mm, 2 * reach), net(self.size_mm, _NET), _NET**2 // 2
+        origin = frame.origin_mm
+        for _ in range(_MOVES):
+            chart = Chart(origin, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
+            surface = heights(chart, near, self.size_mm, _NET, (-reach, reach))
+            level = np.abs(surface - surface[middle]) <= self._gap_mm
+            lies = np.isfinite(surface) if self.scene.settings.patch.bend else level
+            if lies.mean() >= 1 - _COARSE_OVERHANG:
+                return origin + surface[middle] * frame.normal
+            if not level.any():
+                return None
+            # what a strip along one edge lacks moves the mean of the rest by half of its width
+            x, y = 2 * points[level].mean(0)
+            origin = origin + x * right + y * up
+        return None
+
+    def _frame_at(self, at_mm: tuple[float, float, float]) -> Frame:
+        """The frame that a piece at a point has."""
+        return patch_frame(self.scene.mesh, self.scene.given(at_mm, 0.0).patch)
+
+    @property
+    def _gap_mm(self) -> float:
+        return self.scene.settings.patch.search.gap_mm or WARN_GAP_SHARE * min(self.size_mm)
+
+    @cached_property
+    def _triangles(self) -> np.ndarray:
+        return self.scene.mesh.vertices[self.scene.mesh.faces]
+
+    @cached_property
+    def _samples(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points M×3 evenly over the surface, their faces' normals M×3 and numbers M."""
+        a, b, c = self._triangles.transpose(1, 0, 2)
+        cross = np.cross(b - a, c - a)
+        doubled = np.linalg.norm(cross, axis=1)
+        apart_mm = _SAMPLES_APART * min(self.size_mm)
+        count = int(np.clip(doubled.sum() / 2 / apart_mm**2, 1000, _SAMPLES))
+        rng = np.random.default_rng(self.scene.seed)
+        share = (np.arange(count) + rng.random(count)) / count
+        face = np.searchsorted(np.cumsum(doubled) / doubled.sum(), share).clip(max=len(doubled) - 1)
+        u, v = rng.random((2, count, 1))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        points = a[face] + u * (b - a)[face] + v * (c - a)[face]
+        return points, (cross / doubled[:, None])[face], face
+
+    @cached_property
+    def _tried(self) -> tuple[Frame, ...]:
+        """Frames of the points that are tried, the one next to the middle of the scene's front first."""
+        points, normals, _ = self._samples
+        eyes = _eyes(self.scene)
+        cosines = [((eye - points) * normals).sum(1) / np.linalg.norm(eye - points, axis=1) for eye in eyes]
+        faced = (np.array(cosines) > _FACING_COSINE).mean(0) >= _FACING_SHARE
+        points, normals = points[faced], normals[faced]
+        if not len(points):
+            return ()
+        first = int(np.linalg.norm(points - self.scene.frame.origin_mm, axis=1).argmin())
+        edge_mm = min(self.size_mm)
+        chosen = _spread(points, normals, edge_mm, _POOL_APART, _POOL, first)
+        return tuple(surface_frame(self.scene.mesh, points[i], normals[i]) for i in chosen)
+
+    @cached_property
+    def _forbidden(self) -> np.ndarray:
+        """Which of the sampled points are to be kept free."""
+        search = self.scene.settings.patch.search
+        faces = named_faces(self.scene.mesh, search.keep_off, search.keep_off_faces, self.scene.base)
+        return faces[self._samples[2]]
+
+    def _touches_forbidden(self, laid: Placement) -> bool:
+        """Whether a point of the piece lies nearest to one that is to be kept free, of those that face as it does."""
+        from scipy.spatial import KDTree
+
+        points, normals, _ = self._samples
+        below = normals @ laid.normal > 0
+        if not (self._forbidden & below).any():
+            return False
+        paper = laid.world(net(self.size_mm, _NET) * [1, -1] + np.array(self.size_mm) / 2)
+        return bool(self._forbidden[below][KDTree(points[below]).query(paper)[1]].any())
+
+
+def _eyes(scene: OpenScene) -> np.ndarray:
+    """N×3: where cameras of the scene stand."""
+    poses = camera_poses(scene, scene.middle_mm, scene.draw("train", _VIEWS).pose)
+    return -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+
+
+def _rounded(point_mm: np.ndarray) -> tuple[float, float, float]:
+    """To 0.1 mm: what a person would write down."""
+    x, y, z = (round(float(value), 1) + 0.0 for value in point_mm)
+    return x, y, z
+
+
+def _spread(
+    points_mm: np.ndarray, normals: np.ndarray, edge_mm: float, apart: float, most: int, first: int = 0
+) -> list[int]:
+    """At most `most` of the points, each as far as can be from those before, `apart` edges at least; what faces the
+    other way is as far as an edge.
+    """
+    rows = np.concatenate([points_mm, normals * edge_mm / 2], 1)
+    chosen, distance = [first], np.full(len(rows), np.inf)
+    while len(chosen) < most:
+        distance = np.minimum(distance, np.linalg.norm(rows - rows[chosen[-1]], axis=1))
+        if distance.max() < apart * edge_mm:
+            break
+        chosen.append(int(distance.argmax()))
+    return chosen
