@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -124,12 +125,11 @@ METHODS: dict[str, Callable[[Problem], Made]] = {"ours": ours, "sign": sign, "fl
 def load_art() -> tuple[Any, Any]:
     """ART's attack and its wrapper of networks; refused in a sentence where they cannot be imported."""
     try:
-        from art.attacks.evasion import AdversarialPatchPyTorch
-        from art.estimators.classification import PyTorchClassifier
-    except ImportError:
+        attack, wrapper = import_module("art.attacks.evasion"), import_module("art.estimators.classification")
+    except (ImportError, RuntimeError):  # the latter of a torchvision that was built for another torch
         do = 'pip install "patchproof[peers]", or leave art out of peers'
         raise Refused("the Adversarial Robustness Toolbox", "none", do) from None
-    return AdversarialPatchPyTorch, PyTorchClassifier
+    return attack.AdversarialPatchPyTorch, wrapper.PyTorchClassifier
 
 
 class _OfCodes(torch.nn.Module):

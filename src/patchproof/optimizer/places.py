@@ -38,7 +38,7 @@ from patchproof.strict import Refused, Side, Strict
 SHARE = 0.25
 PLACES, SCREEN_VIEWS = 24, 4  # 192 of 608 passes, and 4 of the bare object
 TURNED = 4  # of the best places, with at most three turns each: 96
-# What is left, 18 steps at least. Of as many views, 18 steps of 2 got 0.02 to 0.03 further than 9 of 4 (two places of
+# What is left, 18 steps at least. Of as many views, 18 steps of 2 got 0.02 to 0.03 further than 9 of 4 (two places on
 # the demo's truck).
 DRAFTS, DRAFT_VIEWS, HELD_OUT_VIEWS = 3, 2, 24
 _REACH = 0.1  # of sRGB's range: so far a gradient is believed

@@ -34,7 +34,7 @@ from patchproof.strict import Refused
 APART = 0.5  # of the piece's shorter edge between two places
 _POOL_APART, _POOL = 0.25, 96  # the same between points that are tried, and how many at most
 _SAMPLES_APART, _SAMPLES = 1 / 16, 100_000  # and between those that stand for the surface
-_VIEWS, _FACING_SHARE, _FACING_COSINE = 64, 0.1, 0.17  # a tenth of the views at least, less than 80° from the normal
+_VIEWS, _FACING_SHARE, _FACING_COSINE = 64, 0.2, 0.26  # a fifth of the views at least, less than 75° from the normal
 _NET, _MOVES = 17, 4  # points along each edge under which a place is leveled, and how often the piece is moved
 _COARSE_OVERHANG = 0.07  # of these points: one row of 17 may just miss the edge
 _SAME_SIDE = 0.97  # cosine of 15°: a point that is moved onto what faces elsewhere is no place

@@ -54,7 +54,7 @@ class Layout(Strict):
     size: Positive = 1.0  # of the markers that the scene's views ask for
     quiet: Positive = 1.0  # modules of white between a marker and the design
     framed: bool = False  # the design inside a frame of markers, all of which is white
-    optimize: dict[str, Any] = Field({})  # keys of the scene's [optimize] that change with it
+    optimize: dict[str, Any] = Field(default_factory=dict)  # keys of the scene's [optimize] that change with it
 
 
 _LAYOUTS = {
