@@ -13,7 +13,6 @@ from patchproof.bench.paper import PIECE_MM, corners_mm, drawn_sheet
 from patchproof.bench.world import demo_problem, with_optimize
 from patchproof.claims import Estimate
 from patchproof.optimizer import loop
-from patchproof.optimizer.patch import Patch
 from patchproof.settings import OptimizeSettings
 
 
@@ -70,7 +69,7 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
 
     monkeypatch.setattr(train, "trained_losses", losses)
     charts = train.charts(True, quiet)
-    for chart, name in ((next(charts), f"{usual.views}"), (next(charts), f"{usual.optimizer} {Patch.STEP_SIZE:g}")):
+    for chart, name in ((next(charts), f"{usual.views}"), (next(charts), f"{usual.optimizer} {usual.step_size:g}")):
         (default,) = (p for points in chart.series.values() for p in points if p.default)
         assert default.setting == name and default.cost == loop.views_seen(usual.changed(steps=120 // usual.views))
     (*_, last) = chart.series.values()

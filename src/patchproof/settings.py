@@ -222,8 +222,9 @@ class OptimizeSettings(Strict):
     views: Annotated[int, Field(ge=1)] = 4  # conditions in each step
     seed: Annotated[int, Field(ge=0)] = 0  # of everything that is drawn
     optimizer: Literal["adam", "sign"] = "adam"  # or the signed steps of FGSM and PGD
-    # A larger one only jumps to the ends of sRGB's range.
-    step_size: Annotated[Positive, Field(le=1)] | None = None  # of sRGB's range; 0.05 for a patch, 0.015 for a texture
+    # With 0.0075, 0.015, 0.03 and 0.05 designs of six pairs of object and network were recognized in 73, 74, 71 and
+    # 69 % of unseen views; a step that decays over the run did no better.
+    step_size: Annotated[Positive, Field(le=1)] = 0.015  # of sRGB's range
     tv: NotNegative = 0.0  # loss for the design's total variation
     # At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
     # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).
@@ -233,7 +234,7 @@ class OptimizeSettings(Strict):
     @classmethod
     def _forget_former_keys(cls, data):
         # runs from before these keys went have them, nearly always at the values that changed nothing
-        former = {"refresh": 1, "mine": 0, "nps": 0.0, "in_gamut": False}
+        former = {"refresh": 1, "mine": 0, "nps": 0.0, "in_gamut": False, "step_size": None}
         if not isinstance(data, dict):
             return data
         return {key: value for key, value in data.items() if key not in former or value != former[key]}

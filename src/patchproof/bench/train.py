@@ -17,17 +17,16 @@ from patchproof.bench.chart import Chart, OnStage, Point
 from patchproof.bench.world import demo_problem, with_optimize
 from patchproof.claims import paired_means
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
-from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import responses
 from patchproof.settings import OptimizeSettings
 
 VIEWS, QUICK_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
-ADAM, QUICK_ADAM = (0.01, 0.025, 0.05, 0.1, 0.2), (0.025, 0.05, 0.1)  # step sizes
+ADAM, QUICK_ADAM = (0.0075, 0.015, 0.03, 0.06, 0.12), (0.0075, 0.015, 0.03)  # step sizes
 SIGN, QUICK_SIGN = (0.01, 0.03, 0.1), (0.03,)
 
-USUAL = OptimizeSettings(step_size=Patch.STEP_SIZE)
+USUAL = OptimizeSettings()
 Losses = Mapping[tuple[OptimizeSettings, int], Sequence[float]]  # by settings and training views, one per seed
 
 

@@ -136,7 +136,7 @@ def _step(problem: Problem, state: State, seen: Views) -> Step:
 def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
     """One update of the design, clipped to what it may become."""
     clipped, settings = problem.subject.clipped, problem.scene.settings.optimize
-    number, step_size = state.number + 1, settings.step_size or problem.subject.STEP_SIZE
+    number, step_size = state.number + 1, settings.step_size
     if settings.optimizer == "sign":
         design = clipped(state.design - step_size * gradient.sign())
         return replace(state, number=number, design=design)

@@ -44,7 +44,6 @@ class Patch:
     printer: Printer
     design_px: tuple[int, int]
     device: torch.device
-    STEP_SIZE: ClassVar[float] = 0.015
     LOOK: ClassVar[str] = "printer"
 
     def start(self) -> Tensor:

@@ -37,7 +37,6 @@ class Grid:
 class Subject(Protocol):
     """What the loop, the promise and studies ask of what is optimized."""
 
-    STEP_SIZE: ClassVar[float]
     LOOK: ClassVar[str]  # what turns a design into what is shown
 
     def start(self) -> Tensor:

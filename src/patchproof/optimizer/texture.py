@@ -41,7 +41,6 @@ class Texture:
 
     # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
     # 60 % as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
-    STEP_SIZE: ClassVar[float] = 0.015
     LOOK: ClassVar[str] = "textures"
     scene: TextureScene
     device: torch.device
