@@ -32,8 +32,8 @@ up = "y"
 [patch]
 side = "+y"
 offset_mm = [0, 45]
-width_mm = 150
-height_mm = 150
+width_mm = 147
+height_mm = 147
 
 [target]
 label = "box truck"
