@@ -70,6 +70,7 @@ patch_share = [0.35, 0.45]
 photo_px = [800, 600]
 blur_px = [0, 0.5]
 noise = [0, 0.005]
+exposure_ev = [-0.6, -0.2]  # at 0 the paper of a pasted piece is full white, which is no reference for a gray design
 [optimize]
 steps = 2
 views = 4
