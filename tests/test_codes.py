@@ -22,7 +22,7 @@ GOOD = dict(tilt_deg=10.0, blur_px=1.0, contrast=0.5, px_per_mm=2.0, residual_mm
 
 
 def trouble(markers=8, module_px=4.0, **figures):
-    """What `measure` says of these figures, of a 100 mm design."""
+    """What `measure` says of these figures, of a 140 mm piece."""
     borders = Borders(np.zeros((4, 2)), 1.0, module_px, True)
     found = MarkersInView({i: borders for i in PIECE_IDS[:markers]}, (), ())
     fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[:markers])
@@ -34,9 +34,9 @@ def trouble(markers=8, module_px=4.0, **figures):
     [
         ("tilted", {"tilt_deg": 77.9}, {"tilt_deg": 78.1}),
         ("blurred", {"blur_px": 1.99}, {"blur_px": 2.01}),  # half a module of 4 px
-        ("too_small", {"px_per_mm": 0.241}, {"px_per_mm": 0.239}),  # 24 px across 100 mm
+        ("too_small", {"px_per_mm": 0.172}, {"px_per_mm": 0.171}),  # 24 px across 140 mm
         ("too_small", {"corner_uncertainty_mm": 1.49}, {"corner_uncertainty_mm": 1.51}),
-        ("curled", {"residual_mm": 0.99}, {"residual_mm": 1.01}),
+        ("curled", {"residual_mm": 1.39}, {"residual_mm": 1.41}),
     ],
 )
 def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
@@ -90,7 +90,7 @@ def test_a_mirrored_photo_or_print_is_known_whichever_way_it_is_held(flip):
 
 
 def test_half_of_the_design_may_be_clipped():
-    # a design of codes up to 236 in light of 0.8 stays below white; doubled, most of it does not
-    assert measured(shot(light=0.8)).entry.code is None
-    entry = measured(shot(light=2.0)).entry
+    # in light of 2 a third of the piece is at full white, in light of 3 two thirds are
+    assert measured(shot(light=2.0)).entry.code is None
+    entry = measured(shot(light=3.0)).entry
     assert entry.code == "clipped" and entry.remark.figure > entry.remark.threshold == measure.MOST_CLIPPED

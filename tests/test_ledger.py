@@ -103,7 +103,7 @@ def test_a_known_print_is_read_from_a_noisy_design(change, before, after):
     assert delta(printed(sent), as_printed(promised)) < after
     assert delta(printed(other), as_printed(shown_by("coated", other))) < after
     ends = as_printed(np.stack([np.ones(3), ink]))
-    assert ends == pytest.approx(np.stack([np.ones(3), printed(INK)[0, 0]]), abs=0.01)
+    assert ends == pytest.approx(np.stack([np.ones(3), printed(INK)[0, 0]]), abs=0.015)
 
 
 def test_black_that_is_lighter_in_photographs_is_print():

@@ -85,7 +85,7 @@ def test_the_stated_uncertainty_covers_the_truth_in_drawn_corners():
 
 @pytest.mark.parametrize(
     ("ids", "typical_mm"),
-    [((100,), 55), ((100, 101), 5), ((100, 102, 105, 107), 0.10), (PIECE_IDS, 0.08)],
+    [((100,), 72), ((100, 101), 7), ((100, 102, 105, 107), 0.14), (PIECE_IDS, 0.115)],
     ids=["one", "two", "four", "eight"],
 )
 def test_few_markers_state_as_wide_an_uncertainty_as_they_have(ids, typical_mm):
