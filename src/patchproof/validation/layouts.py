@@ -30,7 +30,7 @@ from patchproof.optimizer.promise import CONTROLS, shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Drawing, Table, Value
 from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, sent_pixels
 from patchproof.scene.scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece
@@ -219,14 +219,19 @@ def _figures(group: Sequence[Result], first: dict) -> tuple:
     beside = [gain_of(result) - first[who(result)] for result in group if who(result) in first]
     return (
         float(np.mean([result.answers["free"] for result in group])),
-        mean([gain_of(result) for result in group]),
-        mean(beside),
+        _mean_or_single([gain_of(result) for result in group]),
+        _mean_or_single(beside),
         rate([word != "rejected" for word in status]),
         rate([word == "measured" for word in status]),
         clustered_median(np.array([[error] for error, _ in errors])) if errors else None,
         rate([error <= stated for error, stated in errors]),
         mean([m["delta_e00"] for m in measured if m["delta_e00"] is not None]),
     )
+
+
+def _mean_or_single(values: Sequence[float]) -> Estimate | float | None:
+    """The mean with its interval; a single value has none."""
+    return values[0] if len(values) == 1 else mean(values)
 
 
 def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Drawing]:
@@ -236,14 +241,20 @@ def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Dr
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         for name, _, gain, _, _, measured, *_ in table.rows:
-            if isinstance(gain, Estimate) and isinstance(measured, Estimate):
-                spans = [[[e.value - e.low], [e.high - e.value]] for e in (measured, gain)]
-                axes.errorbar([measured.value], [gain.value], spans[1], spans[0], "o", label=name)
+            (x, x_span), (y, y_span) = _with_span(measured), _with_span(gain)
+            axes.errorbar([x], [y], y_span, x_span, "o", label=name)
         axes.set_xlabel("photographs measured")
         axes.set_ylabel("gain over the best control")
         axes.legend(fontsize=8)
 
     return (Drawing("layouts", "What layouts cost and buy", draw, (7.0, 4.5), table.about),)
+
+
+def _with_span(value: Value) -> tuple[float, list[list[float]] | None]:
+    """A figure and how far its interval reaches down and up, as matplotlib takes it."""
+    if isinstance(value, Estimate):
+        return value.value, [[value.value - value.low], [value.high - value.value]]
+    return float(value or 0), None
 
 
 STUDY = Study("layouts", LayoutsSettings, cells, run, tables, figures)

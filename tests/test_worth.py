@@ -1,0 +1,73 @@
+"""What a design is worth beside its best control: the word, the first line, the page, and who asks for better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from patchproof.cli import app
+from patchproof.report.summary import promise_lines
+from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.manifest import Promise
+from patchproof.sheets.piece import lay_out_piece
+
+
+def promise_of(rate: float, controls: dict[str, tuple[float, float, float]], goal: str = "assist") -> Promise:
+    """Controls are (rate, low, high), the ends of the design's difference to them."""
+    claim = {"interval": (0, 1), "confidence": 0.5}
+    return Promise(
+        target={"label": "jeep", "indices": (1,), "goal": goal},
+        models=[{"name": "m", "sha256": None, "rate": rate, **claim}],
+        rate=rate,
+        interval=(0, 1),
+        n=400,
+        controls={
+            name: {"rate": own, "difference": rate - own, "difference_interval": (low, high), **claim}
+            for name, (own, low, high) in controls.items()
+        },
+        conditions=(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("controls", "goal", "best", "worth"),
+    [
+        ({"bare": (0.4, 0.05, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "better"),
+        ({"bare": (0.4, 0.0, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "no better"),
+        ({"bare": (0.6, -0.2, -0.01), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "worse"),
+        ({"bare": (0.8, -0.4, -0.2), "gray": (0.6, -0.2, -0.05)}, "deceive", "gray", "better"),
+        ({"bare": (0.8, -0.4, -0.2), "gray": (0.4, 0.05, 0.2)}, "deceive", "gray", "worse"),
+    ],
+)
+def test_the_hardest_control_decides_and_its_interval_says_the_word(controls, goal, best, worth):
+    promise = promise_of(0.5, controls, goal)
+    assert (promise.best_control, promise.worth) == (best, worth)
+    first = promise_lines(promise)[0]
+    assert first.startswith(f"{worth} than its best control ({best}): 50.0%")
+    assert ("before printing it" in first) == (worth != "better")
+
+
+def test_the_page_says_so_in_its_first_line():
+    piece = lay_out_piece((100, 100), 10, "A" * 10, "design")
+    design = np.full((8, 8, 3), 128, np.uint8)
+    kinds = [
+        PrintedPiece(piece, "A" * 10, "design", design, promise_of(0.5, {"bare": ends})).words["kind"]
+        for ends in ((0.4, 0.05, 0.2), (0.5, -0.1, 0.1), (0.6, -0.2, -0.05))
+    ]
+    assert kinds == ["design", "design, no better than bare", "design, worse than bare"]
+
+
+def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 60\nheight_mm = 60\n'
+        '[target]\nlabel = "mug"\nmodels = ["builtin"]\n[camera]\nphoto_px = [96, 96]\n'
+        "[optimize]\nsteps = 1\nviews = 1\n"
+    )
+    run = lambda name, *more: CliRunner().invoke(app, ["optimize", str(scene), "--out", str(tmp_path / name), *more])
+    asked = run("a", "--require", "better")
+    assert asked.exit_code == 1 and "no better than its best control" in asked.stdout
+    assert (tmp_path / "a" / "run.json").is_file()
+    assert run("b").exit_code == 0
+    assert run("c", "--require", "kept").exit_code == 2
