@@ -65,7 +65,10 @@ def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_p
         '[target]\nlabel = "mug"\nmodels = ["builtin"]\n[camera]\nphoto_px = [96, 96]\n'
         "[optimize]\nsteps = 1\nviews = 1\n"
     )
-    run = lambda name, *more: CliRunner().invoke(app, ["optimize", str(scene), "--out", str(tmp_path / name), *more])
+
+    def run(name, *more):
+        return CliRunner().invoke(app, ["optimize", str(scene), "--out", str(tmp_path / name), *more])
+
     asked = run("a", "--require", "better")
     assert asked.exit_code == 1 and "no better than its best control" in asked.stdout
     assert (tmp_path / "a" / "run.json").is_file()
