@@ -16,6 +16,7 @@ from patchproof.bench.chart import all_checks
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import load_scene
+from patchproof.sheets.piece import marker_image
 from patchproof.strict import Refused
 from patchproof.study.grid import scene_values
 from patchproof.study.record import bits
@@ -99,8 +100,10 @@ def test_every_method_of_ours_goes_where_the_goal_is_for_no_more_than_the_budget
 
 
 def test_signed_steps_are_the_paper_s(scene_file):
-    made = methods.sign(set_problem(load_scene(red_scene(scene_file, steps=2))))
-    steps = (made.pixels / 255 - 0.5) / methods.SIGN_STEP
+    problem = set_problem(load_scene(red_scene(scene_file, steps=2)))
+    made = methods.sign(problem)
+    _, reserved = marker_image(problem.patch.scene.piece, problem.patch.printed_px)
+    steps = (made.pixels[~reserved] / 255 - 0.5) / methods.SIGN_STEP
     assert np.abs(steps).max() == pytest.approx(2, abs=0.4)  # of two; codes are 0.4 of a step apart
 
 
@@ -157,7 +160,8 @@ def test_art_gets_the_same_photographs_the_target_and_the_design_s_size(scene_fi
     assert (given.options["scale_min"], given.options["scale_max"]) == (low, high) and 0 < low < high <= 1
     codes = torch.full((1, 3, 64, 64), 255.0)
     assert torch.equal(given.network.model(codes), problem.classifiers[0].logits(codes / 255))
-    assert (made.pixels[0, 0].tolist(), made.pixels[-1, -1].tolist()) == ([255, 0, 0], [0, 0, 255])
+    middle = made.pixels.shape[1] // 2  # of the first and last rows: the corners are the markers'
+    assert (made.pixels[0, middle].tolist(), made.pixels[-1, middle].tolist()) == ([255, 0, 0], [0, 0, 255])
 
 
 def test_art_s_square_patch_is_squeezed_into_a_design_of_another_shape(scene_file, given):
@@ -167,7 +171,9 @@ def test_art_s_square_patch_is_squeezed_into_a_design_of_another_shape(scene_fil
     assert given.options["patch_shape"] == (3, width, width) and width > height
     assert given.options["targeted"] is False
     assert made.pixels.shape[:2][::-1] == problem.patch.printed_px
-    assert (made.pixels[0, :] == [255, 0, 0]).all() and (made.pixels[-1, :] == [0, 0, 255]).all()
+    free = ~marker_image(problem.patch.scene.piece, problem.patch.printed_px)[1]
+    first, last = (made.pixels[row][free[row]] for row in (0, -1))
+    assert len(first) > 20 and (first == [255, 0, 0]).all() and (last == [0, 0, 255]).all()
 
 
 @pytest.mark.filterwarnings("ignore")  # ART's own

@@ -131,7 +131,7 @@ def test_the_sheet_is_the_same_bytes_when_made_twice(journey, tmp_path):
 def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
     small = shipped("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
     assert "177.0, 262.4]" in small
-    (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "90.0, 90.0]"), encoding="utf-8")
+    (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "60.0, 60.0]"), encoding="utf-8")
     pdf, run = tmp_path / "tiles.pdf", journey / "run"
     # a control, for which no promise is made anew
     assert command("sheet", run, "--out", pdf, "--template", tmp_path / "small.toml", "--control", "mean") == 0

@@ -9,6 +9,7 @@ import shlex
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from patchproof.settings import SceneSettings
@@ -131,6 +132,33 @@ def test_figures_of_the_promises_are_the_stored_ones():
     assert f"{count} prediction intervals of 95 % held: {share}." in words(NOTEBOOK)
     assert f"Their median width is {rows['all'][2]:.0%}".replace("%", " %") in words(NOTEBOOK)
     assert f"{count} promises" in words(README) and f": {share}." in words(README)
+
+
+def test_figures_of_layouts_are_the_stored_ones():
+    with (NOTEBOOK.parent / "layouts" / "layouts_layouts.csv").open(encoding="utf-8") as file:
+        whole, framed = csv.DictReader(file)
+
+    def points(row: dict[str, str], key: str, ends=("", "_low", "_high"), sign: float = 100) -> list[str]:
+        return [f"{sign * float(row[key + end]):.1f}" for end in ends]
+
+    gains = [points(row, "gain over the best control") for row in (whole, framed)]
+    texts = [f"+{value} points [{low}, {high}]" for value, low, high in gains]
+    assert f"{texts[0]} in place of {texts[1].replace(' points', '')}" in words(NOTEBOOK)
+    value, high, low = points(framed, "beside the first layout", sign=-100)
+    assert f"{value} more [{low}, {high}] over 18 designs" in words(NOTEBOOK)
+    measured = [points(row, "measured") for row in (whole, framed)]
+    (a, a_low, a_high), (b, b_low, b_high) = measured
+    assert f"{a} % [{a_low}, {a_high}] were measured ({b} % [{b_low}, {b_high}])" in words(NOTEBOOK)
+    with (NOTEBOOK.parent / "layouts" / "layouts_cells.csv").open(encoding="utf-8") as file:
+        cells = [row for row in csv.DictReader(file) if row["scene"] == "postbox_025"]
+    rates = {
+        layout: 100 * np.mean([float(row["design"]) for row in cells if row["layout"] == layout])
+        for layout in ("whole", "framed, step 0.05")
+    }
+    row = next(
+        line for line in NOTEBOOK.read_text(encoding="utf-8").splitlines() if "letter box, MobileNet v1 0.25" in line
+    )
+    assert f"| {rates['framed, step 0.05']:.0f} | {rates['whole']:.0f} |" in row
 
 
 def test_figures_of_the_ablation_are_the_stored_ones():
