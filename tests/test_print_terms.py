@@ -93,6 +93,7 @@ def test_print_terms_reach_the_gradient_through_each_views_own_copy(tmp_path):
     (gradient,) = torch.autograd.grad(pictures.mean(), design)
     free = ~torch.tensor(marker_image(problem.patch.scene.piece, problem.patch.design_px)[1])
     assert torch.isfinite(gradient).all() and float((gradient[:, free] > 0).float().mean()) > 0.9
+    assert not gradient[:, ~free].any() and not free.all()
 
 
 def test_the_plan_names_each_print_term_and_takes_it_out(tmp_path):
