@@ -82,9 +82,9 @@ class Counted(Bright):
 def test_the_place_is_where_the_network_looks():
     """It looks at the picture's upper left quarter alone; as one faces +z, left is -x."""
     place = choose_place(open_scene())
-    x, y, z = place.at_mm
+    x, y, z = place.at
     assert x < -30 and y > 30 and z == 10 and place.front == "+z"
-    assert place.candidates[0].at_mm == place.at_mm and place.candidates[0].draft is not None
+    assert place.candidates[0].at == place.at and place.candidates[0].draft is not None
     gains = [candidate.draft for candidate in place.candidates if candidate.draft is not None]
     assert gains == sorted(gains) and gains[0] < -0.1
 
@@ -92,7 +92,7 @@ def test_the_place_is_where_the_network_looks():
 def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
     monkeypatch.setattr(places, "PLACES", 8)
     scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
-    assert choose_place(scene).at_mm[0] == 150  # azimuth 90 faces +x where 0 faces +z
+    assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
 
 
 def test_what_is_to_be_kept_free_is_kept_free(tmp_path):
@@ -125,9 +125,9 @@ def test_places_fit_are_apart_and_the_same_for_the_same_seed():
     middles = np.array([spot.placement.center_mm for spot in spots])
     distances = np.linalg.norm(middles[:, None] - middles, axis=2) + 1e9 * np.eye(len(spots))
     assert distances.min() > APART * 30 / 2
-    assert [spot.at_mm for spot in Ground(scene).spots(12)] == [spot.at_mm for spot in spots]
+    assert [spot.at for spot in Ground(scene).spots(12)] == [spot.at for spot in spots]
     other = Ground(open_scene(mesh=ball, seed=1, **small)).spots(12)
-    assert [spot.at_mm for spot in other] != [spot.at_mm for spot in spots]
+    assert [spot.at for spot in other] != [spot.at for spot in spots]
 
 
 def test_a_gap_is_no_larger_than_asked():
@@ -141,7 +141,7 @@ def test_a_piece_that_fits_only_in_one_spot_finds_it():
     """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
     size = Ground(open_scene(**SHARP)).size_mm
     spots = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP)).spots(12)
-    assert [spot for spot in spots if np.abs(spot.at_mm[:2]).max() < 4]
+    assert [spot for spot in spots if not isinstance(spot.at, str) and np.abs(spot.at[:2]).max() < 4]
 
 
 def test_upright_means_no_turns():
@@ -250,7 +250,7 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
     path, out = scene_file(tmp_path), tmp_path / "run"
     first = pp.optimize(path, out)
     place = read_place(out)
-    assert first.scene.settings.patch.at_mm == place.at_mm and (out / "place.png").stat().st_size > 500
+    assert first.scene.settings.patch.at_mm == place.at and (out / "place.png").stat().st_size > 500
     monkeypatch.setattr(run, "choose_place", no_search)
     loaded = pp.load_run(out)
     np.testing.assert_array_equal(loaded.scene.placement.world_from_piece, first.scene.placement.world_from_piece)
@@ -278,22 +278,22 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     spots = Ground(scene).spots(3)
     laid = [spot.placement for spot in spots]
     candidates = tuple(
-        places.Candidate(at_mm=s.at_mm, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
+        places.Candidate(at=s.at, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
         for s, p in zip(spots, laid, strict=True)
     )
     place = places.Place(
         sheet_id=scene.sheet_id,
         front="+z",
-        at_mm=spots[0].at_mm,
+        at=spots[0].at,
         spin_deg=0,
         lead=None,
         passes=0,
         run_share=0,
         candidates=candidates,
     )
-    save_place(place, scene.at(place.at_mm, 0), tmp_path)
+    save_place(place, scene.at(place.at, 0), tmp_path)
     assert read_place(tmp_path, scene) == place
-    picture = place_files._picture(place, scene.at(place.at_mm, 0)).getcolors(1 << 20)
+    picture = place_files._picture(place, scene.at(place.at, 0)).getcolors(1 << 20)
     shown = {color for _, color in picture}
     assert {(253, 231, 37), (33, 145, 140), (68, 1, 84), (230, 0, 90)} <= shown
 
@@ -303,4 +303,14 @@ def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_search):
     plan = plan_scene(scene_file(tmp_path), timing=False, views=2)
     assert plan.place is not None and plan.surface.family == "card"
     lines = plan_lines(plan)
-    assert f"chosen: at_mm = [{plan.place.at_mm[0]:g}" in lines[lines.index("place") + 1]
+    assert f"chosen: at_mm = [{plan.place.at[0]:g}" in lines[lines.index("place") + 1]
+
+
+def test_middles_of_sides_that_views_face_are_places_however_the_piece_stands_there():
+    scene = open_scene()
+    spots = Ground(scene).spots(12)
+    named = [spot for spot in spots if isinstance(spot.at, str)]
+    assert spots[: len(named)] == tuple(named) and scene.settings.patch.side in [spot.at for spot in named]
+    hung = scene.at(named[0].at, 0.0)
+    assert hung.settings.patch.side == named[0].at and hung.settings.view.front == scene.settings.patch.side
+    np.testing.assert_allclose(hung.placement.center_mm, named[0].placement.center_mm)

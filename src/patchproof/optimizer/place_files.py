@@ -27,7 +27,7 @@ from patchproof.render.views import cameras, near_mm, see
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import OpenScene, PatchScene
-from patchproof.scene.placement import patch_frame, spun
+from patchproof.scene.placement import patch_frame, side_frame, spun
 from patchproof.settings import BackgroundSettings
 from patchproof.strict import Refused, validated
 
@@ -110,10 +110,11 @@ def _plain(scene: PatchScene) -> tuple[PatchScene, Conditions]:
 
 def _dots(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.ndarray]]:
     """(rank from 0, candidate, 4×3 corners of its small square in the world), the worst first."""
-    half_mm = _DOT / 2 * min(scene.placement.size_mm)
+    half_mm, patch = _DOT / 2 * min(scene.placement.size_mm), scene.settings.patch
     for rank, candidate in reversed([*enumerate(place.candidates)]):
-        patch = scene.settings.patch.changed(at_mm=candidate.at_mm)
-        right, up = spun(frame := patch_frame(scene.mesh, patch), candidate.spin_deg)
+        at = candidate.at
+        frame = side_frame(scene.mesh, at) if isinstance(at, str) else patch_frame(scene.mesh, patch.changed(at_mm=at))
+        right, up = spun(frame, candidate.spin_deg)
         signs = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
         yield rank, candidate, frame.origin_mm + half_mm * signs @ np.stack([right, up])
 

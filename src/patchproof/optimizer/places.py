@@ -28,7 +28,7 @@ from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.patch_scene import At, OpenScene
 from patchproof.scene.places import APART, Ground, Spot
 from patchproof.scene.scene import Scene, needs_open
 from patchproof.settings import OptimizeSettings
@@ -49,7 +49,7 @@ class Candidate(Strict):
     `outlook` is `gray` less what the gradient promises, `draft` that of a drafted design in held-out views.
     """
 
-    at_mm: tuple[float, float, float]
+    at: At
     spin_deg: float
     family: str
     gap_mm: float
@@ -70,13 +70,14 @@ class Lead(Strict):
 
 
 class Place(Strict):
-    """The place that a search chose, as the keys `patch.at_mm`, `patch.spin_deg` and `view.front` say it. Candidates
-    run from the best to the worst. `passes` are those of each network, `run_share` is their share of a default run's.
+    """The place that a search chose, as the keys `patch.at_mm` (or `patch.side`), `patch.spin_deg` and `view.front` say
+    it. Candidates run from the best to the worst. `passes` are those of each network, `run_share` is their share of a
+    default run's.
     """
 
     sheet_id: str  # of the scene that was searched
     front: Side
-    at_mm: tuple[float, float, float]
+    at: At
     spin_deg: float
     lead: Lead | None  # None where no other place was drafted
     passes: int
@@ -103,7 +104,7 @@ def choose_place(
     on_pass: Callable[[int, int], None] = lambda done, total: None,
 ) -> Place:
     """Search the object of a scene with `patch.place = "auto"` for the piece's place; `models` and `loss` as in
-    `optimize`. `scene.at(place.at_mm, place.spin_deg)` has the piece there. Refused where there is no place at all.
+    `optimize`. `scene.at(place.at, place.spin_deg)` has the piece there. Refused where there is no place at all.
     """
     scene = needs_open(scene)
     search, ground = _Search(scene, models, loss, device, on_pass), Ground(scene)
@@ -120,7 +121,7 @@ def choose_place(
     return Place(
         sheet_id=scene.sheet_id,
         front=scene.settings.patch.side,
-        at_mm=candidates[0].at_mm,
+        at=candidates[0].at,
         spin_deg=candidates[0].spin_deg,
         lead=_lead(drafts[order[1]] - drafts[order[0]]) if len(order) > 1 else None,
         passes=search.passes,
@@ -131,8 +132,8 @@ def choose_place(
 
 def place_lines(place: Place) -> list[str]:
     """The choice for the terminal: the place as a scene file would say it, how sure it is, and what it cost."""
-    x, y, z = place.at_mm
-    where = f'at_mm = [{x:g}, {y:g}, {z:g}], spin_deg = {place.spin_deg:g}, view.front = "{place.front}"'
+    at = f'side = "{place.at}"' if isinstance(place.at, str) else f"at_mm = [{', '.join(f'{v:g}' for v in place.at)}]"
+    where = f'{at}, spin_deg = {place.spin_deg:g}, view.front = "{place.front}"'
     drafted = sum(candidate.draft is not None for candidate in place.candidates)
     cost = f"{len(place.candidates)} tried, {drafted} drafted, {place.run_share:.0%} of a default run's passes"
     if place.lead is None:
@@ -191,7 +192,7 @@ class _Search:
         hung, refusal = [], None
         for spot in spots:
             try:
-                scene = self._scene.at(spot.at_mm, spot.spin_deg)
+                scene = self._scene.at(spot.at, spot.spin_deg)
             except Refused as refused:
                 refusal = refused
                 continue
@@ -254,7 +255,7 @@ def _lead(differences: np.ndarray) -> Lead:
 def _candidate(trial: _Trial, draft_loss: float | None = None) -> Candidate:
     laid = trial.spot.placement
     return Candidate(
-        at_mm=trial.spot.at_mm,
+        at=trial.spot.at,
         spin_deg=trial.spot.spin_deg,
         family=laid.family,
         gap_mm=round(laid.gap_mm, 2),

@@ -90,7 +90,7 @@ def optimize_scene(
     if isinstance(scene, OpenScene):
         place = read_place(out, scene) if resume else None
         place = place or choose_place(scene, models=models, loss=loss, device=device, on_pass=on_place)
-        scene = scene.at(place.at_mm, place.spin_deg)
+        scene = scene.at(place.at, place.spin_deg)
     on_scene(scene)
     problem = set_problem(scene, device, models, loss)
     if not resume:

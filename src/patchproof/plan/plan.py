@@ -109,7 +109,7 @@ def plan_scene(
     scene, place = load_scene(scene_path), None
     if isinstance(scene, OpenScene):
         place = choose_place(scene, device=device, on_pass=partial(on_stage, "place"))
-        scene = scene.at(place.at_mm, place.spin_deg)
+        scene = scene.at(place.at, place.spin_deg)
     problem = set_problem(scene, device)
     other, sentence = scene.other_surface()
     design, draft = _draft(problem, on_stage)

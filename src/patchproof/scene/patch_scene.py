@@ -31,7 +31,9 @@ from patchproof.settings import SceneSettings, SearchSettings, identifying
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
-from patchproof.strict import Refused, expand
+from patchproof.strict import Refused, Side, expand
+
+At = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
 
 @dataclass(frozen=True)
@@ -141,16 +143,17 @@ class OpenScene(MeshScene):
         """As in `Scene.description`."""
         return f'{super().description()} with patch.place = "auto"'
 
-    def given(self, at_mm: tuple[float, float, float], spin_deg: float) -> SceneSettings:
+    def given(self, at: At, spin_deg: float) -> SceneSettings:
         """The settings of a scene file that gives this place itself and keeps the views."""
-        patch = {"place": "given", "search": SearchSettings(), "at_mm": at_mm, "spin_deg": spin_deg}
+        where = {"side": at} if isinstance(at, str) else {"at_mm": at}
+        patch = {"place": "given", "search": SearchSettings(), "spin_deg": spin_deg} | where
         return self.settings.changed(patch=patch, view={"front": self.settings.patch.side})
 
-    def at(self, at_mm: tuple[float, float, float], spin_deg: float) -> PatchScene:
+    def at(self, at: At, spin_deg: float) -> PatchScene:
         """The scene with its piece at a place, its views as they were; refused where the piece cannot hang there. It is
         the one of a file that gives this place itself.
         """
-        settings = self.given(at_mm, spin_deg)
+        settings = self.given(at, spin_deg)
         identity = sheet_id(identifying(settings) | dict(self.known), self.seed)
         return _with_piece(replace(self, settings=settings, sheet_id=identity))
 

@@ -9,14 +9,16 @@ Left out on purpose: what stands before a place. The networks will tell.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 
 from patchproof.scene.bend import place_bent
 from patchproof.scene.mesh_scene import camera_poses
-from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.patch_scene import At, OpenScene
 from patchproof.scene.placement import (
     WARN_GAP_SHARE,
     WARN_OVERHANG_SHARE,
@@ -29,7 +31,7 @@ from patchproof.scene.placement import (
 )
 from patchproof.scene.surface import Chart, crop, heights, net
 from patchproof.scene.texture import named_faces
-from patchproof.strict import Refused
+from patchproof.strict import Refused, Side
 
 APART = 0.5  # of the piece's shorter edge between two places
 _POOL_APART, _POOL = 0.25, 96  # the same between points that are tried, and how many at most
@@ -42,9 +44,9 @@ _SAME_SIDE = 0.97  # cosine of 15°: a point that is moved onto what faces elsew
 
 @dataclass(frozen=True)
 class Spot:
-    """A place for the piece, as the keys `at_mm` and `spin_deg` say it, and how it lies there."""
+    """A place for the piece, as the keys `at_mm` (or `side`) and `spin_deg` say it, and how it lies there."""
 
-    at_mm: tuple[float, float, float]
+    at: At
     spin_deg: float
     placement: Placement
 
@@ -59,18 +61,20 @@ class Ground:
         """At most `most` places, one spin each, at least `APART` from each other and as far as their number allows;
         refused where there is none.
         """
-        fitting = [spot for frame in self._tried if (spot := self._first(frame)) is not None]
+        sides = [spot for side in get_args(Side) if (spot := self._middle_of(side)) is not None]
+        fitting = sides + [spot for frame in self._tried if (spot := self._first(frame)) is not None]
         if not fitting:
             expected = f"a place for a piece of {self.size_mm[0]:.0f} × {self.size_mm[1]:.0f} mm that views face"
             do = "make it smaller, let it bend, or ask less of patch.search"
             raise Refused(expected, "none", do)
         middles = np.array([spot.placement.center_mm for spot in fitting])
         normals = np.array([spot.placement.normal for spot in fitting])
-        return tuple(fitting[i] for i in _spread(middles, normals, min(self.size_mm), APART, most))
+        first = range(max(len(sides), 1))
+        return tuple(fitting[i] for i in _spread(middles, normals, min(self.size_mm), APART, most, first))
 
     def turned(self, spot: Spot) -> tuple[Spot, ...]:
         """About the same place with the other spins that fit there."""
-        frame = self._frame_at(spot.at_mm)
+        frame = self._frame_at(spot.at)
         turns = (self._fitting(frame, spin) for spin in self._spins if spin != spot.spin_deg)
         return tuple(turn for turn in turns if turn is not None)
 
@@ -86,6 +90,26 @@ class Ground:
         if self.scene.settings.patch.search.upright:
             return (0.0,)
         return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
+
+    def _middle_of(self, side: Side) -> Spot | None:
+        """The middle of a side that views face, where a piece hangs that is given no other place; however far it stands
+        off there, unless that is limited.
+        """
+        frame, patch = self._frame_at(side), self.scene.settings.patch
+        if self._facing(frame.origin_mm[None], frame.normal[None])[0] < _FACING_SHARE:
+            return None
+        try:
+            laid = (place_bent if patch.bend else place_card)(self.scene.mesh, frame, self.size_mm, 0.0)
+        except Refused:
+            return None
+        fits = patch.search.gap_mm is None or laid.gap_mm <= patch.search.gap_mm
+        return Spot(side, 0.0, laid) if fits and not self._touches_forbidden(laid) else None
+
+    def _facing(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """M shares of the views that face the points M×3."""
+        eyes = _eyes(self.scene)
+        cosines = [((eye - points) * normals).sum(1) / np.linalg.norm(eye - points, axis=1) for eye in eyes]
+        return (np.array(cosines) > _FACING_COSINE).mean(0)
 
     def _first(self, frame: Frame) -> Spot | None:
         """The piece near a frame's origin, upright if it fits so, else a quarter turned."""
@@ -128,9 +152,9 @@ class Ground:
             origin = origin + x * right + y * up
         return None
 
-    def _frame_at(self, at_mm: tuple[float, float, float]) -> Frame:
+    def _frame_at(self, at: At) -> Frame:
         """The frame that a piece at a point has."""
-        return patch_frame(self.scene.mesh, self.scene.given(at_mm, 0.0).patch)
+        return patch_frame(self.scene.mesh, self.scene.given(at, 0.0).patch)
 
     @property
     def _gap_mm(self) -> float:
@@ -160,15 +184,13 @@ class Ground:
     def _tried(self) -> tuple[Frame, ...]:
         """Frames of the points that are tried, the one next to the middle of the scene's front first."""
         points, normals, _ = self._samples
-        eyes = _eyes(self.scene)
-        cosines = [((eye - points) * normals).sum(1) / np.linalg.norm(eye - points, axis=1) for eye in eyes]
-        faced = (np.array(cosines) > _FACING_COSINE).mean(0) >= _FACING_SHARE
+        faced = self._facing(points, normals) >= _FACING_SHARE
         points, normals = points[faced], normals[faced]
         if not len(points):
             return ()
         first = int(np.linalg.norm(points - self.scene.frame.origin_mm, axis=1).argmin())
         edge_mm = min(self.size_mm)
-        chosen = _spread(points, normals, edge_mm, _POOL_APART, _POOL, first)
+        chosen = _spread(points, normals, edge_mm, _POOL_APART, _POOL, [first])
         return tuple(surface_frame(self.scene.mesh, points[i], normals[i]) for i in chosen)
 
     @cached_property
@@ -203,16 +225,15 @@ def _rounded(point_mm: np.ndarray) -> tuple[float, float, float]:
 
 
 def _spread(
-    points_mm: np.ndarray, normals: np.ndarray, edge_mm: float, apart: float, most: int, first: int = 0
+    points_mm: np.ndarray, normals: np.ndarray, edge_mm: float, apart: float, most: int, first: Sequence[int]
 ) -> list[int]:
     """At most `most` of the points, each as far as can be from those before, `apart` edges at least; what faces the
     other way is as far as an edge.
     """
     rows = np.concatenate([points_mm, normals * edge_mm / 2], 1)
-    chosen, distance = [first], np.full(len(rows), np.inf)
-    while len(chosen) < most:
-        distance = np.minimum(distance, np.linalg.norm(rows - rows[chosen[-1]], axis=1))
-        if distance.max() < apart * edge_mm:
-            break
+    chosen = list(first)
+    distance = np.min([np.linalg.norm(rows - rows[i], axis=1) for i in chosen], 0)
+    while len(chosen) < most and distance.max() >= apart * edge_mm:
         chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(rows - rows[chosen[-1]], axis=1))
     return chosen
