@@ -140,8 +140,9 @@ def test_a_gap_is_no_larger_than_asked():
 def test_a_piece_that_fits_only_in_one_spot_finds_it():
     """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
     size = Ground(open_scene(**SHARP)).size_mm
-    spots = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP)).spots(12)
-    assert [spot for spot in spots if not isinstance(spot.at, str) and np.abs(spot.at[:2]).max() < 4]
+    ground = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP))
+    moved = [ground._first(frame) for frame in ground._tried]  # before middles of sides take their places
+    assert [spot for spot in moved if spot is not None and np.abs(spot.at[:2]).max() < 4]
 
 
 def test_upright_means_no_turns():
