@@ -26,7 +26,6 @@ from patchproof.bench.measure import clocked
 from patchproof.bench.methods import METHODS, load_art
 from patchproof.claims import clustered, median, paired_means
 from patchproof.experiments.patch3d import patch_cells
-from patchproof.goal import Goal
 from patchproof.journey.demo import demo_scene
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.promise import shown_with_controls
@@ -37,7 +36,7 @@ from patchproof.strict import Refused
 from patchproof.study.figures import picture_sheet
 from patchproof.study.grid import Count, GridSettings, Seeds, grouped, of_values, problem_of, who, with_tables
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
-from patchproof.study.record import hits_of, recorded
+from patchproof.study.record import gain_of, hardest, rate_of, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.workers import one_thread
 
@@ -101,16 +100,16 @@ def tables(settings: PeersSettings, results: Sequence[Result]) -> list[Table]:
 def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
     rows = []
     for name in settings.methods:
-        behind = [_gain(result, "ours", name) for result in results]
+        behind = [gain_of(result, "ours", name) for result in results]
         by_pair = [
-            float(np.mean([_gain(result, "ours", name) for result in group]))
+            float(np.mean([gain_of(result, "ours", name) for result in group]))
             for group in grouped(results, of_values("name", "network")).values()
         ]
         rows.append(
             (
                 name,
-                float(np.mean([_rate(result, name) for result in results])),
-                clustered([_gain(result, name, _best_control(result)) for result in results]),
+                float(np.mean([rate_of(result, name) for result in results])),
+                clustered([gain_of(result, name, hardest(result, CONTROLS)) for result in results]),
                 *((None, None) if name == "ours" else (clustered(behind), clustered(by_pair))),
                 float(np.mean([result.answers["passes"][name] for result in results])),
                 float(np.mean([result.answers["seconds"][name] for result in results])),
@@ -128,21 +127,8 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
 
 def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
     names = (*CONTROLS, *settings.methods)
-    rows = tuple((*who(result), *(_rate(result, name) for name in names)) for result in results)
+    rows = tuple((*who(result), *(rate_of(result, name) for name in names)) for result in results)
     return Table("cells", "Rates, cell by cell", ("object", "network", "seed", *names), rows)
-
-
-def _rate(result: Result, name: str) -> float:
-    return float(np.mean(hits_of(result.answers["hits"][name][0])))
-
-
-def _gain(result: Result, name: str, other: str) -> float:
-    """The rate of a thing over another's, in the direction of the goal."""
-    return Goal(result.cell.values["scene"]["target"]["goal"]).sign * (_rate(result, name) - _rate(result, other))
-
-
-def _best_control(result: Result) -> str:
-    return max(CONTROLS, key=lambda name: _gain(result, name, "bare"))
 
 
 def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
@@ -166,7 +152,7 @@ def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]
 def _scatter(settings: PeersSettings, results: Sequence[Result], figure: Figure) -> None:
     axes = figure.add_subplot()
     for peer in settings.peers:
-        theirs, ours = ([_rate(result, name) for result in results] for name in (peer, "ours"))
+        theirs, ours = ([rate_of(result, name) for result in results] for name in (peer, "ours"))
         axes.plot(theirs, ours, "o", label=peer, alpha=0.7)
     axes.plot([0, 1], [0, 1], color="#8a8f98", linewidth=0.8)
     axes.set_xlabel("rate of the peer")
@@ -198,7 +184,7 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
 
 def peers_chart(settings: PeersSettings, results: Sequence[Result]) -> Chart:
     """Seconds of each method, relative to ours, against the share of unseen views that its design loses."""
-    losses = np.array([[1 - _rate(result, name) for name in settings.methods] for result in results])
+    losses = np.array([[1 - rate_of(result, name) for name in settings.methods] for result in results])
     points = []
     for name, loss in zip(settings.methods, paired_means(losses), strict=True):
         seconds = [result.answers["seconds"] for result in results]

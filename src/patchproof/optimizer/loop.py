@@ -74,14 +74,10 @@ def selects(settings: OptimizeSettings, number: int) -> bool:
     return done > before or number == settings.steps
 
 
-def selections(settings: OptimizeSettings) -> int:
-    """How often that is in all steps."""
-    return sum(selects(settings, number) for number in range(1, settings.steps + 1))
-
-
 def views_seen(settings: OptimizeSettings) -> int:
     """Views that each network sees in training and selection."""
-    return settings.steps * settings.views + selections(settings) * SELECT_VIEWS
+    selections = sum(selects(settings, number) for number in range(1, settings.steps + 1))
+    return settings.steps * settings.views + selections * SELECT_VIEWS
 
 
 def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:

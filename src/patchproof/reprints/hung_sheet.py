@@ -32,8 +32,11 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.scene import PieceScene, Scene, needs_piece
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import attached_manifest, piece_pixels
+from patchproof.sheets.template import load_template
+from patchproof.sheets.write import write_sheet
 from patchproof.strict import Refused
 
 # The print is rasterized this much finer than the closest view can see. Rasterizers of pages average code values: fine
@@ -130,13 +133,23 @@ def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:
     return HungSheet(stage, manifest, sent, how.printer_for(scene), how)
 
 
-def hang_own(run: Run, photo_px: tuple[int, int] | None = None) -> HungSheet:
-    """The sheet that the run makes, for photographs of `photo_px` (by default the scene's own)."""
-    with TemporaryDirectory() as temporary:
-        pdf = Path(temporary) / "sheet.pdf"
-        manifest = sheet_of(run, pdf)
-        sent = sent_pixels(pdf, manifest, run.scene, photo_px)
-    return HungSheet(set_stage(run.scene), manifest, sent, AS_MADE.printer_for(run.scene))
+def hang_own(run: Run) -> HungSheet:
+    """The sheet that the run makes."""
+    return _printed_and_hung(set_stage(run.scene), lambda pdf: sheet_of(run, pdf))
+
+
+def hang_piece(stage: Stage, content: PrintedPiece) -> HungSheet:
+    """A sheet of the stage's scene with any content in its piece."""
+    template = load_template(stage.scene.settings.sheet.template)
+    return _printed_and_hung(stage, lambda pdf: write_sheet(pdf, template, content))
+
+
+def _printed_and_hung(stage: Stage, write: Callable[[Path], Manifest]) -> HungSheet:
+    with TemporaryDirectory() as folder:
+        pdf = Path(folder) / "sheet.pdf"
+        manifest = write(pdf)
+        sent = sent_pixels(pdf, manifest, stage.scene)
+    return HungSheet(stage, manifest, sent, AS_MADE.printer_for(stage.scene))
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
@@ -153,11 +166,9 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     return manifest, scene
 
 
-def sent_pixels(
-    pdf_path: str | Path, manifest: Manifest, scene: Scene, photo_px: tuple[int, int] | None = None
-) -> Tensor:
-    """The piece of a PDF as 1×3×H×W sRGB, with more pixels than the closest view of `photo_px` can see."""
-    finest = scene.closest_px_per_mm(photo_px or scene.settings.camera.photo_px)
+def sent_pixels(pdf_path: str | Path, manifest: Manifest, scene: Scene) -> Tensor:
+    """The piece of a PDF as 1×3×H×W sRGB, with more pixels than the closest view can see."""
+    finest = scene.closest_px_per_mm(scene.settings.camera.photo_px)
     dpi = float(np.clip(OVERSAMPLING * finest * MM_PER_INCH, *DPI_RANGE))
     return torch.tensor(piece_pixels(pdf_path, manifest, dpi)).permute(2, 0, 1)[None] / 255
 

@@ -32,13 +32,12 @@ SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule l
 @dataclass(frozen=True)
 class Part:
     """What a scene itself models and a simpler one would not: its name, the settings key that governs it, if any,
-    whether it needs whole photographs to be seen as it is, and whether the camera brings it about.
+    and whether it needs whole photographs to be seen as it is.
     """
 
     name: str
     key: str = ""
     whole: bool = False
-    camera: bool = True
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class BasePhoto:
     blur_px: float
 
 
-EVEN_LIGHT = Part("uneven light on paper", camera=False)
+EVEN_LIGHT = Part("uneven light on paper")
 OWN_BLUR = Part("photographs' own blur", whole=True)
 OWN_NOISE = Part("photographs' own noise", whole=True)
 

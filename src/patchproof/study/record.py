@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from patchproof.claims import Estimate, difference, mean, rate
+from patchproof.goal import Goal
 from patchproof.optimizer.responses import Answers
 from patchproof.study.study import Result
 
@@ -33,6 +34,21 @@ def bits(hits: Sequence[bool] | np.ndarray) -> str:
 def hits_of(text: str) -> list[bool]:
     """The hits of `bits`."""
     return [digit == "1" for digit in text]
+
+
+def rate_of(result: Result, thing: str) -> float:
+    """The rate of a shown thing before the first of its cell's networks."""
+    return float(np.mean(hits_of(result.answers["hits"][thing][0])))
+
+
+def gain_of(result: Result, thing: str, other: str) -> float:
+    """The rate of a thing over another's, in the direction of the goal of its cell's scene."""
+    return Goal(result.cell.values["scene"]["target"]["goal"]).sign * (rate_of(result, thing) - rate_of(result, other))
+
+
+def hardest(result: Result, controls: Sequence[str]) -> str:
+    """The control that is hardest to beat."""
+    return max(controls, key=lambda name: gain_of(result, name, controls[0]))
 
 
 class Record:

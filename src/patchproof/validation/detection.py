@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import cv2
@@ -33,14 +32,12 @@ from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Table
-from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, jpeg_of, sent_pixels
+from patchproof.reprints.hung_sheet import HungSheet, hang_piece, jpeg_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import load_scene, needs_patch
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import control_design
-from patchproof.sheets.template import load_template
-from patchproof.sheets.write import write_sheet
 from patchproof.strict import Refused, Share, Strict
 from patchproof.study.study import Cell, Result, Study
 
@@ -139,13 +136,8 @@ def _hung(scene_path: str, seed: int) -> tuple[HungSheet, PatchScene]:
         raise Refused("a scene of an object with a flat patch", "another one", "name a mesh and leave bend out")
     piece = scene.piece
     blank = np.zeros((240, round(240 * piece.size_mm[0] / piece.size_mm[1]), 3), np.uint8)
-    with TemporaryDirectory() as folder:
-        pdf = Path(folder) / "sheet.pdf"
-        noise = control_design("noise", blank, scene.sheet_id, piece)
-        content = PrintedPiece(piece, scene.sheet_id, "design", noise)
-        manifest = write_sheet(pdf, load_template(scene.settings.sheet.template), content)
-        sent = sent_pixels(pdf, manifest, scene)
-    return HungSheet(set_stage(scene), manifest, sent, AS_MADE.printer_for(scene)), scene
+    noise = control_design("noise", blank, scene.sheet_id, piece)
+    return hang_piece(set_stage(scene), PrintedPiece(piece, scene.sheet_id, "design", noise)), scene
 
 
 def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:

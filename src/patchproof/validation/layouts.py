@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -23,7 +22,7 @@ from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.geometry import rect_corners
+from patchproof.geometry import apply_homography, rect_corners
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.promise import CONTROLS, shown_with_controls
@@ -31,16 +30,14 @@ from patchproof.optimizer.responses import responses
 from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, sent_pixels
+from patchproof.reprints.hung_sheet import hang_piece
 from patchproof.scene.scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
 from patchproof.sheets.rects import RectMm, grown
-from patchproof.sheets.template import load_template
-from patchproof.sheets.write import write_sheet
 from patchproof.strict import Positive, Strict
 from patchproof.study.grid import Count, GridSettings, cell_of, grouped, pairs, problem_of, who, with_tables
-from patchproof.study.record import Record, recorded
+from patchproof.study.record import Record, gain_of, hardest, recorded
 from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
@@ -148,11 +145,8 @@ def _free_share(piece: Piece) -> float:
 
 def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
     """What `verify` makes of photographs of the design's sheet, and how far it is off, by photograph."""
-    with TemporaryDirectory() as folder:
-        pdf = Path(folder) / "sheet.pdf"
-        content = PrintedPiece(scene.piece, scene.sheet_id, "design", design)
-        manifest = write_sheet(pdf, load_template(scene.settings.sheet.template), content)
-        sheet = HungSheet(problem.stage, manifest, sent_pixels(pdf, manifest, scene), AS_MADE.printer_for(scene))
+    sheet = hang_piece(problem.stage, PrintedPiece(scene.piece, scene.sheet_id, "design", design))
+    manifest = sheet.manifest
     surface = surface_of(manifest)
     promised, drawn = promised_of(manifest, surface, sheet.printer), scene.draw("reprint", count)
     out: dict[str, list] = {"status": [], "error_mm": [], "uncertainty_mm": [], "delta_e00": []}
@@ -164,8 +158,7 @@ def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count
         if geometry is not None and geometry.homography_px_from_mm is not None and scene.is_flat:
             corners = rect_corners(manifest.cut_mm)
             seen = np.linalg.inv(np.array(geometry.homography_px_from_mm)) @ sheet.px_from_page(conditions)
-            homogeneous = np.column_stack([corners, np.ones(4)]) @ seen.T
-            error = float(np.linalg.norm(homogeneous[:, :2] / homogeneous[:, 2:] - corners, axis=1).max())
+            error = float(np.linalg.norm(apply_homography(seen, corners) - corners, axis=1).max())
         out["status"].append(entry.status)
         out["error_mm"].append(error)
         out["uncertainty_mm"].append(geometry and geometry.corner_uncertainty_mm)
@@ -173,16 +166,15 @@ def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count
     return out
 
 
-def gain_of(result: Result) -> float:
+def _gain(result: Result) -> float:
     """The design's rate over that of its best control."""
-    rates = {thing: np.mean([digit == "1" for digit in hits[0]]) for thing, hits in result.answers["hits"].items()}
-    return float(rates.pop("design") - max(rates.values()))
+    return gain_of(result, "design", hardest(result, CONTROLS))
 
 
 def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Table]:
     """Costs and gains by layout, and every cell."""
     by_layout = grouped(results, lambda result: result.cell.values["layout"])
-    first = {who(result): gain_of(result) for result in next(iter(by_layout.values()))}
+    first = {who(result): _gain(result) for result in next(iter(by_layout.values()))}
     rows = [(name, *_figures(group, first)) for name, group in by_layout.items()]
     head = ("layout", "share for the design", "gain over the best control", "beside the first layout")
     head = (*head, "identified", "measured", "corner error, mm", "uncertainty holds", "ΔE00")
@@ -194,7 +186,7 @@ def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Tab
         (
             *who(r),
             r.cell.values["layout"],
-            gain_of(r),
+            _gain(r),
             *(Record([r], thing).level()[0] for thing in ("design", *CONTROLS)),
         )
         for r in results
@@ -216,10 +208,10 @@ def _figures(group: Sequence[Result], first: dict) -> tuple:
         if word == "measured"
     ]
     errors = [(m["error_mm"], m["uncertainty_mm"]) for m in measured if m["error_mm"] is not None]
-    beside = [gain_of(result) - first[who(result)] for result in group if who(result) in first]
+    beside = [_gain(result) - first[who(result)] for result in group if who(result) in first]
     return (
         float(np.mean([result.answers["free"] for result in group])),
-        _mean_or_single([gain_of(result) for result in group]),
+        _mean_or_single([_gain(result) for result in group]),
         _mean_or_single(beside),
         rate([word != "rejected" for word in status]),
         rate([word == "measured" for word in status]),
