@@ -193,7 +193,7 @@ def test_paper_and_ink_go_where_they_were_promised():
 
 
 def test_markers_that_blur_made_larger_are_neither_noise_nor_an_error():
-    """Three markers of a tilted sheet whose borders all lie 0.3 px too far out: the hidden corner stays in its place."""
+    """Three markers of a tilted sheet whose borders all lie 0.3 px too far out: the hidden corner stays put."""
     truth = np.array([[4.0, 0.6, 300], [-0.4, 3.5, 200], [1e-3, 4e-4, 1]])
     places = {1: (3, 3), 2: (127, 3), 3: (127, 127)}
     mm = {i: np.array([[0, 0], [20, 0], [20, 20], [0, 20.0]]) + at for i, at in places.items()}
