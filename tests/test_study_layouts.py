@@ -52,10 +52,13 @@ def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch):
     config = tmp_path / "study.toml"
     config.write_text(
         'scenes = ["scene.toml"]\nn = 8\nphotos = 2\n[layouts.whole]\n[layouts.framed]\nmarkers = 8\nframed = true\n'
+        "[layouts.smaller.scene.patch]\nwidth_mm = 80\nheight_mm = 80\n"
+        '[layouts.anywhere.scene.patch]\nplace = "auto"\n'
     )
     finished = run_study("layouts", config, tmp_path / "out")
     assert not finished.failed
-    (whole, framed), (first, second) = finished.tables[0].rows, finished.results
+    (whole, framed, smaller, _), (first, second, *_) = finished.tables[0].rows, finished.results
     assert whole[0] == "whole" and whole[1] > framed[1] > 0.2
+    assert smaller[1] < whole[1]  # markers do not shrink with the piece
     assert first.answers["status"] == ["measured"] * 2 and max(first.answers["error_mm"]) < 0.5
     assert len(second.answers["hits"]["design"][0]) == 8 and (tmp_path / "out" / "layouts.html").is_file()

@@ -1,10 +1,11 @@
 """What a piece's layout costs in recognition, and what it buys in finding and measuring the sheet.
 
 In: scene files, networks, seeds and layouts: how many markers, how large, with how much white round them, with the
-design all over the piece or in a frame of markers. Per cell a design is trained in that layout and shown, beside the
-controls, under unseen conditions; then its sheet is printed, hung up, photographed, found and measured against the
-renderer's truth. All layouts of a scene, network and seed share their draws; intervals are over such groups, since each
-design has its own luck.
+design all over the piece or in a frame of markers, and whatever else of the scene file changes: the piece's size or
+place, how it is trained. Per cell a design is trained in that layout and shown, beside the controls, under unseen
+conditions; then its sheet is printed, hung up, photographed, found and measured against the renderer's truth. All
+layouts of a scene, network and seed share their draws; intervals are over such groups, since each design has its own
+luck.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,19 +25,31 @@ from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.places import choose_place
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.output import image_pixels
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
 from patchproof.reprints.hung_sheet import hang_piece
+from patchproof.scene.patch_scene import OpenScene
 from patchproof.scene.scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
 from patchproof.sheets.rects import RectMm, grown
 from patchproof.strict import Positive, Strict
-from patchproof.study.grid import Count, GridSettings, cell_of, grouped, pairs, problem_of, who, with_tables
+from patchproof.study.grid import (
+    Count,
+    GridSettings,
+    cell_of,
+    grouped,
+    networks_at,
+    pairs,
+    scene_of,
+    who,
+    with_tables,
+)
 from patchproof.study.record import Record, gain_of, hardest, recorded
 from patchproof.study.study import Cell, Result, Study
 
@@ -51,7 +64,7 @@ class Layout(Strict):
     size: Positive = 1.0  # of the markers that the scene's views ask for
     quiet: Positive = 1.0  # modules of white between a marker and the design
     framed: bool = False  # the design inside a frame of markers, all of which is white
-    optimize: dict[str, Any] = Field(default_factory=dict)  # keys of the scene's [optimize] that change with it
+    scene: dict[str, dict[str, Any]] = Field(default_factory=dict)  # tables of the scene file, keys that change with it
 
 
 _LAYOUTS = {
@@ -69,7 +82,7 @@ class LayoutsSettings(GridSettings):
 
     layouts: dict[str, Layout] = Field(_LAYOUTS, min_length=1)  # by name; the others are compared with the first
     n: Count = 400  # unseen conditions that measure
-    photos: Count = 40  # of each design's sheet
+    photos: Annotated[int, Field(ge=0)] = 40  # of each design's sheet
 
 
 @dataclass(frozen=True)
@@ -109,7 +122,7 @@ def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed a cell per layout."""
     return [
         cell_of(
-            with_tables(values, {"optimize": layout.optimize}) | {"layout": name, "how": layout.model_dump()},
+            with_tables(values, layout.scene) | {"layout": name, "how": layout.model_dump()},
             seed,
             values["network"],
             name,
@@ -121,8 +134,8 @@ def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
 
 
 def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train, show and photograph."""
-    problem = problem_of(base, cell.values)
+    """Train, at a place that is searched where the scene asks for it; show and photograph."""
+    problem = _problem(base, cell)
     scene = laid_out(needs_patch(problem.scene), Layout(**cell.values["how"]))
     patch = replace(problem.patch, scene=scene)
     problem = replace(problem, scene=scene, stage=replace(problem.stage, scene=scene), subject=patch)
@@ -132,6 +145,14 @@ def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     return (
         recorded(answers) | {"free": _free_share(scene.piece)} | _photographed(problem, scene, design, settings.photos)
     )
+
+
+def _problem(base: Path, cell: Cell) -> Problem:
+    scene, networks = scene_of(base, cell.values), networks_at(base, cell.values)
+    if isinstance(scene, OpenScene):
+        place = choose_place(scene, models=networks)
+        scene = scene.at(place.at, place.spin_deg)
+    return set_problem(scene, models=networks)
 
 
 def _free_share(piece: Piece) -> float:
@@ -227,8 +248,10 @@ def _mean_or_single(values: Sequence[float]) -> Estimate | float | None:
 
 
 def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Drawing]:
-    """Recognition against measured photographs."""
+    """Recognition against measured photographs, where there are any."""
     table = tables(settings, results)[0]
+    if not settings.photos:
+        return []
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
