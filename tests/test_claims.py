@@ -11,7 +11,6 @@ from patchproof.claims import (
     median,
     paired_difference,
     paired_means,
-    prediction_interval,
     wilson,
 )
 
@@ -102,25 +101,6 @@ def test_mcnemar_by_hand():
     assert mcnemar_p(*pairs(5, 0, 0, 5)) == 1
     assert mcnemar_p(*pairs(5, 6, 0, 5)) == pytest.approx(2 / 2**6)
     assert mcnemar_p(*pairs(3, 9, 1, 7)) == pytest.approx(2 * (1 + 10) / 2**10)
-
-
-def test_prediction_interval_covers_new_photographs():
-    """Rates from the prior, 400 promise images, 20 photographs: the count falls inside at least 95 times in 100."""
-    rng = np.random.default_rng(0)
-    rates = rng.beta(0.5, 0.5, 4000)
-    seen, photos = rng.binomial(400, rates), rng.binomial(20, rates)
-    bounds = {k: prediction_interval(int(k), 400, 20) for k in np.unique(seen)}
-    inside = np.mean([bounds[k][0] <= photo <= bounds[k][1] for k, photo in zip(seen, photos, strict=True)])
-    assert 0.95 <= inside < 0.995  # whole counts cannot meet 95 % exactly from above
-
-
-def test_prediction_interval_is_wider_than_wilson_and_knows_the_ends():
-    low, high = prediction_interval(320, 400, 20)
-    assert low / 20 < wilson(320, 400)[0] and high / 20 > wilson(320, 400)[1]
-    assert prediction_interval(0, 400, 20)[0] == 0 and prediction_interval(400, 400, 20)[1] == 20
-    assert prediction_interval(0, 0, 5) == (0, 5)
-    assert prediction_interval(80, 400, 20) == tuple(20 - k for k in reversed(prediction_interval(320, 400, 20)))
-    assert all(isinstance(k, int) for k in prediction_interval(320, 400, 20))
 
 
 def test_intervals_of_medians_are_order_statistics():

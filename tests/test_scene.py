@@ -88,10 +88,10 @@ def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(t
         ("[500, 900]", "[50, 90]", r"cameras outside the object"),
         ("[-40, 40]", "[180, 180]", r"views from which the patch can be seen"),
         ("[view]", "[veiw]", r'did you mean "view"'),
-        ("[optimize]", '[background]\nimages = "nowhere"\n[optimize]', r"folder of pictures.*nowhere"),
+        ("color = [0.5, 0.5, 0.5]", 'images = "nowhere"', r"folder of pictures.*nowhere"),
         (
-            "[optimize]",
-            '[background]\nimages = "${NO_SUCH_VARIABLE}"\n[optimize]',
+            "color = [0.5, 0.5, 0.5]",
+            'images = "${NO_SUCH_VARIABLE}"',
             r"environment variable NO_SUCH_VARIABLE",
         ),
         ("steps = 3", "steps = 0", r"optimize\.steps"),
@@ -134,7 +134,7 @@ def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
 def test_the_square_is_the_middle_of_the_photograph(tmp_path):
     """The classifier's square rendered directly, and cut out of the full photograph at the same pixels."""
     text = SCENE.replace("[800, 600]", "[400, 300]" + QUIET).replace(
-        "[optimize]", '[background]\nimages = "backgrounds"\n[optimize]'
+        "color = [0.5, 0.5, 0.5]", 'images = "backgrounds"'
     )
     (tmp_path / "backgrounds").mkdir()
     from PIL import Image

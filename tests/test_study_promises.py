@@ -5,18 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from patchproof.claims import prediction_interval
 from patchproof.optimizer import loop, run
+from patchproof.sessions import spread_of
 from patchproof.study.study import Cell, Result, run_study
 from patchproof.validation import promises
 from test_optimize import SCENE
 
 
-def count(rate, recognized, judged=40, n=400):
-    return {"rate": rate, "n": n, "judged": judged, "recognized": recognized, "verdict": "kept"}
-
-
-def result(scene, one):
+def result(scene, *sessions, hits=320, n=400):
+    """A run whose promise drew every condition anew."""
     values = {
         "name": scene,
         "networks": ["builtin"],
@@ -24,23 +21,27 @@ def result(scene, one):
         "scene": {"printer": {"profile": "coated"}},
         "seed": 0,
     }
-    return Result(Cell(f"{scene}{one['recognized']}", values), one, Path())
+    found = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "sessions": sessions, "verdict": "kept"}
+    return Result(Cell(f"{scene}{sessions}", values), found, Path())
 
 
 def test_an_interval_holds_up_to_its_ends_and_not_beyond():
-    low, high = prediction_interval(320, 400, 40)
-    assert [promises.held(count(0.8, hits)) for hits in (low - 1, low, high, high + 1)] == [False, True, True, False]
-    assert promises.interval_of(count(0.8, 0)) == (low, high)
+    low, high = spread_of([1] * 320 + [0] * 80, [1] * 400).counts([40])
+    sessions = promises.counted(result("a", *((hits, 40) for hits in (low - 1, low, high, high + 1)), (0, 0)))
+    assert [session.held() for session in sessions] == [False, True, True, False]
+    assert sessions[0].interval() == (low, high) == sessions[0].interval(alone=True)
 
 
 def test_shares_and_biases_by_hand():
     settings = promises.PromisesSettings(scenes=("a", "b"), networks=("builtin",))
-    low = [result("a", count(0.8, hits)) for hits in (20, 21, 22)]  # promised too much
-    fair = [result("b", count(0.8, hits)) for hits in (31, 32, 33)]
+    low = [result("a", (20, 40), (21, 40)), result("a", (22, 40))]  # promised too much
+    fair = [result("b", *((hits, 40) for hits in (31, 32, 33)))]
     held, each = promises.tables(settings, low + fair)
     assert [(row[0], row[1].value, row[1].n) for row in held.rows] == [("a", 0, 3), ("b", 1, 3), ("all", 0.5, 6)]
-    assert held.rows[0][3].value == pytest.approx(21 / 40 - 0.8)
+    assert held.rows[0][6].value == pytest.approx((20.5 + 22) / 80 - 0.8) and held.rows[0][3] is None
     assert len(each.rows) == 6
+    many = promises.tables(settings, [result("a", *((20 + i % 20, 40) for i in range(40)))])[0]
+    assert many.rows[0][3] == pytest.approx(19 / 40, abs=0.01)
 
 
 def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
@@ -55,13 +56,11 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     ]
     (tmp_path / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
     names = 'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\n'
-    (tmp_path / "study.toml").write_text(names + "photos = 10\npath_traced = false\n")
+    (tmp_path / "study.toml").write_text(names + "sessions = 2\nphotos = 5\npath_traced = false\n")
     finished = run_study("promises", tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
     (one,) = finished.results
-    assert (
-        one.answers["n"] == 16
-        and one.answers["judged"] <= 10
-        and 0 <= one.answers["recognized"] <= one.answers["judged"]
-    )
-    assert (tmp_path / "out" / "promises_calibration.png").is_file() or not one.answers["judged"]
+    assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == 6
+    judged = [judged for _, judged in one.answers["sessions"]]
+    assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])
+    assert (tmp_path / "out" / "promises_calibration.png").is_file()

@@ -147,7 +147,7 @@ class Deadly:
 
 def test_a_photograph_that_ends_its_process_each_time_is_rejected_and_the_others_go_on(folder):
     task = task_of(make_manifest(promise()), Options([NET], identity_printer()), None)
-    items = [batch.Item(path) for path in sorted(folder.iterdir())]
+    items = [batch.Item(path, path.name) for path in sorted(folder.iterdir())]
     photos = batch.measure_all(task, items, None, Deadly(), None, lambda *_: None, lambda *_: None)
     codes = {photo.entry.file: (photo.entry.status, photo.entry.code) for photo in photos}
     assert codes.pop("b2.jpg") == ("rejected", "unreadable") and codes.pop("a.JPG") == ("rejected", "unreadable")

@@ -2,45 +2,93 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from patchproof.claims import prediction_interval
 from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
 from patchproof.evidence.results import Geometry, PhotoEntry, Pose
-from patchproof.evidence.verdict import compare, effect_of, judge
+from patchproof.evidence.verdict import asked_rate, compare, effect_of, judge, kept_chance
 from patchproof.goal import Goal
-from patchproof.sheets.manifest import ConditionClaim
+from patchproof.sheets.manifest import ConditionClaim, Promise
 from test_photo_synthetic import make_manifest
 
 
-def test_the_rule_at_both_sides_of_the_interval():
-    low, high = prediction_interval(360, 400, 40)
-    assert (low, high) == (32, 39)  # mean 36, standard deviation √(40 · 0.9 · 0.1 · 441/402) = 1.99
-    assert judge(32, 40, 0.9, 400, Goal.assist, 0).verdict == "kept"
-    assert judge(31, 40, 0.9, 400, Goal.assist, 0).verdict == "broken"
-    assert judge(40, 40, 0.9, 400, Goal.assist, 0).verdict == "kept"
+def promise_of(rate: float, control: float = 0.0, goal: str = "assist", correlation: float = 0.0) -> Promise:
+    """A promise of 100 sessions of 6, whose rates are drawn from the beta distribution with that correlation."""
+    hits = [i < 600 * rate for i in range(600)]
+    if correlation:
+        strength, rng = 1 / correlation - 1, np.random.default_rng(5)
+        hits = (rng.random((100, 6)) < rng.beta(rate * strength, (1 - rate) * strength, (100, 1))).ravel().tolist()
+        rate = float(np.mean(hits))
+    claim = dict(interval=(0, 1), confidence=0.5)
+    empty = dict(px_per_mm=None, tilt_deg=None, azimuth_deg=None, contrast=None, blur_px=None)
+    return Promise(
+        target=dict(label="jeep", indices=(1,), goal=goal),
+        models=[dict(name="m", sha256=None, rate=rate, **claim)],
+        rate=rate,
+        interval=(0, 1),
+        n=600,
+        per_session=6 if correlation else 1,
+        controls={"bare": dict(rate=control, difference=rate - control, difference_interval=(-1, 1), **claim)},
+        conditions=[dict(recognized=hit, **empty) for hit in hits],
+    )
 
 
-def test_a_wide_interval_cannot_tell_but_can_still_break():
-    # 6 photographs at 0.8: k_lo = 2, and 2/6 lies below 0.8 - 0.2
-    low, _ = prediction_interval(320, 400, 6)
-    assert low / 6 < 0.6
-    assert judge(6, 6, 0.8, 400, Goal.assist, 0).verdict == "cannot_tell"
-    assert judge(low - 1, 6, 0.8, 400, Goal.assist, 0).verdict == "broken"
+def word(recognized: int, photos: tuple[int, ...], promise: Promise, without: int = 0) -> str:
+    return judge(recognized, photos, promise, without).verdict
+
+
+def test_the_rule_at_both_ends_of_the_interval():
+    low, high = prediction = promise_of(0.9).spread.counts((40,))
+    assert prediction == judge(36, (40,), promise_of(0.9)).prediction_interval and low < 36 < high
+    assert word(low - 1, (40,), promise_of(0.9)) == "broken"
+    assert word(low, (40,), promise_of(0.9)) == "cannot_tell"  # allowed for, and no proof
+    assert word(36, (40,), promise_of(0.9)) == word(40, (40,), promise_of(0.9)) == "kept"
+
+
+@pytest.mark.parametrize(
+    ("recognized", "photos", "rate", "control"), [(0, 40, 0.0875, 0.05), (1, 5, 0.2, 0.1), (40, 40, 0.9, 0.93)]
+)
+def test_what_proves_nothing_keeps_no_promise(recognized, photos, rate, control):
+    """None of 40 at 8.75 % promised; one of five at 20 %; all of 40 where the bare object is as good."""
+    assert word(recognized, (photos,), promise_of(rate, control)) == "cannot_tell"
+
+
+def test_a_rate_too_low_is_rarely_called_kept_and_the_promised_one_mostly():
+    """40 photographs in 4 sessions, 85 % promised; true rates of 85, 75, 70 and 65 %."""
+    rng, promise, photos = np.random.default_rng(0), promise_of(0.85, 0.3, correlation=0.05), (10,) * 4
+    words = [word(count, photos, promise) for count in range(41)]
+    for rate, most in ((0.75, 0.30), (0.70, 0.11), (0.65, 0.04)):
+        counts = rng.binomial(10, rng.beta(19 * rate, 19 * (1 - rate), (4000, 4))).sum(1)
+        assert np.mean([words[count] == "kept" for count in counts]) <= most
+    counts = rng.binomial(10, rng.beta(19 * 0.85, 19 * 0.15, (4000, 4))).sum(1)
+    assert np.mean([words[count] == "kept" for count in counts]) >= 0.60
+    assert kept_chance(promise, photos) == pytest.approx(
+        np.mean([words[c] == "kept" for c in counts]), abs=0.12
+    )  # which knows rate and spread
+
+
+def test_photographs_in_one_place_prove_less():
+    promise = promise_of(0.85, 0.3, correlation=0.2)
+    chances = [kept_chance(promise, photos) for photos in ((40,), (10,) * 4, (5,) * 8)]
+    assert chances == sorted(chances) and chances[0] < 0.4 < chances[2]
+    assert "other places" in judge(33, (40,), promise).reason
 
 
 def test_deceive_is_the_mirror_image_of_assist():
     for k in range(41):
-        assert judge(k, 40, 0.9, 400, Goal.assist, 0).verdict == judge(40 - k, 40, 0.1, 400, Goal.deceive, 0).verdict
+        mirrored = promise_of(0.1, 1.0, "deceive")
+        assert word(k, (40,), promise_of(0.9)) == word(40 - k, (40,), mirrored)
+    assert asked_rate(promise_of(0.1, 0.2, "deceive")) == pytest.approx(0.2)
 
 
 def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
-    assert judge(0, 4, 0.9, 400, Goal.assist, 0).verdict == "cannot_tell"
-    assert judge(0, 5, 0.9, 400, Goal.assist, 0).verdict == "broken"
-    assert judge(0, 0, 0.9, 400, Goal.assist, 0).prediction_interval is None
+    assert word(0, (4,), promise_of(0.9)) == "cannot_tell"
+    assert word(0, (5,), promise_of(0.9)) == "broken"
+    assert judge(0, (), promise_of(0.9)).prediction_interval is None
     # 4 of 40 readable ones are 10 %, 5 of 41 are more
-    assert judge(36, 36, 0.9, 400, Goal.assist, 4).verdict == "kept"
-    assert judge(36, 36, 0.9, 400, Goal.assist, 5).verdict == "cannot_tell"
+    assert word(36, (36,), promise_of(0.9), 4) == "kept"
+    assert word(36, (36,), promise_of(0.9), 5) == "cannot_tell"
 
 
 def test_pairs_by_file_name_go_to_mcnemar():
@@ -53,6 +101,13 @@ def test_pairs_by_file_name_go_to_mcnemar():
     assert compare(control, "bare", patch, Goal.deceive).shown
     control["4.jpg"] = True  # five pairs: 0.0625
     assert not compare(patch, "bare", control, Goal.assist).shown
+
+
+def test_a_few_names_that_happen_to_be_equal_are_no_pairs():
+    patch = {f"a{i}.jpg": True for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
+    control = {f"b{i}.jpg": False for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
+    assert compare(patch, "bare", control, Goal.assist).pairs == 0
+    assert compare(patch, "bare", control, Goal.assist).shown
 
 
 def test_different_names_go_to_newcombe():

@@ -23,7 +23,7 @@ from patchproof.render.pixels import ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see
-from patchproof.scene.conditions import with_poses_of, with_values
+from patchproof.scene.conditions import draw, with_poses_of, with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import marker_image
 from patchproof.strict import Refused
@@ -49,7 +49,7 @@ def box_scene(folder, *changes, **more):
 
 def posed(scene, n=1, **values):
     """`n` draws with the middle of each range, at these values."""
-    drawn = scene.draw("promise", n)
+    drawn = draw(scene.settings, "promise", n, scene.seed)
     still = {"roll_deg": 0, "elevation_deg": 0, "azimuth_deg": 0, "distance_mm": 700, "look_at_offset": 0} | values
     return with_values(drawn, **still)
 
@@ -210,7 +210,7 @@ def test_edges_in_small_pictures_are_those_of_reduced_photographs(tmp_path):
     """A black piece on a pale object: what reduces a photograph averages its code values, and so does an edge. Blending
     light there, as before the lens, is 0.09 off in the mean square.
     """
-    scene = box_scene(tmp_path, ("[800, 600]", "[1600, 1200]"), tables="[background]\ncolor = [0.9, 0.9, 0.9]\n")
+    scene = box_scene(tmp_path, ("[800, 600]", "[1600, 1200]"), ("[0.5, 0.5, 0.5]", "[0.9, 0.9, 0.9]"))
     stage, black = set_stage(scene), replace(WHITE, srgb=torch.zeros(64, 64, 3))
     conditions = posed(scene, 2, azimuth_deg=[20, -40], roll_deg=[10, 45], blur_px=0, noise=0)
     share = shares(see(stage, black, conditions, (192, 192)), 2, 192)

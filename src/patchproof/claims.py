@@ -1,10 +1,9 @@
 """Intervals and promises: what a count of recognized images allows one to claim.
 
-In: counts and figures. Out: intervals, or counts for prediction intervals, and `Estimate`s for tables; all at 95 %
-unless told otherwise.
-A rate from n images gets a Wilson interval. What n *new* photographs may show is wider, since they have noise of
-their own: a beta-binomial prediction interval with the Jeffreys prior Beta(1/2, 1/2). Differences on the same
-conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10, applies.
+In: counts and figures. Out: intervals and `Estimate`s for tables; all at 95 % unless told otherwise.
+A rate from n images gets a Wilson interval; what photographs of new sessions may show is said by `sessions`.
+Differences on the same conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10,
+applies.
 Left out on purpose: corrections for looking more than once. The promise set is looked at once.
 
 Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
@@ -17,7 +16,6 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -92,16 +90,6 @@ def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[floa
     half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n)) / (1 + z * z / n)
     # at 0 and n the formula gives exactly 0 and 1 but for rounding
     return (0.0 if successes == 0 else center - half), (1.0 if successes == n else center + half)
-
-
-@lru_cache(maxsize=4096)
-def prediction_interval(successes: int, n: int, photos: int) -> tuple[int, int]:
-    """Counts [lo, hi] that `photos` new images will show, after `successes` of `n`."""
-    from scipy.stats import betabinom
-
-    predictive = betabinom(photos, successes + 0.5, n - successes + 0.5)
-    tail = (1 - CONFIDENCE) / 2
-    return int(predictive.ppf(tail)), int(predictive.ppf(1 - tail))
 
 
 def paired_difference(a: list[bool], b: list[bool]) -> tuple[float, tuple[float, float]]:

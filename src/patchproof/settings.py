@@ -156,6 +156,9 @@ class LightSettings(Strict):
 
     ambient: NotNegativeRange = (0.3, 0.7)  # light from everywhere
     directional: NotNegativeRange = (0.2, 0.8)  # light from one far side, on a surface that faces it
+    # Where the sun and lamps may stand, from the scene's front: behind it, nothing on a patch there could be seen.
+    azimuth_deg: Range = (-90.0, 90.0)  # of the sun and lamps about the vertical
+    elevation_deg: Annotated[Range, within(-90, 90)] = (10.0, 80.0)  # of the sun and lamps above the horizontal
     point: NotNegativeRange = (0.0, 0.0)  # a lamp's light on the patch's middle where it faces the lamp
     point_distance_mm: PositiveRange = (300.0, 2000.0)  # of the lamp from the patch's middle
     sh2: ShareRange = (0.0, 0.0)  # standard deviation of the ambient light over directions, share of its mean
@@ -164,9 +167,10 @@ class LightSettings(Strict):
 
 
 class BackgroundSettings(Strict):
-    """Photographs behind the object, or one plain color."""
+    """What is behind the object; procedural places where nothing is given."""
 
-    images: str | None = None  # a folder of photographs
+    # A folder of photographs, each for one of training, selection, promise and evaluation; a picture: the known place.
+    images: str | None = None
     color: tuple[Share, Share, Share] | None = None  # sRGB
     erasing: Share = 0.5  # chance that a random box is erased in training, in a folder of images
 

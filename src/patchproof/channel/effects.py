@@ -1,5 +1,9 @@
 """What views differ by: four records of drawn values, and one table of the effects that fill them.
 
+Two levels: what is one and the same for all photographs of a session (the print, its paper, the lamp, the camera and
+its lens, the place) and what each photograph has of its own (where the camera stands, its exposure, blur and noise,
+where in the place). A session here is what one person does in one go with one print.
+
 A record's fields are arrays of one row per view in physical units; what is not given is off (no blur, white paper), and
 a single row stands for all views. `EFFECTS` says of each effect how the scene's settings and numbers in [0, 1) become
 its fields; its first field is its strength, and at the record's default the effect is off. `plan` and the ablation
@@ -13,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from typing_extensions import Self
@@ -21,8 +25,6 @@ from typing_extensions import Self
 from patchproof.color import tinted_white
 from patchproof.settings import SceneSettings
 
-# The sun and lamps stand within these angles of the scene's front: from behind, nothing on a patch there could be seen.
-_AZIMUTH_DEG, _ELEVATION_DEG = (-90.0, 90.0), (10.0, 80.0)
 _UNIT = (0.0, 1.0)
 # Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
 _NORMAL_MARGIN = 1e-3
@@ -129,7 +131,9 @@ class Effect:
     "table.name" that has it; they fill the fields of the same names, or are `made` into the fields `into`. `first` is
     where they stand in the draws that the oldest effects share.
 
-    `switch` is False of what no picture can be without. `instead` makes the light that stands in for a light left out.
+    `anew` are the columns that every photograph has of its own ("all", or by name); the others are drawn once a
+    session. `switch` is False of what no picture can be without. `instead` makes the light that stands in for a light
+    left out.
     """
 
     name: str
@@ -137,6 +141,7 @@ class Effect:
     first: int | None = None
     into: tuple[str, ...] = ()
     made: Callable[..., np.ndarray | tuple[np.ndarray, ...]] = lambda *columns: columns
+    anew: tuple[str, ...] | Literal["all"] = ()
     switch: bool = True
     instead: Callable[[Any, Facing], Rows] | None = None
     whole: bool = False  # whether it takes whole photographs to be seen as it is
@@ -163,6 +168,11 @@ class Effect:
             return value
         end = _ENDS[source](value)
         return -end, end
+
+    @property
+    def shared(self) -> list[bool]:
+        """Of each column, whether all photographs of a session have it in common."""
+        return [self.anew != "all" and name not in self.anew for name in self.columns]
 
     def sample(self, settings: SceneSettings, unit: np.ndarray, number: np.ndarray) -> dict[str, np.ndarray]:
         """Its fields for N views with numbers N×columns in [0, 1); without columns, the views' own `number` N."""
@@ -238,17 +248,19 @@ def _units(*names: str) -> dict[str, tuple[float, float]]:
 
 
 _VIEW = {name: f"view.{name}" for name in ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg")}
+_PLACE = _units("picture", "size", "x", "y", "mirrored")
 _JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
 _BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
-_SUN = {"light_azimuth_deg": _AZIMUTH_DEG, "light_elevation_deg": _ELEVATION_DEG}
-_LAMP = {"point": "light.point", "point_azimuth_deg": _AZIMUTH_DEG, "point_elevation_deg": _ELEVATION_DEG}
+_SUN = {"light_azimuth_deg": "light.azimuth_deg", "light_elevation_deg": "light.elevation_deg"}
+_LAMP = {"point": "light.point", "point_azimuth_deg": "light.azimuth_deg"}
+_LAMP |= {"point_elevation_deg": "light.elevation_deg"}
 _LAMP_MM = {"point_distance_mm": "light.point_distance_mm"}
 _SHIFT = {"length": "printer.misregistration_mm"} | _units("red", "blue")
 _SH2 = {"sh2": "light.sh2"} | _units(*(f"coefficient {i}" for i in range(8)))
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, switch=False),
-    Effect("background", _units("picture", "size", "x", "y", "mirrored"), 11, ("background",), _stacked, switch=False),
+    Effect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, anew="all", switch=False),
+    Effect("background", _PLACE, 11, ("background",), _stacked, anew=("x", "y"), switch=False),
     Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
     Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
     Effect("lamp", _LAMP | _LAMP_MM, 25, instead=_even_for_lamp),
@@ -260,12 +272,12 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), tinted_white),
     Effect("misregistration", _SHIFT, 45, ("misregistration_mm",), _shifts),
     Effect("print scale", {"printed_scale": "printer.scale"}, 48),
-    Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16),
+    Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, anew="all"),
     Effect("white balance", _BALANCE, 17, ("white_balance",), _gains),
     Effect("vignetting", {"vignetting": "camera.vignetting"}, 42),
-    Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, whole=True),
-    Effect("blur", {"blur_px": "camera.blur_px"}, 19, whole=True),
-    Effect("noise", {"noise": "camera.noise"}, 20, whole=True),
+    Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, anew="all", whole=True),
+    Effect("blur", {"blur_px": "camera.blur_px"}, 19, anew="all", whole=True),
+    Effect("noise", {"noise": "camera.noise"}, 20, anew="all", whole=True),
     Effect("grain", {}, 25, ("noise_seed",), switch=False),
     Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, ("jpeg",), _whole, whole=True),
 )

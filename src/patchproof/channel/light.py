@@ -30,6 +30,7 @@ _C1, _C2, _C3, _C5 = 0.429043, 0.511664, 0.743125, 0.247708
 # Mean square of irradiance over directions and over coefficients of unit variance: A1²·3/4π + A2²·5/4π with
 # A1 = 2π/3, A2 = π/4. Dividing by its root makes `sh2` the standard deviation of the ambient light, as a share of it.
 _SPREAD = (np.pi / 3 + 5 * np.pi / 64) ** 0.5
+PAPER_REFLECTANCE = 0.85  # of white paper, whose light is 1: what a highlight takes, the print under it loses
 _NEAREST_MM = 1.0  # nearer to a lamp, light no longer grows
 
 

@@ -170,6 +170,9 @@ def reprint(
     run: Annotated[Path, typer.Option(help="The run it was made from.")],
     n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
     out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
+    sessions: Annotated[
+        int, typer.Option(min=1, help="Places to take them in, each with its light, camera and folder.")
+    ] = 1,
     seed: Seed = None,
     printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
     print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
@@ -205,6 +208,7 @@ def reprint(
                 n,
                 out,
                 how,
+                sessions=sessions,
                 seed=seed,
                 overwrite=overwrite,
                 jobs=jobs,
@@ -215,7 +219,7 @@ def reprint(
 
 
 def verify(
-    photos: Annotated[Path, typer.Argument(help="A folder of photographs.")],
+    photos: Annotated[Path, typer.Argument(help="A folder of photographs, or of folders: one for each place.")],
     sheet: Annotated[Path, typer.Option(help="The manifest that was written beside the PDF.")],
     out: Annotated[Path, typer.Option(help="Folder for the report.")],
     models: Models = None,

@@ -41,16 +41,19 @@ _DIED = "measuring it ended its process each time, for want of memory: save it s
 
 @dataclass(frozen=True)
 class Item:
-    """A photograph to look at, the control that it shows (None: the patch), and whether pictures of it are wanted."""
+    """A photograph to look at, its name in the report, the control that it shows (None: the patch), and whether
+    pictures of it are wanted.
+    """
 
     path: Path
+    file: str
     control: str | None = None
     with_pictures: bool = False
 
     @property
     def name(self) -> str:
         """Its name in the journal, where controls' photographs may be called as the patch's are."""
-        return self.path.name if self.control is None else f"{self.control}/{self.path.name}"
+        return self.file if self.control is None else f"{self.control}/{self.file}"
 
 
 def measure_all(
@@ -80,7 +83,7 @@ def measure_all(
         sha256 = file_sha256(item.path)
         entry = measured.entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
-            on_pictures(item.path.name, measured.pictures)
+            on_pictures(item.file, measured.pictures)
         kept = _serialized(replace(measured, entry=entry))
         if journal is not None:
             journal.add(item.name, sha256, kept | {"pictures": item.with_pictures})
@@ -106,9 +109,9 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         photo = read_photo(item.path)
         squares = squares_of(photo.srgb, task.sizes_px)
         if item.control is not None:
-            return MeasuredPhoto(PhotoEntry(file=item.path.name, status="judged"), True, squares=squares)
+            return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
         view = view_of(photo, task.camera)
-        measured = measure(view, item.path.name, task.surface, task.promised, task.ranges, task.scan_dpi)
+        measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi)
         if not item.with_pictures:
             return replace(measured, pictures={}, squares=squares)
         geometry = measured.entry.geometry
@@ -140,7 +143,7 @@ def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface)
 
 
 def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:
-    return MeasuredPhoto(PhotoEntry(file=item.path.name, status="rejected", remark=remark), False)
+    return MeasuredPhoto(PhotoEntry(file=item.file, status="rejected", remark=remark), False)
 
 
 def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Shot | None:

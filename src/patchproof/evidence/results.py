@@ -161,8 +161,18 @@ class Ledger(Strict):
     photos: int
 
 
+class SessionCount(Strict):
+    """One session's judged photographs, and how many of them were recognized."""
+
+    name: str
+    recognized: int
+    judged: int
+
+
 class Summary(Strict):
-    """All photographs together, for the promise's primary model."""
+    """All photographs together, for the promise's primary model. The rate's interval knows how much sessions differ,
+    and `sessions_known_from` says how sessions were told apart.
+    """
 
     photos: int
     judged: int
@@ -177,6 +187,8 @@ class Summary(Strict):
     culprit: str | None = None
     reason: str = ""  # for the verdict, in a sentence
     models: dict[str, ModelRate] = Field(default_factory=dict)
+    sessions: tuple[SessionCount, ...] = ()
+    sessions_known_from: str = ""
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,16 @@ import numpy as np
 from patchproof.claims import wilson
 from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
 from patchproof.evidence.classify import Judges, judges_of
+from patchproof.evidence.grouping import Grouping, group
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.ranges import matched_rate
-from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, Summary
+from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
-from patchproof.photo.read import list_photos, pictures_in
+from patchproof.photo.read import pictures_in
+from patchproof.sessions import TAIL
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
 from patchproof.workers import open_workers
@@ -43,18 +45,20 @@ def gather_evidence(
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
-    """Measure, classify and judge every picture in the folder (or the one picture) `photos`.
+    """Measure, classify and judge every picture in the folder (or the one picture) `photos`, folders in it being
+    sessions (see `grouping`).
 
     Photographs are measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is
     finished; with `resume`, what it has of an earlier run is not done again. `on_pictures` gets the pictures of each
     photograph that is (of the first `batch.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where
     it was measured); `progress` is called with (done, all).
     """
-    paths, control_paths = list_photos(photos), _list_controls(options.controls)
+    grouping = group(photos, None if options.controls is None else Path(options.controls))
+    paths, control_paths = grouping.paths, _list_controls(options.controls)
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
-    items = [Item(path, with_pictures=number < WITH_PICTURES) for number, path in enumerate(paths)]
-    items += [Item(path, control) for control, files in control_paths.items() for path in files]
+    items = [Item(path, grouping.file(i), with_pictures=i < WITH_PICTURES) for i, path in enumerate(paths)]
+    items += [Item(path, path.name, control) for control, files in control_paths.items() for path in files]
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with kept as open_journal, open_workers(jobs, cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
@@ -72,7 +76,7 @@ def gather_evidence(
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
             controls.setdefault(item.control, []).append(result.entry)
-    return _report(manifest, judges, own, controls, ledger, options.ruler_mm, task.ranges.side_px)
+    return _report(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
 
 
 def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
@@ -95,6 +99,7 @@ def _report(
     manifest: Manifest,
     judges: Judges | None,
     photos: Sequence[MeasuredPhoto],
+    grouping: Grouping,
     controls: Mapping[str, Sequence[PhotoEntry]],
     ledger: Ledger | None,
     ruler_mm: tuple[float, float] | None,
@@ -103,14 +108,19 @@ def _report(
     """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
-    compared, rates, rate = [], {}, _rate({})
+    compared, rates, rate, interval, sessions = [], {}, _rate({}), None, ()
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
         rate, recognized = rates[primary], _recognized(counted, primary)
         without = sum(e.code == "too_few_markers" and e.status == "rejected" for e in entries)
         goal = promise.target.goal
-        verdict = judge(sum(recognized.values()), len(recognized), promise.rate, promise.n, goal, without)
+        sessions = _sessions(grouping, photos, recognized)
+        counts = sum(recognized.values()), [session.judged for session in sessions if session.judged]
+        verdict = judge(*counts, promise, without)
+        if recognized:
+            spread = promise.spread
+            interval = spread.least_rate(*counts, TAIL), spread.most_rate(*counts, TAIL)
         measured = (entry for entry in counted if entry.status == "measured")
         matched = matched_rate(measured, promise.conditions, side_px)
         compared = [compare(recognized, name, _recognized(shown, primary), goal) for name, shown in controls.items()]
@@ -119,7 +129,9 @@ def _report(
         judged=len(counted),
         measured=sum(entry.status == "measured" for entry in entries),
         rate=rate.rate,
-        interval=rate.interval,
+        interval=interval,
+        sessions=sessions,
+        sessions_known_from=grouping.known_from,
         prediction_interval=verdict.prediction_interval,
         verdict=verdict.verdict,
         effect=effect_of(compared),
@@ -135,6 +147,20 @@ def _report(
         entries = [entry if entry.scale else entry.changed(scale=scale) for entry in entries]
     sheet_id = manifest.sheet_id
     return Report(sheet_id=sheet_id, photos=tuple(entries), summary=summary, controls=tuple(compared), ledger=ledger)
+
+
+def _sessions(
+    grouping: Grouping, photos: Sequence[MeasuredPhoto], recognized: Mapping[str, bool]
+) -> tuple[SessionCount, ...]:
+    """What was recognized in each session."""
+    hits: list[list[bool]] = [[] for _ in grouping.names]
+    for number, photo in zip(grouping.session, photos, strict=True):
+        if photo.counted and photo.entry.file in recognized:
+            hits[number].append(recognized[photo.entry.file])
+    return tuple(
+        SessionCount(name=name, recognized=sum(own), judged=len(own))
+        for name, own in zip(grouping.names, hits, strict=True)
+    )
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:

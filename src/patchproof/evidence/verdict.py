@@ -1,13 +1,15 @@
 """From counts to a verdict: pure functions, no photographs.
 
-In: how many photographs were recognized, what was promised, what controls showed. Out: `kept`, `broken` or
-`cannot_tell` with the prediction interval that decided it, and whether an effect was shown. For `assist`:
+In: how many photographs of each session were recognized, what was promised, what controls showed. Out: `kept`, `broken`
+or `cannot_tell` with the prediction interval that decided it, and whether an effect was shown. For `assist`:
 
-    broken       k < k_lo                             fewer than the promise allows for, at 95 %
-    kept         k ≥ k_lo and k_lo / n ≥ rate - 0.20  and enough photographs that a miss would have shown
+    broken       fewer are recognized than the promise allows for, at 95 %, of photographs in so many sessions
+    kept         the least rate that the photographs leave possible (97.5 %, sessions differ) is at most 20 points under
+                 the promised one, and no less than the best control's
     cannot_tell  otherwise; always below 5 judged photographs, or with more than 10 % of readable ones without a marker
 
-mirrored for `deceive`, where a rate too high breaks the promise.
+mirrored for `deceive`, where a rate too high breaks the promise. `kept` is a claim that the photographs prove; too few
+of them, or all in one place, can prove none.
 """
 
 from __future__ import annotations
@@ -15,21 +17,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from patchproof.claims import (
-    CONFIDENCE,
-    independent_difference,
-    mcnemar_p,
-    paired_difference,
-    prediction_interval,
-    wilson,
-)
+from patchproof.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, wilson
 from patchproof.evidence.results import Control, Effect, Word
 from patchproof.goal import Goal
+from patchproof.sessions import TAIL
+from patchproof.sheets.manifest import Promise
 
 LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
-SLACK = 0.20  # how far below the promised rate the interval's floor may lie
-LEAST_PAIRS = 5  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
+SLACK = 0.20  # how far below the promised rate the photographs may leave the true one
+LEAST_PAIRS = 6  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
+LEAST_PAIRED = 0.5  # of either folder's photographs: a few names that happen to be equal are no pairs
 
 
 @dataclass(frozen=True)
@@ -41,26 +39,49 @@ class Verdict:
     reason: str
 
 
-def judge(
-    recognized: int, judged: int, promise_rate: float, promise_n: int, goal: Goal, without_markers: int
-) -> Verdict:
-    """The verdict on `recognized` of `judged` photos; `without_markers` more are readable and show no marker."""
+def judge(recognized: int, photos: Sequence[int], promise: Promise, without_markers: int = 0) -> Verdict:
+    """The verdict on photographs of which `recognized` were, so many in each session; `without_markers` more are
+    readable and show no marker.
+    """
+    judged, goal = sum(photos), promise.target.goal
     if judged == 0:
         return Verdict("cannot_tell", None, "No photograph could be judged.")
-    low, high = prediction_interval(round(promise_rate * promise_n), promise_n, judged)
-    counts = f"{recognized} of {judged} photographs were recognized; the promise allows for {low} to {high}"
+    spread = promise.spread
+    low, high = spread.counts(photos)
+    allowed = f"the promise allows for {low} to {high} in {_sessions(photos)}"
     lost = without_markers / (judged + without_markers)
     if lost > MOST_WITHOUT_MARKERS:
         reason = f"{without_markers} readable photographs show no marker ({lost:.0%}, at most 10 % are allowed)."
         return Verdict("cannot_tell", (low, high), reason)
     if judged < LEAST_JUDGED:
         return Verdict("cannot_tell", (low, high), f"Only {judged} photographs could be judged; at least 5 are needed.")
-    worst = low if goal.sign > 0 else high
-    if goal.sign * (recognized - worst) < 0:
-        return Verdict("broken", (low, high), f"{counts}.")
-    if goal.sign * (worst / judged - promise_rate) >= -SLACK - 1e-9:
+    counts = f"{recognized} of {judged} photographs were recognized"
+    if goal.sign * (recognized - (low if goal.sign > 0 else high)) < 0:
+        return Verdict("broken", (low, high), f"{counts}; {allowed}.")
+    ends = spread.least_rate if goal.sign > 0 else spread.most_rate
+    proved, asked = ends(recognized, photos, TAIL), asked_rate(promise)
+    side = "at least" if goal.sign > 0 else "at most"
+    counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {asked:.0%} is asked for"
+    if goal.sign * (proved - asked) >= 0:
         return Verdict("kept", (low, high), f"{counts}.")
-    return Verdict("cannot_tell", (low, high), f"{counts}, which is too wide to tell: take more photographs.")
+    return Verdict("cannot_tell", (low, high), f"{counts}: take more, in other places and light.")
+
+
+def asked_rate(promise: Promise) -> float:
+    """The rate that photographs have to prove: the promise's with its slack, and no worse than the best control's."""
+    sign, control = promise.target.goal.sign, promise.controls[promise.best_control].rate
+    return sign * max(sign * promise.rate - SLACK, sign * control)
+
+
+def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
+    """The chance that the promise is called kept by photographs, so many in each session, where it holds."""
+    chances = promise.spread.chances(photos)
+    words = (judge(count, photos, promise).verdict for count in range(len(chances)))
+    return float(sum(chance for chance, word in zip(chances, words, strict=True) if word == "kept"))
+
+
+def _sessions(photos: Sequence[int]) -> str:
+    return "one session" if len(photos) == 1 else f"{len(photos)} sessions"
 
 
 def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:
@@ -70,7 +91,7 @@ def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], g
     if not patch or not control:
         return beside
     names = sorted(patch.keys() & control.keys())
-    if len(names) >= LEAST_PAIRS:
+    if len(names) >= max(LEAST_PAIRS, LEAST_PAIRED * len(patch), LEAST_PAIRED * len(control)):
         a, b = [patch[name] for name in names], [control[name] for name in names]
         difference, interval = paired_difference(a, b)
         p_value = mcnemar_p(a, b)

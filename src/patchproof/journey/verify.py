@@ -1,8 +1,9 @@
 """Verify: photographs and a manifest in, a report out.
 
-In: a folder of photographs and SHEET.json. Out: REPORT/ with report.json, report.csv, report.html, pictures and
-photos.jsonl, one line per finished photograph, from which `resume` goes on. This joins what must not know each other:
-the judge, its networks and the page. The promise's primary network always judges, whatever others are named.
+In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
+report.html, pictures and photos.jsonl, one line per finished photograph, from which `resume` goes on. This joins what
+must not know each other: the judge, its networks and the page. The promise's primary network always judges, whatever
+others are named.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
 from patchproof.output import check_folder
-from patchproof.report.images import save_pictures
+from patchproof.report.images import save_pictures, stem_of
 from patchproof.report.results import versions_of
 from patchproof.report.write import write_report
 from patchproof.sheets.manifest import Manifest, load_manifest
@@ -87,7 +88,7 @@ def verify_photos(
         f"network {network.name}": network.sha256 for network in networks
     }
     report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
-    _drop_pictures(out / "pictures", {photo.file for photo in report.photos[:WITH_PICTURES]})
+    _drop_pictures(out / "pictures", {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]})
     ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
     return report

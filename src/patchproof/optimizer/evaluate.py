@@ -51,7 +51,7 @@ def evaluate_run(
         answers = joined(workers.map(show, parts, lambda done, _: on_view(min(done * AT_A_TIME, n), n)))
     _opened.cache_clear()
     result = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
-    for i, claim in enumerate(model_claims(problem, answers)):
+    for i, claim in enumerate(model_claims(problem, answers["design"])):
         controls = {kind: control.model_dump() for kind, control in control_claims(answers, i).items()}
         result["models"][claim.name] = claim.model_dump(exclude={"name"}) | {"controls": controls}
     write_whole(

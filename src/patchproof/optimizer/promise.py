@@ -1,9 +1,10 @@
 """The promise: what rate the finished design will reach on conditions that nobody has looked at yet, beside its
 controls.
 
-In: a `Problem`, the design's pixels, and conditions. Out: the manifest's `Promise`. Controls are shown on the very same
-conditions, so that differences are paired: the bare object, and a mean-color, a gray and a noise design in the same
-printed markers. The set is drawn and looked at once, after the design is frozen.
+In: a `Problem`, the design's pixels, and conditions in sessions: a few photographs each that share print, light, camera
+and place. Out: the manifest's `Promise`. Controls are shown in some of each session's conditions, so that differences
+are paired: the bare object, and a mean-color, a gray and a noise design in the same printed markers. The set is drawn
+and looked at once, after the design is frozen.
 """
 
 from __future__ import annotations
@@ -14,17 +15,19 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from patchproof.claims import paired_difference, wilson
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, responses
+from patchproof.optimizer.responses import Answers, joined, responses
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import PieceScene, needs_piece
+from patchproof.sessions import difference_in_sessions, in_sessions, spread_of
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
-PROMISE_VIEWS = 400  # the Wilson interval of a rate of 0.9 is then 6 points wide
+# Many short sessions: how much they differ is known from their number, not from their length.
+PROMISE_VIEWS, PER_SESSION = 600, 6
+CONTROL_VIEWS = 2  # of each session: differences are paired, and need fewer
 CONTROLS = ("bare", "mean", "gray", "noise")
 
 
@@ -34,10 +37,20 @@ def make_promise(
     conditions: Conditions,
     controls: Sequence[str] = CONTROLS,
     on_views: Callable[[int], None] = lambda n: None,
+    per_session: int = 1,
 ) -> Promise:
-    """Show the design and its controls; rate, interval and controls are those of the primary (first) network."""
-    answers = responses(problem, shown_with_controls(problem, design, controls), conditions, on_views=on_views)
-    models = model_claims(problem, answers)
+    """Show the design in all conditions, `per_session` in a row of one session, and the controls in the first
+    `CONTROL_VIEWS` of each; rate, interval and controls are those of the primary (first) network.
+    """
+    shown = shown_with_controls(problem, design, controls)
+    beside = np.arange(len(conditions)) % per_session < CONTROL_VIEWS
+    compared = responses(problem, shown, conditions[beside], on_views=on_views)
+    answers = compared["design"]
+    if not beside.all():
+        rest = responses(problem, {"design": shown["design"]}, conditions[~beside], on_views=on_views)["design"]
+        order = np.argsort(np.concatenate([np.flatnonzero(beside), np.flatnonzero(~beside)]), kind="stable")
+        answers = joined([{"design": compared["design"]}, {"design": rest}])["design"].at(order)
+    models = model_claims(problem, answers, per_session)
     target = problem.scene.settings.target
     return Promise(
         target=Target(label=str(target.label), indices=problem.indices[0], goal=target.goal),
@@ -45,8 +58,9 @@ def make_promise(
         rate=models[0].rate,
         interval=models[0].interval,
         n=len(conditions),
-        controls=control_claims(answers, 0),
-        conditions=_condition_claims(problem, conditions, answers["design"].recognized[0]),
+        per_session=per_session,
+        controls=control_claims(compared, 0, min(CONTROL_VIEWS, per_session)),
+        conditions=_condition_claims(problem, conditions, answers.recognized[0]),
     )
 
 
@@ -60,30 +74,30 @@ def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence
     return shown
 
 
-def model_claims(problem: Problem, answers: Mapping[str, Answers]) -> tuple[ModelClaim, ...]:
-    """Each network's rate and confidence of the design."""
-    rows = zip(problem.classifiers, answers["design"].recognized, answers["design"].confidence, strict=True)
+def model_claims(problem: Problem, design: Answers, per_session: int = 1) -> tuple[ModelClaim, ...]:
+    """Each network's rate and confidence of the design; intervals are over sessions."""
+    rows = zip(problem.classifiers, design.recognized, design.confidence, strict=True)
     return tuple(
         ModelClaim(
             name=classifier.name,
             sha256=classifier.sha256,
             rate=float(recognized.mean()),
-            interval=wilson(int(recognized.sum()), len(recognized)),
+            interval=spread_of(*in_sessions(recognized, per_session)).rate,
             confidence=float(confidence.mean()),
         )
         for classifier, recognized, confidence in rows
     )
 
 
-def control_claims(answers: Mapping[str, Answers], model: int) -> dict[str, ControlClaim]:
+def control_claims(answers: Mapping[str, Answers], model: int, per_session: int = 1) -> dict[str, ControlClaim]:
     """Each control beside the design on the same conditions, for one network."""
     design, claims = answers["design"].recognized[model], {}
     for kind in (kind for kind in CONTROLS if kind in answers):
         recognized = answers[kind].recognized[model]
-        difference, interval = paired_difference(design.tolist(), recognized.tolist())
+        difference, interval = difference_in_sessions(design, recognized, per_session)
         claims[kind] = ControlClaim(
             rate=float(recognized.mean()),
-            interval=wilson(int(recognized.sum()), len(recognized)),
+            interval=spread_of(*in_sessions(recognized, per_session)).rate,
             confidence=float(answers[kind].confidence[model].mean()),
             difference=difference,
             difference_interval=interval,

@@ -30,6 +30,10 @@ class Answers:
     confidence: np.ndarray
     loss: np.ndarray
 
+    def at(self, rows: np.ndarray) -> Answers:
+        """The answers to conditions at an index array."""
+        return Answers(self.recognized[:, rows], self.confidence[:, rows], self.loss[:, rows])
+
 
 def responses(
     problem: Problem,

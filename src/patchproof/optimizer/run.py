@@ -30,7 +30,7 @@ from patchproof.optimizer.patch import DESIGN_FILE
 from patchproof.optimizer.place_files import PLACE_FILES, read_place, save_place
 from patchproof.optimizer.places import choose_place
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, make_promise
+from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, make_promise
 from patchproof.optimizer.subject import read_png
 from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
 from patchproof.output import check_folder, make_folder, write_whole
@@ -199,7 +199,8 @@ def _promise(
         done += n
         on_promise(done, PROMISE_VIEWS)
 
-    return make_promise(problem, design, problem.scene.draw("promise", PROMISE_VIEWS), controls, progress)
+    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=PER_SESSION)
+    return make_promise(problem, design, conditions, controls, progress, PER_SESSION)
 
 
 def _log_line(step: Step) -> dict[str, Any]:

@@ -1,14 +1,14 @@
-"""How much the figures that are counted can say: the selection's, the promise's, and that of photographs.
+"""How much the figures that are counted can say: the selection's and the promise's.
 
 In: the draft's rate and what selection can tell apart. Out: for each, how far off it may be with as many samples as it
 takes, and with four times as many, which is the next rung: chance shrinks with their root, cost grows with them. The
-promise's interval is Wilson's; photographs are judged by what they may show after such a promise (see `claims`).
+promise's interval is Wilson's, of views that share no session. What photographs can say depends on how much sessions
+differ, which the promise measures: the sheet's plan page has it.
 """
 
 from __future__ import annotations
 
-from patchproof.claims import prediction_interval, wilson
-from patchproof.journey.demo import PHOTOS
+from patchproof.claims import wilson
 from patchproof.optimizer.loop import SELECT_VIEWS
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.strict import Strict
@@ -30,13 +30,9 @@ def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
     """The samples' ladder at a rate; `standard_error` is that of the selection set's mean confidence."""
     selection = [1.96 * standard_error / k**0.5 for k in (1, NEXT)]
     promise = [_half(wilson(round(rate * n), n)) for n in (PROMISE_VIEWS, NEXT * PROMISE_VIEWS)]
-    photos = [
-        _half(prediction_interval(round(rate * PROMISE_VIEWS), PROMISE_VIEWS, n)) / n for n in (PHOTOS, NEXT * PHOTOS)
-    ]
     rows = (
         ("selection: mean confidence", SELECT_VIEWS, selection),
         ("promise: rate", PROMISE_VIEWS, promise),
-        ("photographs: rate", PHOTOS, photos),
     )
     return tuple(
         Sample(name=name, n=n, half_width=now, next_n=NEXT * n, next_half_width=after) for name, n, (now, after) in rows

@@ -1,10 +1,12 @@
-"""The shot plan: how many photographs, from where and of which controls, so that the verdict will not be `cannot_tell`.
+"""The shot plan: how many photographs, in how many places, from where and of which controls, so that the verdict will
+not be `cannot_tell`.
 
-In: a promise and the scene's ranges. Out: counts, and sentences for the sheet's last page. A verdict needs as many
-photographs as narrow the prediction interval to the rule of `verify.verdict`. An effect needs as many pairs of design
-and control that McNemar's exact test, or Newcombe's interval where photographs are not paired, finds it with 90 %
-power. Design and control are taken to be recognized independently at their promised rates, which asks for more
-photographs than pairs of one view need. Assumed: the promise holds.
+In: a promise and the scene's ranges. Out: counts, and sentences for the sheet's last page. Photographs of one session
+are alike, so that a few in each of several places say more than many in one: for some ways to take them, what the
+promise allows for and the chance that they will prove it. An effect needs as many pairs of design and control that
+McNemar's exact test, or Newcombe's interval where photographs are not paired, finds it with 90 % power. Design and
+control are taken to be recognized independently at their promised rates, which asks for more photographs than pairs of
+one view need. Assumed: the promise holds.
 """
 
 from __future__ import annotations
@@ -15,20 +17,37 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.claims import CONFIDENCE, independent_difference
-from patchproof.evidence.verdict import judge
+from patchproof.evidence.verdict import asked_rate, kept_chance
+from patchproof.sessions import evenly
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
 
 POWER = 0.90
 MOST_PHOTOS = 150  # nobody takes more
+WAYS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
+EACH = 10  # photographs of a session, where their number is asked for
+KEPT = 0.80  # chance of `kept` that is enough
 STEADY = 12  # so many counts in a row must do: floors of intervals are whole photographs, so that some n just miss
 
 
 @dataclass(frozen=True)
-class ShotPlan:
-    """Photographs for a verdict, for an effect with and without pairs (None: more than 150), and the best control."""
+class Way:
+    """Photographs in some sessions, the counts that the promise allows for, and the chance that they prove it."""
 
-    verdict: int | None
+    photos: int
+    sessions: int
+    allowed: tuple[int, int]
+    chance: float
+
+
+@dataclass(frozen=True)
+class ShotPlan:
+    """Ways to take photographs, sessions of `EACH` that a verdict needs (None: more than 150 photographs), the best
+    control, and photographs for an effect with and without pairs (None likewise).
+    """
+
+    ways: tuple[Way, ...]
+    sessions: int | None
     control: str
     paired: int | None
     unpaired: int | None
@@ -40,17 +59,19 @@ def plan_shots(promise: Promise) -> ShotPlan:
     best = promise.best_control
     rates = (promise.rate, promise.controls[best].rate)
     better, worse = rates[::sign]
+    enough = (s for s in range(1, MOST_PHOTOS // EACH + 1) if kept_chance(promise, (EACH,) * s) >= KEPT)
     return ShotPlan(
-        verdict=fewest(lambda n: _is_kept(promise, n)),
+        ways=tuple(_way(promise, *way) for way in WAYS),
+        sessions=next(enough, None),
         control=best,
         paired=fewest(lambda n: paired_power(better, worse, n) >= POWER),
         unpaired=fewest(lambda n: unpaired_power(better, worse, n) >= POWER),
     )
 
 
-def _is_kept(promise: Promise, n: int) -> bool:
-    """Whether n photographs, recognized as often as promised, keep the promise."""
-    return judge(round(promise.rate * n), n, promise.rate, promise.n, promise.target.goal, 0).verdict == "kept"
+def _way(promise: Promise, photos: int, sessions: int) -> Way:
+    parts = evenly(photos, sessions)
+    return Way(photos, sessions, promise.spread.counts(parts), kept_chance(promise, parts))
 
 
 def fewest(enough: Callable[[int], bool]) -> int | None:
@@ -104,12 +125,21 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         f"Promised: {promise.rate:.0%} recognized as {promise.target.label}; the best control ({plan.control}) "
         f"{control.rate:.0%}."
     ]
-    if plan.verdict is None:
-        lines.append("The promise is too weak for a verdict from any reasonable number of photographs.")
+    lines.append(
+        f"A verdict asks the photographs to prove a rate of {asked_rate(promise):.0%}. What they will show if the "
+        "promise holds, and the chance that it is enough: "
+        + "; ".join(
+            f"{way.photos} in {_places(way.sessions)}: {way.allowed[0]} to {way.allowed[1]} ({way.chance:.0%})"
+            for way in plan.ways
+        )
+        + "."
+    )
+    if plan.sessions is None:
+        lines.append("The promise is too weak to be proved by any reasonable number of photographs.")
     else:
         lines.append(
-            f"For a verdict on the promise: at least {plan.verdict} photographs of the piece on the object. With fewer "
-            "the verdict may be cannot_tell however well they go."
+            f"Take at least {EACH} photographs in each of {_places(plan.sessions)}, with other light in each, and keep "
+            "those of each place in a folder of their own."
         )
     if plan.paired is None and plan.unpaired is None:
         lines.append(
@@ -130,6 +160,10 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         "every control that you photograph."
     )
     return tuple(lines)
+
+
+def _places(count: int) -> str:
+    return "1 place" if count == 1 else f"{count} places"
 
 
 def _from_where(settings: SceneSettings) -> tuple[str, ...]:

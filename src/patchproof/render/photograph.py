@@ -22,6 +22,7 @@ from patchproof.channel.camera import (
     noisy,
 )
 from patchproof.channel.lens import distorted
+from patchproof.channel.light import PAPER_REFLECTANCE
 from patchproof.channel.printer import misregistered, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
@@ -119,7 +120,10 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     paper = torch.as_tensor(drawn.paper).to(reflectance)
     light = vary(reflectance, change.index_select(0, piece.view))
     light = light * paper.index_select(0, piece.view) * views.piece_white
-    return light if views.piece_gloss is None else light + views.piece_gloss
+    if views.piece_gloss is None:
+        return light
+    mirrored = torch.as_tensor(PAPER_REFLECTANCE * views.conditions.light.gloss).to(light)
+    return light * (1 - mirrored.index_select(0, piece.view))[:, None] + views.piece_gloss
 
 
 def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[Tensor]]:

@@ -41,7 +41,8 @@ def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> N
     for path in _paths(folder, file):
         path.unlink(missing_ok=True)
     for kind, content in encoded(kinds).items():
-        (folder / f"{file}.{kind}.{'png' if content.startswith(_PNG) else 'jpg'}").write_bytes(content)
+        suffix = "png" if content.startswith(_PNG) else "jpg"
+        (folder / f"{stem_of(file)}.{kind}.{suffix}").write_bytes(content)
 
 
 def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
@@ -49,8 +50,13 @@ def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
     return {path.suffixes[-2][1:]: path.read_bytes() for path in _paths(folder, file) if path.is_file()}
 
 
+def stem_of(file: str) -> str:
+    """How the pictures of a photograph begin, which may lie in a folder of its session."""
+    return file.replace("/", "%2F")
+
+
 def _paths(folder: Path, file: str) -> list[Path]:
-    return [folder / f"{file}.{kind}.{suffix}" for kind in KINDS for suffix in ("jpg", "png")]
+    return [folder / f"{stem_of(file)}.{kind}.{suffix}" for kind in KINDS for suffix in ("jpg", "png")]
 
 
 def data_uri(content: bytes) -> str:

@@ -26,6 +26,7 @@ from patchproof import geometry
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light, Print
 from patchproof.channel.lens import Frame, distorted
+from patchproof.channel.light import PAPER_REFLECTANCE
 from patchproof.channel.printer import misregistered, vary
 from patchproof.color import LIGHT_OF_CODE, linear_from_srgb
 from patchproof.mesh.mesh import Mesh
@@ -39,8 +40,6 @@ from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import needs_mesh, needs_patch, needs_piece
 from patchproof.strict import Refused
 
-# Bare paper: our levels are relative to it, but light that goes back and forth is not.
-PAPER_REFLECTANCE = 0.85
 LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
 APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
 PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels

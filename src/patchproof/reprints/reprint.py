@@ -2,7 +2,8 @@
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object, and
 `truth.json` with each one's homography, marker corners and conditions (see `hung_sheet`). With `scan` the uncut page is
-scanned flat instead. Conditions come from the reprint stream, which nothing else has seen.
+scanned flat instead. Conditions come from the reprint stream, which nothing else has seen: one print, photographed in
+one session or in several, each with a place, light and camera of its own and in a folder of its own.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,10 +30,11 @@ from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, hang, sh
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import page_pixels
+from patchproof.strict import Refused
 from patchproof.workers import open_workers, result_of
 
 SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
-OWN = ("photo_*.jpg", "scan_*.jpg", "truth.json")
+OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json")
 
 
 def reprint(
@@ -41,23 +44,33 @@ def reprint(
     out: str | Path,
     how: Hanging = AS_MADE,
     *,
+    sessions: int = 1,
     seed: int | None = None,
     overwrite: bool = False,
     jobs: int = 1,
     cluster: str | None = None,
     on_photo: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict:
-    """Write n photographs of what hangs there and truth.json into the folder `out`; returns the truth."""
+    """Write n photographs of what hangs there, taken in so many sessions, and truth.json into the folder `out`; returns
+    the truth by file name.
+    """
+    if not 1 <= sessions <= n:
+        raise Refused(f"1 to {n} sessions of {n} photographs", f"{sessions}", "ask for fewer")
     with _hung_pdf(pdf_path, run, how.control, Path(out)) as pdf:
         sheet = hang(pdf, run, how)
         take = sheet.photograph
         if jobs > 1 or cluster is not None:
             take = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
-        conditions = sheet.scene.draw("reprint", n, seed)
-        views, done = [conditions[i : i + 1] for i in range(n)], 0
+        each, done = -(-n // sessions), 0
+        conditions = sheet.scene.draw("reprint", n, seed, per_session=each)
+        conditions = replace(conditions, print=conditions.print[[0] * n])  # one print, wherever it is photographed
+        views = [conditions[i : i + 1] for i in range(n)]
         names = [f"photo_{i + 1:04d}.jpg" for i in range(n)]
+        if sessions > 1:
+            names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
         with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
             for i, photo in workers.completed(take, views):
+                make_folder((folder / names[i]).parent)
                 (folder / names[i]).write_bytes(result_of(photo))
                 done += 1
                 on_photo(done, n)

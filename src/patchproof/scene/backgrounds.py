@@ -1,45 +1,68 @@
-"""Pictures behind the object: a folder of photographs or one plain color.
+"""Places behind the object: photographs in a folder, one known picture, procedural places, or one plain color.
 
-In: the folder and, per view, five numbers in [0, 1) that choose picture, crop and mirroring. Out: H×W×3 uint8 sRGB. The
-photograph and its centered square show the same crop, so that what trains and what is photographed agree.
+In: the settings and, per view, five numbers in [0, 1) that choose picture, crop and mirroring. Out: H×W×3 uint8 sRGB.
+The photograph and its centered square show the same crop, so that what trains and what is photographed agree.
+
+Each file of a folder belongs to one part only: to what trains, selects, promises, or is reprinted and evaluated. A rate
+in places that training knows would say little of the place where somebody will take photographs. Parts with few files
+are filled up with procedural places (`rooms`). A picture that is named itself is the known place of all parts.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from patchproof.color import codes_of
+from patchproof.scene.rooms import place
 from patchproof.settings import BackgroundSettings
 from patchproof.strict import Refused, expand
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits
+FEW = 10  # files of which the scene is told that they are few
+LEAST_PLACES = {"train": 28, "select": 12, "promise": 24, "evaluate": 24}  # of a part, the procedural ones included
+# whose the files are, in the order of a hash of their names, again and again
+_DEALT = ("train", "promise", "evaluate", "select", "train", "promise", "train", "evaluate", "promise", "train")
+_PART = 1000  # procedural places of a part are numbered from its own thousand
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
-_PLAIN = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """Pictures as uint8 H×W×3, or a single 1×1 picture where the background is plain."""
+    """Pictures as uint8 H×W×3 or numbers of procedural places, a single 1×1 picture where the background is plain; by
+    stream the first and the end of those that it may show, all where it is not named.
+    """
 
-    pictures: tuple[np.ndarray, ...]
+    pictures: tuple[np.ndarray | int, ...]
+    of_stream: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def chosen(self, stream: str, choice: np.ndarray) -> np.ndarray:
+        """Numbers in [0, 1) that choose among all pictures, from numbers that choose among a stream's."""
+        first, end = self.of_stream.get(stream, (0, len(self.pictures)))
+        return (first + np.floor((end - first) * choice) + 0.5) / len(self.pictures)
 
     @cached_property
-    def _reduced(self) -> tuple[list[np.ndarray], ...]:
-        """Each picture with its halvings, so that a small view does not read megapixels."""
+    def _reduced(self) -> dict[int, list[np.ndarray]]:
+        """Pictures with their halvings as they come into use, so that a small view does not read megapixels."""
+        return {}
+
+    def _levels(self, number: int) -> list[np.ndarray]:
         import cv2
 
-        pyramids = []
-        for picture in self.pictures:
-            levels = [picture]
+        if number not in self._reduced:
+            picture = self.pictures[number]
+            levels = [place(picture) if isinstance(picture, int) else picture]
             while min(levels[-1].shape[:2]) >= 256:
                 height, width = levels[-1].shape[:2]
                 levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-            pyramids.append(levels)
-        return tuple(pyramids)
+            self._reduced[number] = levels
+        return self._reduced[number]
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is
@@ -47,7 +70,7 @@ class Backgrounds:
         """
         import cv2
 
-        levels = self._reduced[int(choice[0] * len(self.pictures))]
+        levels = self._levels(int(choice[0] * len(self.pictures)))
         height, width = levels[0].shape[:2]
         x0, y0, crop_w, crop_h = _crop((width, height), choice, photo_px)
         if size_px[0] == size_px[1]:
@@ -68,16 +91,38 @@ class Backgrounds:
 
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     """The scene's backgrounds; refused where the folder is missing, empty, or holds a picture that cannot be read."""
+    if settings.color is not None:
+        return Backgrounds((codes_of(np.array(settings.color)).reshape(1, 1, 3),))
     if settings.images is None:
-        plain = codes_of(np.array(settings.color or _PLAIN))
-        return Backgrounds((plain.reshape(1, 1, 3),))
+        return _in_parts([])
     folder = Path(expand(settings.images, base))
+    if folder.is_file():
+        return Backgrounds((_read(folder),))
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
     if not files:
         raise Refused(
             "a folder of pictures (background.images)", f"none in {folder}", "put photographs there or give a color"
         )
-    return Backgrounds(tuple(_read(file) for file in files))
+    return _in_parts(files)
+
+
+def _in_parts(files: Sequence[Path]) -> Backgrounds:
+    """Files dealt to the parts, which procedural places fill up."""
+    files = sorted(files, key=lambda file: hashlib.sha256(file.name.encode()).digest())
+    pictures: list[np.ndarray | int] = []
+    ends, filled = {}, 0
+    for part, (name, least) in enumerate(LEAST_PLACES.items()):
+        first, own = len(pictures), [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
+        more = max(0, least - len(own))
+        pictures += [*map(_read, own), *(_PART * part + i for i in range(more))]
+        ends[name], filled = (first, len(pictures)), filled + more
+    notes = ()
+    if 0 < len(files) < FEW:
+        notes = (
+            f"only {len(files)} pictures in background.images: {filled} procedural places stand in for real ones; with "
+            f"{FEW} or more, training and promise know different ones",
+        )
+    return Backgrounds(tuple(pictures), ends | {"reprint": ends["evaluate"]}, notes)
 
 
 def _read(file: Path) -> np.ndarray:

@@ -4,8 +4,8 @@ transformation).
 In: the scene's settings and a stream. Out: `Conditions`, the four records of `channel.effects`. Five streams share
 nothing: what trains, what selects, what is promised, what is reprinted and what is evaluated. Training and selection
 use scrambled Sobol points, which cover the ranges with fewer views; the others draw independently, so that their
-intervals hold. All follow from one seed, and a view's draw depends on its index alone: step 70 sees the same views
-after a resume.
+intervals hold. All follow from one seed, and a view's draw depends on its index alone (and on how many make
+a session): step 70 sees the same views after a resume.
 
 Source of EoT: Athalye et al., Synthesizing Robust Adversarial Examples, ICML 2018.
 """
@@ -53,27 +53,48 @@ class Conditions(Rows):
     sensor: Sensor = field(default_factory=Sensor)
 
 
-def draw(settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0) -> Conditions:
-    """Draws `start` to `start + n` of a stream."""
-    return of_fields(sampled(EFFECTS, settings, stream, n, seed, start))
+def draw(
+    settings: SceneSettings,
+    stream: Stream,
+    n: int,
+    seed: int,
+    start: int = 0,
+    per_session: int = 1,
+    salt: str = "",
+) -> Conditions:
+    """Draws `start` to `start + n` of a stream; `per_session` in a row, from the first of all, are one session. Another
+    `salt`, other draws.
+    """
+    return of_fields(sampled(EFFECTS, settings, stream, n, seed, start, per_session, salt))
 
 
 def sampled(
-    effects: Sequence[Effect], settings: SceneSettings, stream: Stream, n: int, seed: int, start: int
+    effects: Sequence[Effect],
+    settings: SceneSettings,
+    stream: Stream,
+    n: int,
+    seed: int,
+    start: int,
+    per_session: int = 1,
+    salt: str = "",
 ) -> dict[str, np.ndarray]:
     """The fields that effects fill in draws `start` to `start + n`; no effect's draws depend on the others."""
     number, end = _STREAMS.index(stream), start + n
-    shared = np.concatenate([_unit(stream, seed, end), _rng(seed, number, 1).random((end, _PRINT_DIMENSIONS))], 1)
+    key = (seed, number, zlib.crc32(salt.encode())) if salt else (seed, number)
+    sequence = _unit(stream, _rng(*key), end)
+    shared = np.concatenate([sequence, _rng(*key, 1).random((end, _PRINT_DIMENSIONS))], 1)
     # each view's noise is its own, whatever batch it is rendered in
     views = ((seed * len(_STREAMS) + number) * 1_000_003 + start + np.arange(n)).astype(np.int64)
+    # what a session's photographs share is what was drawn for its first
+    first = np.arange(start, end) // per_session * per_session
     values = {}
     for effect in effects:
         count = len(effect.columns)
         if effect.first is None:
-            unit = _rng(seed, number, zlib.crc32(effect.name.encode())).random((end, count))
+            unit = _rng(*key, zlib.crc32(effect.name.encode())).random((end, count))
         else:
             unit = shared[:, effect.first : effect.first + count]
-        values |= effect.sample(settings, unit[start:], views)
+        values |= effect.sample(settings, np.where(effect.shared, unit[first], unit[start:]), views)
     return values
 
 
@@ -121,9 +142,8 @@ def _rng(*key: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
 
 
-def _unit(stream: Stream, seed: int, n: int) -> np.ndarray:
+def _unit(stream: Stream, rng: np.random.Generator, n: int) -> np.ndarray:
     """n×D points of the unit cube; the first k do not depend on n."""
-    rng = _rng(seed, _STREAMS.index(stream))
     if stream not in _SOBOL:
         return rng.random((n, _DIMENSIONS))
     from scipy.stats import qmc

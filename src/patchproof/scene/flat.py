@@ -10,14 +10,14 @@ Left out on purpose: what lies in front of the piece (a hand, a handle); the new
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from patchproof.geometry import rect_corners, scaled_about
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PieceScene
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings
@@ -35,6 +35,11 @@ class FlatScene(PieceScene):
         "other viewpoints, backgrounds and lamps than the pictures show; what stands in front of the piece;",
         "curl: the piece is a plane",
     )
+
+    def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
+        """As in `Scene.draw`; which picture it is, is drawn for each photograph: it decides the pose, too."""
+        drawn = super().draw(stream, n, seed, start, per_session)
+        return drawn if per_session == 1 else replace(drawn, pose=super().draw(stream, n, seed, start).pose)
 
     @abstractmethod
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:

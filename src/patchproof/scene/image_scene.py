@@ -25,7 +25,7 @@ from typing_extensions import Self
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
@@ -52,11 +52,11 @@ class ImageScene(flat.FlatScene):
     def _laid_out(self) -> Self:
         return replace(self, piece=_piece(self.settings, self.sheet_id))
 
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
+    def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
         """Draws of one of the scene's streams: `background[:, 0]` stays in that stream's half of the images, and
         `background[:, 4]` is 1, which erases nothing, in all but training.
         """
-        drawn = super().draw(stream, n, seed, start)
+        drawn = super().draw(stream, n, seed, start, per_session)
         background = drawn.pose.background.copy()
         if len(self.images) >= SPLIT_FROM:
             middle = (len(self.images) // 2) / len(self.images)

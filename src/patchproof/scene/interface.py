@@ -19,7 +19,7 @@ from typing_extensions import Self
 from patchproof.channel.effects import Effect
 from patchproof.channel.lens import Camera
 from patchproof.geometry import apply_homography, local_scale
-from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.scene.placement import Placement
 from patchproof.scene.resolution import design_grid
 from patchproof.settings import SceneSettings, identifying
@@ -92,9 +92,13 @@ class Scene(ABC):
         """The focal length of those; None of pictures, of which nobody knows it."""
         return None
 
-    def draw(self, stream, n: int, seed: int | None = None, start: int = 0) -> Conditions:
-        """Draws of one of the scene's streams, from the scene's own seed unless another is given."""
-        return draw(self.settings, stream, n, self.seed if seed is None else seed, start)
+    def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
+        """Draws of one of the scene's streams, from the scene's own seed unless another is given; `per_session` in a
+        row are of one session. Those that promise depend on all that the scene file says, so that who tries one change
+        after the other does not meet the same few conditions each time.
+        """
+        seed = self.seed if seed is None else seed
+        return draw(self.settings, stream, n, seed, start, per_session, self.sheet_id if stream == "promise" else "")
 
     def with_template(self, name: str) -> Self:
         """The scene for a page of another template: its sheet id and, where there is one, its piece anew."""

@@ -18,7 +18,7 @@ from patchproof.channel import lens
 from patchproof.channel.effects import Pose
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
 from patchproof.scene.placement import Frame, view_frame
 from patchproof.scene.texture import Canvas
@@ -45,6 +45,13 @@ class MeshScene(Scene):
         "curl: paper is as flat or bent as stated",
     )
     EFFECT_TABLES = ("light", "camera")
+
+    def draw(self, stream: Stream, n: int, seed: int | None = None, start: int = 0, per_session: int = 1) -> Conditions:
+        """As in `Scene.draw`, before the backgrounds of the stream."""
+        drawn = super().draw(stream, n, seed, start, per_session)
+        background = drawn.pose.background.copy()
+        background[:, 0] = self.backgrounds.chosen(stream, background[:, 0])
+        return replace(drawn, pose=replace(drawn.pose, background=background))
 
     def description(self) -> str:
         """How many faces the mesh has."""

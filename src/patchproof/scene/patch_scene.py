@@ -166,6 +166,7 @@ def load_mesh_scene(
     if settings_object.mesh is None or settings_object.length_mm is None:
         raise ValueError("a scene with a mesh names it")
     mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
+    backgrounds = load_backgrounds(settings.background, base)
     known = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
     bare = MeshScene(
         settings,
@@ -174,15 +175,15 @@ def load_mesh_scene(
         identity or sheet_id(identifying(settings) | known, seed),
         mesh,
         view_frame(mesh, settings),
-        load_backgrounds(settings.background, base),
-        notes=mesh.warnings,
+        backgrounds,
+        notes=(*mesh.warnings, *backgrounds.notes),
         known=known,
         camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
         given_glb=given_glb,
     )
     if settings.patch.kind != "patch":
         canvas = texture_canvas(mesh, settings.patch, base)
-        own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*mesh.warnings, *canvas.warnings)}
+        own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*bare.notes, *canvas.warnings)}
         return TextureScene(**vars(bare) | own)
     if settings.patch.place == "auto":
         return OpenScene(**vars(bare))
@@ -211,7 +212,7 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    notes = (*mesh.warnings, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
+    notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
     return piece, placement, unreadable, notes
 
 

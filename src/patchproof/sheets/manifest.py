@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 
 from patchproof.goal import Goal
 from patchproof.output import image_bytes
+from patchproof.sessions import Spread, in_sessions, spread_of
 from patchproof.strict import Finite, Gray, Positive, Refused, Share, Strict, validated
 
 Point = tuple[Finite, Finite]
@@ -124,15 +125,26 @@ class ConditionClaim(Strict):
 
 
 class Promise(Strict):
-    """The predicted rate of the primary (first) model, made before printing."""
+    """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
+    of one session. Promises from before sessions drew everything anew for each condition.
+    """
 
     target: Target
     models: Annotated[tuple[ModelClaim, ...], Field(min_length=1)]
     rate: Share
     interval: Interval
     n: Annotated[int, Field(ge=1)]
+    per_session: Annotated[int, Field(ge=1)] = 1
     controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
+
+    @property
+    def spread(self) -> Spread:
+        """What its conditions say of photographs to come."""
+        hits = [condition.recognized for condition in self.conditions]
+        if len(hits) != self.n:  # of pages that say no conditions
+            hits = [number < round(self.rate * self.n) for number in range(self.n)]
+        return spread_of(*in_sessions(hits, self.per_session))
 
     @property
     def best_control(self) -> str:

@@ -1,48 +1,58 @@
-"""Whether promised rates hold in independently rendered photographs.
+"""Whether promised rates hold in independently rendered sessions.
 
 Many runs are promised, printed, photographed by a renderer that is not ours, and verified.
-In: scene files, networks, printers, seeds. Out: for every combination the promised rate, the interval of counts that
-its photographs should show, and the count that they did show; the share of intervals that held, their widths, and the
-bias of each scene. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
+In: scene files, networks, printers, seeds. Out: for every combination the promised rate, and for each session of its
+photographs (one print, one place, light and camera) the counts that the promise allows for and what it shows; the share
+of intervals that held, their widths beside those of the best possible ones, and each scene's bias. Beside them the rule
+that takes photographs for independent. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
 
-Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; without
-`path_traced = true` they are ours, and only sampling and the page in between are tested.
+Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; with
+`path_traced = false` they are ours, and only sampling and the page in between are tested.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from patchproof.claims import mean, prediction_interval, rate
+from patchproof.claims import mean, rate
 from patchproof.report.tables import Drawing, Table
+from patchproof.sessions import TAIL, Spread, in_sessions, spread_of
 from patchproof.study.grid import (
+    Count,
     GridSettings,
     Names,
     cell_of,
+    grouped,
     networks_at,
+    of_values,
     pairs,
     scene_of,
     short_name,
     with_tables,
 )
+from patchproof.study.record import bits, hits_of
 from patchproof.study.study import Cell, Result, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+_LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
+
+
 class PromisesSettings(GridSettings):
     """A run for each scene, network, printer and seed."""
 
     printers: Names = ("coated",)  # that print the designs, and are known while optimizing
-    photos: Annotated[int, Field(ge=10, le=1000)] = 40  # of each print
+    sessions: Count = 4  # of each print
+    photos: Annotated[int, Field(ge=5, le=1000)] = 20  # of each session
     path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
 
 
@@ -77,14 +87,14 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
         made = optimize_scene(scene, folder / "run", controls=("bare",))
         sheet_of(made, folder / "sheet.pdf")
         pdf, photos = folder / "sheet.pdf", folder / "photos"
-        reprint(pdf, made, settings.photos, photos, Hanging(path_traced=settings.path_traced))
+        n, how = settings.sessions * settings.photos, Hanging(path_traced=settings.path_traced)
+        reprint(pdf, made, n, photos, how, sessions=settings.sessions)
         report = verify_photos(photos, folder / "sheet.json", folder / "report")
-    summary = report.summary
+    promise, summary = made.promise, report.summary
     return {
-        "rate": made.promise.rate,
-        "n": made.promise.n,
-        "judged": summary.judged,
-        "recognized": round((summary.rate or 0) * summary.judged),
+        "promised": bits([condition.recognized for condition in promise.conditions]),
+        "per_session": promise.per_session,
+        "sessions": [(session.recognized, session.judged) for session in summary.sessions],
         "verdict": summary.verdict,
     }
 
@@ -94,83 +104,115 @@ def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table
     return _shares(settings, results), _each(results)
 
 
-Count = Mapping[str, Any]  # what a cell counted: promised rate and its n, photographs judged and recognized
+@dataclass(frozen=True)
+class Counted:
+    """One session of one run: what was recognized of the photographs that were judged, and its promise."""
+
+    recognized: int
+    judged: int
+    rate: float
+    spread: Spread
+    alone: Spread  # as if every condition were drawn anew
+
+    @property
+    def share(self) -> float:
+        """What the session shows."""
+        return self.recognized / self.judged
+
+    def interval(self, alone: bool = False) -> tuple[int, int]:
+        """Counts that the promise allows for, or would if photographs were independent."""
+        return self.alone.counts((1,) * self.judged) if alone else self.spread.counts((self.judged,))
+
+    def held(self, alone: bool = False) -> bool:
+        """Whether the count lies in that interval."""
+        low, high = self.interval(alone)
+        return low <= self.recognized <= high
 
 
-def interval_of(count: Count) -> tuple[int, int]:
-    """Counts that the promise allows."""
-    return prediction_interval(round(count["rate"] * count["n"]), count["n"], count["judged"])
+def counted(result: Result) -> list[Counted]:
+    """A run's sessions in which anything could be judged."""
+    hits = hits_of(result.answers["promised"])
+    spread = spread_of(*in_sessions(hits, result.answers["per_session"]))
+    about = sum(hits) / len(hits), spread, spread_of(*in_sessions(hits, 1))
+    return [Counted(recognized, judged, *about) for recognized, judged in result.answers["sessions"] if judged]
 
 
-def held(count: Count) -> bool:
-    """Whether the count lies in the promise's interval."""
-    low, high = interval_of(count)
-    return low <= count["recognized"] <= high
-
-
-def _bias(counts: Sequence[Count]) -> list[float]:
-    return [count["recognized"] / count["judged"] - count["rate"] for count in counts]
-
-
-def _width(counts: Sequence[Count]) -> float:
+def _width(sessions: Sequence[Counted], alone: bool = False) -> float:
     """The median width of the intervals, as a share of the photographs."""
-    ends = [(interval_of(count), count["judged"]) for count in counts]
-    return float(np.median([(high - low) / judged for (low, high), judged in ends]))
+    return float(np.median([np.ptp(session.interval(alone)) / session.judged for session in sessions]))
 
 
-def _by_scene(results: Sequence[Result]) -> dict[str, list[Count]]:
-    """By scene the counts of those that could be judged."""
-    scenes: dict[str, list[Count]] = {}
-    for result in results:
-        if result.answers["judged"]:
-            scenes.setdefault(result.cell.values["name"], []).append(result.answers)
-    return scenes
+def _best_width(sessions: Sequence[Counted]) -> float | None:
+    """Between the 2.5 and 97.5 % points of what sessions showed beside their promise: who knew how much sessions really
+    differ could not promise less. None of too few sessions to say.
+    """
+    if len(sessions) < _LEAST_SESSIONS:
+        return None
+    low, high = np.quantile([session.share - session.rate for session in sessions], (TAIL, 1 - TAIL))
+    return float(high - low)
 
 
 def _shares(settings: PromisesSettings, results: Sequence[Result]) -> Table:
-    scenes = _by_scene(results)
-    groups = {**scenes, "all": [count for counts in scenes.values() for count in counts]} if scenes else {}
-    rows = tuple((name, rate(list(map(held, some))), _width(some), mean(_bias(some))) for name, some in groups.items())
+    scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
+    rows = []
+    for name, group in {**scenes, "all": list(results)}.items():
+        sessions = [session for result in group for session in counted(result)]
+        if not sessions:
+            continue
+        bias = [float(np.mean([s.share - s.rate for s in counted(result)])) for result in group if counted(result)]
+        rows.append(
+            (
+                name,
+                rate([session.held() for session in sessions]),
+                _width(sessions),
+                _best_width(sessions),
+                rate([session.held(alone=True) for session in sessions]),
+                _width(sessions, alone=True),
+                mean(bias),
+            )
+        )
     how = "path-traced" if settings.path_traced else "our own renderer's"
-    about = f"{settings.photos} {how} photographs for each promise; width: median, as a share of the photographs; "
-    about += "bias: recognized minus promised rate"
-    return Table("held", "Promises that held", ("scene", "held", "width", "bias"), rows, about)
+    about = (
+        f"{settings.sessions} sessions of {settings.photos} {how} photographs for each promise; widths: medians, as a "
+        "share of the photographs; best: between the ends of what sessions showed; bias: recognized minus promised "
+        "rate, over runs"
+    )
+    head = ("scene", "held", "width", "best width", "held, if independent", "width, if independent", "bias")
+    return Table("held", "Sessions in which promises held", head, tuple(rows), about)
 
 
 def _each(results: Sequence[Result]) -> Table:
-    head = ("scene", "network", "printer", "seed", "promised", "judged", "recognized", "low", "high")
+    head = ("scene", "network", "printer", "seed", "session", "promised", "correlation")
+    head = (*head, "judged", "recognized", "low", "high", "held", "verdict")
     rows = []
     for result in results:
-        values, count = result.cell.values, result.answers
-        if count["judged"]:
-            printer = short_name(values["scene"]["printer"]["profile"])
-            start = (values["name"], values["network"], printer, values["seed"])
-            what = (count["rate"], count["judged"], count["recognized"], *interval_of(count))
-            rows.append((*start, *what, held(count), count["verdict"]))
-    unseen = len(results) - len(rows)
-    about = f"{unseen} combinations without a photograph that could be judged are left out" if unseen else ""
-    return Table("promises", "Every promise", (*head, "held", "verdict"), tuple(rows), about)
+        values, printer = result.cell.values, short_name(result.cell.values["scene"]["printer"]["profile"])
+        for number, session in enumerate(counted(result), 1):
+            start = (values["name"], values["network"], printer, values["seed"], number)
+            what = (session.rate, session.spread.correlation[0], session.judged, session.recognized)
+            rows.append((*start, *what, *session.interval(), session.held(), result.answers["verdict"]))
+    return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
 
 
 def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
     """The calibration plot."""
-    scenes = _by_scene(results)
-    if not scenes:
-        return ()
+    scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
-        for name, counts in scenes.items():
-            promised = [count["rate"] for count in counts]
-            shares = [count["recognized"] / count["judged"] for count in counts]
-            low, high = np.array([np.array(interval_of(count)) / count["judged"] for count in counts]).T
-            (line,) = axes.plot(promised, shares, "o", label=name, markersize=5)
-            axes.vlines(promised, low, high, colors=line.get_color(), alpha=0.35, linewidth=3)
-        axes.set(xlabel="promised rate", ylabel="share recognized in photographs", xlim=(0, 1.02), ylim=(-0.02, 1.04))
+        for name, group in scenes.items():
+            sessions = [session for result in group for session in counted(result)]
+            if not sessions:
+                continue
+            promised = [session.rate for session in sessions]
+            low, high = np.array([np.array(session.interval()) / session.judged for session in sessions]).T
+            (line,) = axes.plot(promised, [session.share for session in sessions], "o", label=name, markersize=4)
+            axes.vlines(promised, low, high, colors=line.get_color(), alpha=0.2, linewidth=3)
+        axes.set(xlabel="promised rate", ylabel="share recognized in a session", xlim=(0, 1.02), ylim=(-0.02, 1.04))
         axes.legend(loc="upper left", fontsize=8)
 
-    about = "points: what the photographs showed; bars: the promises' 95 % prediction intervals"
+    about = "points: what sessions showed; bars: the promises' 95 % prediction intervals"
     return (Drawing("calibration", "Promised and seen", draw, (6.0, 5.0), about),)
 
 

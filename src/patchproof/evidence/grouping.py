@@ -1,0 +1,91 @@
+"""Which photographs were taken in one session: in one go, in one place and light, with one camera.
+
+In: the folder of the photographs. Out: their sessions, and how that is known. Folders in the folder are sessions. Else
+the cameras' own words decide: another camera, or a pause of half an hour, begins another session. Where they say
+nothing, all are one session: the cautious guess, since photographs of one session count for less.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from patchproof.photo.read import SUFFIXES, pictures_in, readable_formats
+from patchproof.strict import Refused
+
+PAUSE_MINUTES = 30.0
+_EXIF_IFD, _TAKEN, _MODEL = 0x8769, 0x9003, 0x0110
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """Every photograph with the number of its session, sessions' names, and in a few words how they are known."""
+
+    paths: tuple[Path, ...]
+    session: tuple[int, ...]
+    names: tuple[str, ...]
+    known_from: str
+
+    def file(self, number: int) -> str:
+        """A photograph's name in reports: its file's, after that of its folder where folders are sessions."""
+        folder, path = self.names[self.session[number]], self.paths[number]
+        return f"{folder}/{path.name}" if path.parent.name == folder and self.known_from == FOLDERS else path.name
+
+
+FOLDERS, TIMES, GUESS = "folders", "cameras and times", "nothing said so: taken as one"
+
+
+def group(folder: str | Path, without: Path | None = None) -> Grouping:
+    """The photographs in a folder (or the one at a path) by session; refused where there are none. The folder `without`
+    is left out: it has those of controls.
+    """
+    folder = Path(folder)
+    if folder.is_file():
+        return Grouping((folder,), (0,), ("",), GUESS)
+    if not folder.is_dir():
+        raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
+    left_out = None if without is None else without.resolve()
+    inside = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    parts = {"": pictures_in(folder)} | {p.name: pictures_in(p) for p in inside if p.resolve() != left_out}
+    parts = {name: paths for name, paths in parts.items() if paths}
+    if not parts:
+        expected = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}"
+        raise Refused(expected, "none", "copy the photographs there")
+    if set(parts) == {""}:
+        return _by_time(parts[""])
+    pairs = [(path, number) for number, paths in enumerate(parts.values()) for path in paths]
+    return Grouping(tuple(p for p, _ in pairs), tuple(n for _, n in pairs), tuple(parts), FOLDERS)
+
+
+def _by_time(paths: Sequence[Path]) -> Grouping:
+    taken = [words for path in paths if (words := _taken(path)) is not None]
+    if len(taken) < len(paths):
+        return Grouping(tuple(paths), (0,) * len(paths), ("",), GUESS)
+    session, names, last = [0] * len(paths), [], {}
+    for (when, camera), number in sorted(zip(taken, range(len(paths)), strict=True)):
+        before = last.get(camera)
+        if before is None or (when - before[0]).total_seconds() > 60 * PAUSE_MINUTES:
+            before = when, len(names)
+            names.append(f"{when:%Y-%m-%d %H:%M} {camera}".strip())
+        session[number] = before[1]
+        last[camera] = when, before[1]
+    return Grouping(tuple(paths), tuple(session), tuple(names), TIMES)
+
+
+def _taken(path: Path) -> tuple[datetime, str] | None:
+    """When a photograph was taken and by which camera, as its file says; None where it does not."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path, formats=readable_formats()) as image:
+                exif = image.getexif()
+                when, camera = exif.get_ifd(_EXIF_IFD).get(_TAKEN), exif.get(_MODEL)
+        words = " ".join(str(camera or "").split())[:40]
+        return datetime.strptime(str(when).strip("\0 "), "%Y:%m:%d %H:%M:%S"), words
+    except Exception:  # a file that cannot be read is a photograph that will be rejected, and says no time
+        return None

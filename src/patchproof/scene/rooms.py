@@ -1,0 +1,92 @@
+"""Procedural places to photograph an object in, for who has no pictures of real ones: rooms, yards, roads and tables.
+
+In: a place's number. Out: P×P×3 uint8, always the same for a number. A camera stands on a floor before walls or under
+a sky, among boxes that have no class of their own; surfaces wear the textures of `patterns`, light falls unevenly and
+what is far is blurred. Every other place is one of the flat backgrounds of `patterns`, with details of other kinds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from patchproof.color import codes_of
+from patchproof.scene.patterns import background, color, texture
+
+PLACE_PX = 256
+_SEED = 20
+_TEXTURE_PX = 128
+_STRONG = 0.6  # of a texture's color that is left: walls and floors are grayish
+_SKY = 1e6  # how far away it is, in the camera's heights above the floor
+
+
+def place(number: int) -> np.ndarray:
+    """The place of a number, P×P×3 uint8."""
+    rng = np.random.default_rng([_SEED, number])
+    return background(rng, PLACE_PX) if number % 2 else _room(rng, PLACE_PX)
+
+
+def _room(rng: np.random.Generator, px: int) -> np.ndarray:
+    """What a pinhole camera sees that stands one unit above a floor."""
+    import cv2
+
+    ray = _rays(rng, px)
+    depth = np.full(len(ray), _SKY, np.float32)
+    picture = (_paint(rng) * (1.2 - 0.5 * np.clip(ray[:, 1:2], 0, 1))).astype(np.float32)
+    planes = [(1, -1.0)]  # the floor, then walls: (axis, where it stands)
+    if rng.random() < 0.7:
+        planes += [(2, rng.uniform(1.5, 6)), (0, -rng.uniform(1.2, 6)), (0, rng.uniform(1.2, 6))]
+    everywhere = np.arange(len(ray))
+    for axis, at in planes:
+        _put(rng, picture, depth, ray, everywhere, at / _not_zero(ray[:, axis]), axis)
+    for _ in range(int(rng.integers(2, 12))):
+        _put_box(rng, picture, depth, ray)
+    light = rng.normal(size=3).astype(np.float32) * rng.uniform(0, 0.35) / 3
+    picture *= np.clip(1 + np.clip(ray * np.minimum(depth, 5)[:, None], -5, 5) @ light, 0.25, 1.8)[:, None]
+    picture = np.clip(picture, 0, 1).reshape(px, px, 3)
+    return codes_of(cv2.GaussianBlur(picture, (0, 0), float(rng.choice([0.5, 0.8, 1.2, 2.5]))))
+
+
+def _paint(rng: np.random.Generator) -> np.ndarray:
+    """A grayish color, from nearly black to white."""
+    strong, gray = color(rng), rng.uniform(0.08, 1)
+    return np.clip(gray * (1 + _STRONG * (strong - strong.mean())), 0, 1)
+
+
+def _rays(rng: np.random.Generator, px: int) -> np.ndarray:
+    """P²×3 directions by rows: x right, y up, z ahead, of a camera that looks down or up a little."""
+    half, pitch, roll = np.tan(np.radians(rng.uniform(20, 35))), *np.radians(rng.normal(0, (12, 2)))
+    y, x = (0.5 - (np.mgrid[:px, :px].reshape(2, -1) + 0.5) / px) * 2 * half
+    x, y = -x * np.cos(roll) - y * np.sin(roll), -x * np.sin(roll) + y * np.cos(roll)
+    rays = np.stack([x, y * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - y * np.sin(pitch)], -1)
+    return rays.astype(np.float32)
+
+
+def _not_zero(values: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(values) < 1e-9, np.float32(1e-9), values)
+
+
+def _put(rng, picture, depth, ray, where, far, axis) -> None:
+    """A surface square to an axis, so far along the rays at the indices `where`, in front of what is farther."""
+    shown = (far > 0) & (far < depth[where])
+    where, far = where[shown], far[shown]
+    stuff, paint = np.ones((1, 1, 3)), _paint(rng)
+    if rng.random() < 0.7:
+        stuff = texture(rng, _TEXTURE_PX)
+        stuff = stuff.mean(2, keepdims=True) * (1 - _STRONG) + stuff * _STRONG
+    across = np.abs(np.delete(ray[where], axis, 1) * far[:, None])
+    texel = (across * len(stuff) * np.exp(rng.uniform(-1.5, 0.7))).astype(np.int64) % len(stuff)
+    picture[where] = (0.3 + 0.7 * stuff[texel[:, 0], texel[:, 1]]) * paint
+    depth[where] = far
+
+
+def _put_box(rng, picture, depth, ray) -> None:
+    """A box on the floor: it shows where a ray enters the last of its three slabs before it leaves the first."""
+    size = np.exp(rng.uniform(-2.3, 0.3, 3))
+    low = np.array([rng.uniform(-3, 3), -1.0, rng.uniform(1.2, 5)])
+    ends = np.stack([low, low + size]).astype(np.float32)[:, None] / _not_zero(ray)
+    enter, leave = ends.min(0), ends.max(0)
+    hit = np.flatnonzero(enter.max(1) < leave.min(1))
+    face = enter[hit].argmax(1)
+    for axis in range(3):
+        on = hit[face == axis]
+        _put(rng, picture, depth, ray, on, enter[on, axis], axis)
