@@ -46,6 +46,7 @@ STUDIES: dict[str, str] = {
     "robust": "patchproof.experiments.robust",
     "stress": "patchproof.experiments.stress",
     "transfer": "patchproof.experiments.transfer",
+    "verdicts": "patchproof.validation.verdicts",
 }
 _NAME = re.compile(r"[\w=+.,-]{1,120}")
 
