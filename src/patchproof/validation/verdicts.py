@@ -1,9 +1,9 @@
 """How often photographs get which verdict, at true rates from the promised one downwards.
 
-In: a promised rate, correlations within a session, ways to spread photographs over sessions. Out: the chances of `kept`,
-`broken` and `cannot_tell` by correlation, way and true rate: what the rule of `evidence.verdict` is worth. Nothing is
-rendered. A promise is drawn with as many sessions as a real one has and judged as a real one is; the counts' chances at
-a true rate are exact, and figures are means over promises.
+In: a promised rate, correlations within a session, ways to spread photographs over sessions. Out: the chances of
+`kept`, `broken` and `cannot_tell` by correlation, way and true rate: what the rule of `evidence.verdict` is worth.
+Nothing is rendered. A promise is drawn with as many sessions as a real one has and judged as a real one is; the counts'
+chances at a true rate are exact, and figures are means over promises.
 """
 
 from __future__ import annotations
@@ -37,12 +37,8 @@ class VerdictsSettings(Strict):
 
     rate: Share = 0.85
     control: Share = 0.3  # the best control's rate
-    correlations: Annotated[tuple[Annotated[Positive, Field(le=0.9)], ...], Field(min_length=1)] = (
-        0.02,
-        0.05,
-        0.1,
-        0.2,
-    )
+    # of two photographs of one session
+    correlations: Annotated[tuple[Annotated[Positive, Field(le=0.9)], ...], Field(min_length=1)] = (0.02, 0.05, 0.1)
     photos: Count = 40
     sessions: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 2, 4, 8)  # that the photographs are spread over
     below: tuple[Share, ...] = (0.0, 0.1, 0.15, 0.2)  # how far true rates lie under the promised one
@@ -62,7 +58,8 @@ def run(settings: VerdictsSettings, base: Path, cell: Cell) -> dict[str, Any]:
         parts = evenly(settings.photos, sessions)
         rows = [[judge(k, parts, promise).verdict for k in range(settings.photos + 1)] for promise in promises]
         words[str(sessions)] = [
-            [np.mean([row[k] == word for row in rows]) for word in _WORDS] for k in range(len(rows[0]))
+            [float(np.mean([word == each for each in of_count])) for word in _WORDS]
+            for of_count in zip(*rows, strict=True)
         ]
     return words
 
@@ -98,11 +95,10 @@ def _chances(settings: VerdictsSettings, result: Result, sessions: int, rate: fl
 def tables(settings: VerdictsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """Every correlation, way and true rate."""
     rows = tuple(
-        (result.cell.values["correlation"], sessions, settings.rate - below)
-        + tuple(map(float, _chances(settings, result, sessions, settings.rate - below)))
+        (result.cell.values["correlation"], sessions, rate, *map(float, _chances(settings, result, sessions, rate)))
         for result in results
         for sessions in settings.sessions
-        for below in settings.below
+        for rate in (round(settings.rate - below, 6) for below in settings.below)
     )
     about = (
         f"{settings.photos} photographs, {settings.rate:.0%} promised, the best control at {settings.control:.0%}; "
