@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.scene import flat
-from patchproof.scene.image_scene import ERASED_AREA, SPLIT_FROM, erase, load_image_scene
+from patchproof.scene.image_scene import ERASED_AREA, FEW, erase, load_image_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused
 
@@ -45,8 +47,8 @@ def numbers(pictures) -> set[int]:
 @pytest.mark.parametrize("label", ["jeep", "LANDROVER", "jeep, landrover"])
 def test_only_images_of_the_class_are_used(tmp_path, label):
     scene = load_image_scene(settings_of(label, background={"erasing": 0}), folder_of(tmp_path), 0)
-    shown = numbers(scene.pictures(scene.draw("evaluate", 64), (24, 24)))
-    assert len(scene.images) == 12 and shown == set(range(0, 24, 2))
+    shown = [numbers(scene.pictures(scene.draw(stream, 64), (24, 24))) for stream in ("train", "evaluate")]
+    assert len(scene.images) == 12 and set.union(*shown) == set(range(0, 24, 2))
 
 
 def test_indices_and_accepted_labels_count(tmp_path):
@@ -67,13 +69,17 @@ def test_another_template_is_the_scene_made_for_it(tmp_path):
 
 
 def test_what_is_promised_was_not_optimized_on(tmp_path):
-    scene = load_image_scene(settings_of("cup", background={"erasing": 0}), folder_of(tmp_path, 2 * SPLIT_FROM), 0)
+    scene = load_image_scene(settings_of("cup", background={"erasing": 0}), folder_of(tmp_path, 2 * FEW), 0)
     seen = {s: numbers(scene.pictures(scene.draw(s, 128), (24, 24))) for s in ("train", "select", "promise", "reprint")}
     assert seen["train"] == seen["select"] and seen["promise"] == seen["reprint"]
-    assert not seen["train"] & seen["promise"] and len(seen["train"] | seen["promise"]) == SPLIT_FROM
+    assert not seen["train"] & seen["promise"] and len(seen["train"] | seen["promise"]) == FEW
     assert all("unreadable" in warning for warning in scene.warnings)
     few = load_image_scene(settings_of("cup"), folder_of_few(tmp_path), 0)
-    assert few.warnings[0] == "the promise is made on the same 3 images that the patch is optimized on"
+    assert few.warnings[0] == "the promise is made on 2 images, and says little of others: give 20 or more"
+    pictures = {stream: few.draw(stream, 64).pose.background[:, 0] for stream in ("train", "promise")}
+    assert pictures["train"].max() < 1 / 3 <= pictures["promise"].min()
+    alone = replace(few, images=few.images[:1]).draw("promise", 8).pose.background[:, 0]
+    assert alone.min() < 0.5  # where it is alone, it serves all
 
 
 def folder_of_few(tmp_path):

@@ -69,7 +69,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
         assert all(option in listed for option in arguments if option.startswith("--")), line
 
 
-@pytest.mark.parametrize(("name", "count"), [("promises", 4 * 2 * 2 * 2), ("ablation", 4 * (1 + 16))])
+@pytest.mark.parametrize(("name", "count"), [("promises", 6 * 2), ("ablation", 4 * (1 + 16))])
 def test_the_studies_that_are_quoted_can_be_run_again(name, count):
     study = import_module(f"patchproof.validation.{name}").STUDY
     folder = README.parent / ".readme" / name
@@ -86,7 +86,7 @@ def test_python(tmp_path, monkeypatch, capsys):
     gradient, difference = (float(value) for value in re.findall(r"tensor\((\S+?)[,)]", capsys.readouterr().out)[:2])
     # float32 pictures of 2 × 96 × 96 pixels, summed, and a difference over 0.04
     assert gradient == pytest.approx(difference, rel=0.02) and gradient != 0
-    assert names["report"].summary.verdict in {"kept", "broken", "cannot_tell"}
+    assert names["report"].summary.judged == 6
 
 
 def words(path: Path) -> str:

@@ -17,6 +17,7 @@ def promise_lines(promise: Any) -> list[str]:
     lines = [
         promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
+        f"in {-(-promise.n // promise.per_session)} sessions "
         f"[{low:.1%}, {high:.1%}] by {promise.models[0].name}",
     ]
     lines += [
@@ -41,6 +42,8 @@ def verdict_lines(report: Any) -> list[str]:
     summary = report.summary
     lines = [f"verdict: {summary.verdict} (effect: {summary.effect})"]
     lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
+    if summary.sessions:
+        lines.append(f"sessions: {len(summary.sessions)} ({summary.sessions_known_from})")
     if summary.rate is not None:
         low, high = summary.interval
         lines.append(f"recognized: {summary.rate:.1%} [{low:.1%}, {high:.1%}]")

@@ -21,15 +21,16 @@ from patchproof.report.photo_table import photos_csv
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 
 _WORDS = {
-    "kept": ("Promise kept", "The photographs show what was promised before printing."),
+    "kept": ("Promise kept", "The photographs prove a rate near the one that was promised before printing."),
     "broken": ("Promise broken", "The photographs show {} than was promised before printing."),
-    "cannot_tell": ("Cannot tell", "The photographs are too weak as evidence, one way or the other."),
+    "cannot_tell": ("Cannot tell", "The photographs neither break the promise nor prove it."),
 }
 _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
     "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
     "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
 }
+MOST_SESSIONS = 12  # with a bar of their own
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
 
@@ -99,6 +100,10 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
     rows, judged = [], summary["judged"]
     if summary["rate"] is not None:
         rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
+        sessions = [session for session in summary["sessions"] if session["judged"]]
+        for session in sessions[:MOST_SESSIONS] if len(sessions) > 1 else ():
+            name = f"Session {session['name'] or '(no folder)'}: {session['recognized']} of {session['judged']}"
+            rows.append((name, session["recognized"] / session["judged"], None, "seen"))
     if promise:
         rows.append(("Promised", promise["rate"], promise["interval"], "promised"))
     if summary["matched_rate"] is not None:

@@ -6,7 +6,7 @@ square, turned by `view.roll_deg`, as large as `view.patch_share` says. In train
 it may be erased, so that the patch does not lean on one feature. White paper is sRGB white, and nothing else is
 modeled: what is promised holds for a patch pasted into such images, not for a print in the world.
 
-With `SPLIT_FROM` images or more, training and selection see one half and promise, reprint and evaluation the other.
+Training and selection see one half of the images, promise, reprint and evaluation the other; of a single one, the same.
 
 Sources: Brown et al., Adversarial Patch, 2017 (here also with the assistive goal); Zhong et al., Random Erasing Data
 Augmentation, AAAI 2020, algorithm 1.
@@ -33,7 +33,8 @@ from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, expand
 
-SPLIT_FROM = 20
+SPLIT_FROM = 2
+FEW = 20  # images, of which half say little of others
 _OPTIMIZED_ON = {"train", "select"}
 ERASED_AREA, ERASED_ASPECT = (0.02, 0.33), (0.3, 3.3)  # shares of the centered square; height over width
 _ERASED_CELLS = 224  # random values per side of the centered square: one a pixel at networks' usual size
@@ -112,7 +113,10 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     piece = _piece(settings, identity)
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
     if len(images) < SPLIT_FROM:
-        warnings.append(f"the promise is made on the same {len(images)} images that the patch is optimized on")
+        warnings.append("the promise is made on the same image that the patch is optimized on")
+    elif len(images) < FEW:
+        promised = len(images) - len(images) // 2
+        warnings.append(f"the promise is made on {promised} images, and says little of others: give {FEW} or more")
     return ImageScene(settings, base, seed, identity, piece, images, notes=tuple(warnings))
 
 
