@@ -40,6 +40,10 @@ def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
     assert all(len(parts[stream][0]) + len(parts[stream][1]) >= LEAST_PLACES[stream] for stream in STREAMS)
     assert shown(backgrounds, "reprint") == parts["evaluate"]
     assert bool(backgrounds.notes) == (count < FEW)
+    if count == FEW:  # half of the views show real places
+        chosen = backgrounds.chosen("promise", (np.arange(4000) + 0.5) / 4000) * len(backgrounds.pictures)
+        real = [not isinstance(backgrounds.pictures[int(each)], int) for each in chosen]
+        assert np.mean(real) == pytest.approx(0.5, abs=0.02)
     if count == 200:
         assert len(made) == 0 and len(parts["promise"][0]) == 60
 

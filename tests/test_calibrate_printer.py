@@ -28,14 +28,19 @@ from patchproof.calibrate.color_ladder import (
     fit_white_black,
     kinds_of_maps,
 )
+from patchproof.channel.camera import encoded
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer, vary
 from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import Photo
+from patchproof.render.photograph import photograph
+from patchproof.render.stage import set_stage
 from patchproof.reprints.chart_photos import chart_manifest, photograph_page, printed_page
 from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
+from patchproof.scene.conditions import with_values
+from patchproof.scene.scene import make_scene
 from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import dump_manifest
 from patchproof.strict import Refused
@@ -328,9 +333,33 @@ def printer_errors(seed: int, swatches: int, camera: Camera) -> tuple[float, flo
 
 def test_tone_curves_close_and_a_camera_without_one_is_srgb():
     camera, codes = toned_camera(), np.linspace(0, 1, 200)
-    np.testing.assert_allclose(codes_of_light(light_of_codes(codes, camera), camera), codes, atol=1e-9)
+    light = torch.tensor(light_of_codes(codes, camera))
+    np.testing.assert_allclose(codes_of_light(light, camera), codes, atol=1e-9)
     np.testing.assert_allclose(light_of_codes(codes, load_camera("phone")), linear_from_srgb(codes))
-    np.testing.assert_allclose(codes_of_light(np.array([2.0, -1.0]), camera), [1, 0])
+    np.testing.assert_allclose(encoded(torch.tensor([2.0, -1.0]), camera), [1, 0])
+    middle = torch.linspace(0.05, 0.95, 7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: codes_of_light(x, camera), middle)
+
+
+def test_a_scene_s_camera_writes_with_its_own_tone_curve(tmp_path):
+    """In both ways to expose: pixel by pixel, and with blur that needs the whole picture."""
+    camera = toned_camera()
+    scene = make_scene(
+        {
+            "object": {"mesh": "primitive:carton", "length_mm": 300},
+            "patch": {"width_mm": 120, "height_mm": 120},
+            "target": {"label": "carton", "models": ["builtin"]},
+            "background": {"color": [0.5, 0.5, 0.5]},
+            "camera": {"photo_px": camera.image_px},
+        }
+    )
+    toned, plain = (set_stage(replace(scene, camera=each)) for each in (camera, camera.changed(tone_light=None)))
+    design, views = torch.full((3, 8, 8), 0.5), scene.draw("evaluate", 2)
+    for sharp in (True, False):
+        drawn = with_values(views, noise=0, blur_px=0 if sharp else 40, jpeg=0)
+        own, usual = (photograph(stage, design, drawn, (64, 64)) for stage in (toned, plain))
+        light = linear_from_srgb(usual.double())
+        torch.testing.assert_close(own.double(), codes_of_light(light, camera), atol=2e-3, rtol=0)
 
 
 def test_a_tone_curve_that_falls_is_refused(tmp_path):

@@ -2,7 +2,7 @@
 
 In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order:
 vignetting, blur (optics, focus, straight motion), exposure and white balance, shot and read noise, clipping, tone curve
-(sRGB's). The lens's distortion has its own module.
+(sRGB's, or that of a calibrated camera). The lens's distortion has its own module.
 
 Blur, motion, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
 photograph gets what is left of them after averaging: they shrink with `scale`; what falls under the threshold of
@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from patchproof.channel.effects import Sensor
-from patchproof.color import srgb_from_linear
+from patchproof.channel.lens import Camera
+from patchproof.channel.tone import codes_of_light
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4
@@ -29,8 +30,15 @@ SMALLEST_JPEG_SCALE = 0.5
 READ_SHARE = 0.25
 
 
-def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, diagonal_share: float = 1.0) -> Tensor:
-    """The picture that a camera makes; one row of `sensor` per picture.
+def develop(
+    linear: Tensor,
+    sensor: Sensor,
+    scale: float,
+    jpeg: bool = True,
+    diagonal_share: float = 1.0,
+    camera: Camera | None = None,
+) -> Tensor:
+    """The picture that a camera makes, with the tone curve of `camera` if it has one; one row of `sensor` per picture.
 
     `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
     `diagonal_share` is what vignetting needs to know, from `diagonal_share_of`.
@@ -43,7 +51,7 @@ def develop(linear: Tensor, sensor: Sensor, scale: float, jpeg: bool = True, dia
     light = blurred(light, on(sensor.blur_px * scale))
     light = moved(light, on(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
-    picture = encoded(noisy(light, on(sensor.noise * scale), sensor.noise_seed))
+    picture = encoded(noisy(light, on(sensor.noise * scale), sensor.noise_seed), camera)
     return compressed(picture, on(sensor.jpeg)) if _is_stored(sensor, scale, jpeg) else picture
 
 
@@ -75,9 +83,9 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
     return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
 
 
-def encoded(linear: Tensor) -> Tensor:
-    """Clipped light as sRGB."""
-    return srgb_from_linear(linear.clamp(0, 1))
+def encoded(linear: Tensor, camera: Camera | None = None) -> Tensor:
+    """Clipped light as code values in [0, 1]."""
+    return codes_of_light(linear.clamp(0, 1), camera)
 
 
 def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tensor:

@@ -8,6 +8,8 @@ differ between channels, and pictures that a phone tone-maps from place to place
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from patchproof.channel.lens import Camera
 from patchproof.color import linear_from_srgb, srgb_from_linear
@@ -20,9 +22,11 @@ def light_of_codes(codes: np.ndarray, camera: Camera | None) -> np.ndarray:
     return np.interp(codes, np.linspace(0, 1, len(camera.tone_light)), camera.tone_light)
 
 
-def codes_of_light(linear: np.ndarray, camera: Camera | None) -> np.ndarray:
-    """The code values that a camera writes for linear light; what is brighter than 1 clips."""
-    linear = np.clip(linear, 0, 1)
+def codes_of_light(linear: Tensor, camera: Camera | None) -> Tensor:
+    """The code values that a camera writes for linear light in [0, 1]; differentiable."""
     if camera is None or camera.tone_light is None:
         return srgb_from_linear(linear)
-    return np.interp(linear, camera.tone_light, np.linspace(0, 1, len(camera.tone_light)))
+    light = torch.as_tensor(camera.tone_light).to(linear)
+    above = torch.searchsorted(light, linear.detach().contiguous()).clamp(1, len(light) - 1)
+    below = light[above - 1]
+    return (above - 1 + (linear - below) / (light[above] - below)) / (len(light) - 1)

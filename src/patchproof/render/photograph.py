@@ -82,15 +82,15 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
         if camera is not None:
             light = distorted(light, camera, views.size_px)
         share = diagonal_share_of(views.size_px, views.stage.scene.settings.camera.photo_px)
-        return develop(light, sensor, scale, jpeg, share)
+        return develop(light, sensor, scale, jpeg, share, camera)
     image = views.bare_exposed
     if shown is not None:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = encoded(PAPER_BACK_LINEAR * views.gains.index_select(0, piece.back_pixel // pixels))
+        back = encoded(PAPER_BACK_LINEAR * views.gains.index_select(0, piece.back_pixel // pixels), camera)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
         light = _piece_light(views, shown) * views.gains.index_select(0, piece.view)
-        image = _blend(image, piece.pixel, piece.share, encoded(light), False)
+        image = _blend(image, piece.pixel, piece.share, encoded(light, camera), False)
     return _as_pictures(views, image)
 
 

@@ -123,15 +123,16 @@ class Views:
     @cached_property
     def bare_exposed(self) -> Tensor:
         """The bare object as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
+        camera = self.stage.camera
         if self.object is not None and self.object.samples > 1:
-            return encoded((self.bare.view(len(self.conditions), -1, 3) * self.gains[:, None]).view(-1, 3))
+            return encoded((self.bare.view(len(self.conditions), -1, 3) * self.gains[:, None]).view(-1, 3), camera)
         # the background has 256 codes per view and channel, which are exposed as a table
-        light = LIGHT_OF_CODE[:, None] * self.gains[:, None].cpu().double().numpy()
-        image = _looked_up(self.background, srgb_from_linear(light.clip(0, 1)), self.stage.device)
+        light = torch.tensor(LIGHT_OF_CODE)[:, None] * self.gains[:, None].cpu().double()
+        image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
         if self.object is None:
             return image
         color = self._object_color(self._own_texels) * self.gains.index_select(0, self.object.view)
-        return image.index_copy(0, self.object.pixel, encoded(color))
+        return image.index_copy(0, self.object.pixel, encoded(color, camera))
 
     @cached_property
     def gains(self) -> Tensor:

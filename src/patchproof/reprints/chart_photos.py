@@ -20,8 +20,7 @@ from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.light import Lamp, Lighting, irradiance
-from patchproof.channel.tone import codes_of_light
-from patchproof.color import codes_of, linear_from_srgb, photo_codes_of
+from patchproof.color import codes_of, photo_codes_of
 from patchproof.output import image_bytes, image_pixels
 from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
@@ -112,8 +111,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
         jpeg=np.array([rng.uniform(60, 95)]),
     )
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
-    picture = develop(picture, sensor, 1.0, jpeg=False)[0].permute(1, 2, 0).numpy().astype(float)
-    codes = codes_of_light(linear_from_srgb(picture), camera)
+    codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
     return Shot(Photo(image_pixels(file), None), at_middle * exposure * white_balance)
 

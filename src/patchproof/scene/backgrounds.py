@@ -5,7 +5,8 @@ The photograph and its centered square show the same crop, so that what trains a
 
 Each file of a folder belongs to one part only: to what trains, selects, promises, or is reprinted and evaluated. A rate
 in places that training knows would say little of the place where somebody will take photographs. Parts with few files
-are filled up with procedural places (`rooms`). A picture that is named itself is the known place of all parts.
+are filled up with procedural places (`rooms`), which are seen as often as the files. A picture that is named itself is
+the known place of all parts.
 """
 
 from __future__ import annotations
@@ -55,14 +56,15 @@ class Backgrounds:
     def _levels(self, number: int) -> list[np.ndarray]:
         import cv2
 
-        if number not in self._reduced:
-            picture = self.pictures[number]
+        picture = self.pictures[number]
+        key = picture if isinstance(picture, int) else -id(picture)  # a picture may stand there several times
+        if key not in self._reduced:
             levels = [place(picture) if isinstance(picture, int) else picture]
             while min(levels[-1].shape[:2]) >= 256:
                 height, width = levels[-1].shape[:2]
                 levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-            self._reduced[number] = levels
-        return self._reduced[number]
+            self._reduced[key] = levels
+        return self._reduced[key]
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is
@@ -114,7 +116,8 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
     for part, (name, least) in enumerate(LEAST_PLACES.items()):
         first, own = len(pictures), [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
         more = max(0, least - len(own))
-        pictures += [*map(_read, own), *(_PART * part + i for i in range(more))]
+        often = max(1, round(more / max(1, len(own))))
+        pictures += [*often * list(map(_read, own)), *(_PART * part + i for i in range(more))]
         ends[name], filled = (first, len(pictures)), filled + more
     notes = ()
     if 0 < len(files) < FEW:
