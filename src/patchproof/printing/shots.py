@@ -122,8 +122,9 @@ def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str,
 def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
     control = promise.controls[plan.control]
     lines = [
-        f"Promised: {promise.rate:.0%} recognized as {promise.target.label}; the best control ({plan.control}) "
-        f"{control.rate:.0%}."
+        f"Promised: {promise.rate:.0%} recognized as {promise.target.label}, of {promise.n} views in "
+        f"{promise.sessions} sessions, each with a place, light, camera and print of its own; the best control "
+        f"({plan.control}) {control.rate:.0%}."
     ]
     lines.append(
         f"A verdict asks the photographs to prove a rate of {asked_rate(promise):.0%}. What they will show if the "

@@ -17,7 +17,7 @@ def promise_lines(promise: Any) -> list[str]:
     lines = [
         promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
-        f"in {-(-promise.n // promise.per_session)} sessions "
+        f"in {promise.sessions} sessions "
         f"[{low:.1%}, {high:.1%}] by {promise.models[0].name}",
     ]
     lines += [

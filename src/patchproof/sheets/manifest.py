@@ -139,6 +139,11 @@ class Promise(Strict):
     conditions: tuple[ConditionClaim, ...]
 
     @property
+    def sessions(self) -> int:
+        """How many sessions it was made of."""
+        return -(-self.n // self.per_session)
+
+    @property
     def spread(self) -> Spread:
         """What its conditions say of photographs to come."""
         hits = [condition.recognized for condition in self.conditions]
