@@ -134,6 +134,34 @@ def test_figures_of_the_promises_are_the_stored_ones():
     assert f"{count} promises" in words(README) and f": {share}." in words(README)
 
 
+def rows_of(name: str) -> list[dict[str, str]]:
+    with (NOTEBOOK.parent / name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_figures_of_verdicts_are_the_stored_ones():
+    kept = {
+        (float(row["correlation"]), int(row["sessions"]), round(float(row["true rate"]), 2)): row
+        for row in rows_of("verdicts/verdicts_verdicts.csv")
+    }
+    for correlation, sessions in {key[:2] for key in kept} - {key[:2] for key in kept if key[1] == 2}:
+        chances = [float(kept[correlation, sessions, rate]["kept"]) for rate in (0.85, 0.75, 0.7, 0.65)]
+        chances.append(float(kept[correlation, sessions, 0.65]["broken"]))
+        cells = " | ".join(f"{100 * chance:.0f} %" for chance in chances)
+        assert f"| {correlation:g} | {sessions} | {cells} |" in words(NOTEBOOK)
+
+
+def test_figures_of_smaller_pieces_are_the_stored_ones():
+    cells = rows_of("layouts/smaller_cells.csv")
+    for scene, name in (("postbox_025", "letter box"), ("light_025", "traffic light"), ("suv_025", "SUV")):
+        rates = [
+            100 * np.mean([float(row["design"]) for row in cells if (row["scene"], row["layout"]) == (scene, size)])
+            for size in ("85 mm", "100 mm", "115 mm", "130 mm")
+        ]
+        said = " | ".join(f"{rate:.0f}" for rate in rates)
+        assert any(line.startswith(f"| {name} |") and said in line for line in NOTEBOOK.read_text("utf-8").splitlines())
+
+
 def test_figures_of_layouts_are_the_stored_ones():
     with (NOTEBOOK.parent / "layouts" / "layouts_layouts.csv").open(encoding="utf-8") as file:
         whole, framed = csv.DictReader(file)

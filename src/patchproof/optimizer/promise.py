@@ -26,7 +26,7 @@ from patchproof.sessions import difference_in_sessions, in_sessions, spread_of
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 # Many short sessions: how much they differ is known from their number, not from their length.
-PROMISE_VIEWS, PER_SESSION = 600, 6
+PROMISE_VIEWS, PER_SESSION = 400, 4
 CONTROL_VIEWS = 2  # of each session: differences are paired, and need fewer
 CONTROLS = ("bare", "mean", "gray", "noise")
 
