@@ -154,14 +154,16 @@ def _tensor(name: str, meta: dict[str, Any], stored: Tensor) -> Tensor:
     dtype = DTYPES.get(whole(meta["dtype"], 0, 99))
     if dtype is None or whole(meta["layout"], 0, 99) != STRIDED:
         raise Unwanted(f"{quoted(name)} of a type that is not supported")
-    sizes, strides = ([whole(size["as_int"], 0, MAX_NUMBERS) for size in meta[key]] for key in ("sizes", "strides"))
-    offset = whole(meta["storage_offset"]["as_int"], 0, MAX_NUMBERS)
-    if len(sizes) > MAX_DIMENSIONS or math.prod(sizes) > MAX_NUMBERS:
+    sizes, strides = ([whole(size["as_int"], 0, 1 << 62) for size in meta[key]] for key in ("sizes", "strides"))
+    offset = whole(meta["storage_offset"]["as_int"], 0, 1 << 62)
+    if len(sizes) > MAX_DIMENSIONS or math.prod(max(1, size) for size in sizes) > MAX_NUMBERS:
         raise Unwanted(f"{quoted(name)} of an absurd size")
     if len(sizes) != len(strides):
         raise Unwanted(f"{quoted(name)} of {len(sizes)} sizes and {len(strides)} strides")
     if 0 in sizes:
         return torch.empty(sizes, dtype=dtype)
+    if max(strides, default=0) > MAX_NUMBERS:
+        raise Unwanted(f"{quoted(name)} with a stride of {max(strides)}")
     last = offset + sum((size - 1) * stride for size, stride in zip(sizes, strides, strict=True))
     if (last + 1) * dtype.itemsize > len(stored):
         raise Unwanted(f"{quoted(name)} outside of its bytes")
