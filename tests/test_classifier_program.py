@@ -1,45 +1,18 @@
 """Exported programs, honest and hostile: what an archive wants to execute must never happen."""
 
-import io
 import json
-import os
-import pickle
 import shutil
+import warnings
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
-from patchproof.classifier import load_classifier, program
+from archives import LABELS, ConvNeXt, Hostile, ResNet, Small, ViT, exported, save, seeded
+from patchproof.classifier import center_square, load_classifier, program
 from patchproof.classifier.program import load_program
 from patchproof.strict import Refused
-
-LABELS = ["red", "green", "blue", "none"]
-
-
-class Small(nn.Module):
-    def __init__(self):
-        super().__init__()
-        generator = torch.Generator().manual_seed(1)
-        self.conv = nn.Conv2d(3, 4, 3, padding=1)
-        for parameter in self.parameters():
-            parameter.data = torch.randn(parameter.shape, generator=generator)
-        self.register_buffer("mean", torch.full((1, 3, 1, 1), 0.5), persistent=False)  # a constant of the program
-
-    def forward(self, x):
-        return torch.relu(self.conv(x - self.mean)).flatten(2).mean(2)
-
-
-def save(folder: Path, batch: int | None = None) -> Path:
-    """A small program of any batch size, or of one, with its card."""
-    sizes = None if batch else ({0: torch.export.Dim("n", min=1, max=64)},)
-    example = (torch.rand(batch or 2, 3, 16, 16),)
-    path = folder / "small.pt2"
-    torch.export.save(torch.export.export(Small().eval(), example, dynamic_shapes=sizes), str(path))
-    path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
-    return path
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,65 +26,11 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory) -> Path:
-    path = save(tmp_path_factory.mktemp("honest"))
+    path = save(tmp_path_factory.mktemp("honest"), exported(Small()))
     with zipfile.ZipFile(path) as archive:
         if not any(name.endswith("model_weights_config.json") for name in archive.namelist()):
             pytest.skip(f"torch {torch.__version__} saves weights as pickles, which are refused; 2.9 does not")
     return path
-
-
-class Hostile:
-    """One archive that wants to make a folder, the proof that something of it was executed."""
-
-    def __init__(self, folder: Path, honest: Path):
-        self.path, self.mark = folder / "hostile.pt2", folder / "executed"
-        shutil.copy(honest.with_suffix(".json"), self.path.with_suffix(".json"))
-        with zipfile.ZipFile(honest) as archive:
-            self.members = {info.filename: archive.read(info) for info in archive.infolist()}
-        self.root = next(iter(self.members)).partition("/")[0]
-
-    def pickle(self) -> bytes:
-        mark = str(self.mark)
-
-        class MakesAFolder:
-            def __reduce__(self):
-                return os.mkdir, (mark,)
-
-        return pickle.dumps(MakesAFolder())
-
-    def torch_pickle(self) -> bytes:
-        """The same in the zip that torch.save makes."""
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w") as archive:
-            archive.writestr("archive/data.pkl", self.pickle())
-            archive.writestr("archive/version", "3\n")
-            archive.writestr("archive/byteorder", "little")
-        return buffer.getvalue()
-
-    def python(self) -> str:
-        return f"__import__('os').mkdir({str(self.mark)!r})"
-
-    def edit(self, name: str, change) -> "Hostile":
-        """Change a JSON member by a function of its parsed content."""
-        content = json.loads(self.members[f"{self.root}/{name}"])
-        change(content)
-        self.members[f"{self.root}/{name}"] = json.dumps(content).encode()
-        return self
-
-    def add(self, name: str, content: bytes) -> "Hostile":
-        self.members[f"{self.root}/{name}"] = content
-        return self
-
-    def write(self) -> Path:
-        with zipfile.ZipFile(self.path, "w") as archive:
-            for name, content in self.members.items():
-                archive.writestr(name, content)
-        return self.path
-
-    def executed(self) -> bool:
-        was = self.mark.exists()
-        shutil.rmtree(self.mark, ignore_errors=True)
-        return was
 
 
 @pytest.fixture
@@ -344,16 +263,38 @@ def test_an_honest_program_gives_the_networks_logits_and_gradients(honest):
     assert (classifier.name, classifier.input_px, list(classifier.labels)) == ("file:small.pt2", 16, LABELS)
     assert len(classifier.sha256) == 64
     photos = torch.rand(70, 3, 16, 16, requires_grad=True)  # more than the 64 that the program takes at once
-    torch.testing.assert_close(classifier.logits(photos), Small()(photos))
-    ours, theirs = (torch.autograd.grad(f(photos)[:, 0].sum(), photos)[0] for f in (classifier.logits, Small()))
+    torch.testing.assert_close(classifier.logits(photos), seeded(Small())(photos))
+    ours, theirs = (torch.autograd.grad(f(photos)[:, 0].sum(), photos)[0] for f in (classifier.logits, seeded(Small())))
     torch.testing.assert_close(ours, theirs)
     torch.testing.assert_close(classifier.logits(photos[:1]), classifier.logits(photos)[:1])
 
 
+@pytest.mark.parametrize("make", [ResNet, ViT, ConvNeXt])
+def test_logits_and_gradients_are_torchs_also_when_decomposed(make, tmp_path, honest):
+    program = exported(make())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of itself
+        decomposed = program.run_decompositions()
+    truth = program.module()
+    for network in (load_program(save(tmp_path, form)).network for form in (program, decomposed)):
+        for batch, order in ((1, torch.contiguous_format), (5, torch.contiguous_format), (5, torch.channels_last)):
+            photos = torch.rand(batch, 3, 16, 16).to(memory_format=order)
+            (logits, gradient), (expected, true_gradient) = (answered(f, photos) for f in (network, truth))
+            torch.testing.assert_close(logits, expected, rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(gradient, true_gradient, rtol=1e-5, atol=1e-5)
+
+
+def answered(network, photos):
+    """Logits and the gradient of their squares."""
+    photos = photos.clone().requires_grad_()
+    logits = network(photos)
+    return logits.detach(), torch.autograd.grad(logits.square().sum(), photos)[0]
+
+
 def test_a_program_of_one_batch_size_takes_any_number(tmp_path, honest):
-    classifier = load_program(save(tmp_path, batch=3))
+    classifier = load_program(save(tmp_path, exported(Small(), batch=3)))
     photos = torch.rand(7, 3, 16, 16)
-    torch.testing.assert_close(classifier.logits(photos), Small()(photos))
+    torch.testing.assert_close(classifier.logits(photos), seeded(Small())(photos))
 
 
 def test_labels_may_lie_in_a_list_beside_the_card(tmp_path, honest):
@@ -372,3 +313,7 @@ def test_real_networks_recognize_a_photograph(data):
     for name in ("mobilenet_v1_0.25_128", "squeezenet1.1_224"):
         classifier = load_classifier(f"file:${{PATCHPROOF_DATA}}/models/{name}.pt2", Path("."))
         assert classifier.logits(photo).argmax() == 967  # espresso
+        square = center_square(photo, classifier.input_px)
+        truth = torch.export.load(str(data / "models" / f"{name}.pt2")).module()
+        for ours, theirs in zip(answered(classifier.network, square), answered(truth, square), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5 * float(theirs.abs().max()))

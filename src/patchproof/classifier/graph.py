@@ -283,6 +283,9 @@ def _bound(named: list[tuple[str, Any]], schema: Sequence[Any] | None, target: s
     if len(given) != len(named) or given.get("train") is True or given.get("training") is True:
         raise Unwanted(f"the operator {quoted(target)} in training mode, or an argument twice")
     keywords = {argument.name: given.pop(argument.name) for argument in schema if argument.name in given}
+    names = {argument.name for argument in schema}
+    if "device" in names and not any(isinstance(argument.type, torch.TensorType) for argument in schema):
+        keywords.setdefault("device", Here)  # new tensors lie where the pictures do
     if given:
         raise Unwanted(f"the argument {quoted(next(iter(given)))} of {target}")
     arguments = []

@@ -24,7 +24,7 @@ OPERATORS = frozenset(
     # normalization
     "batch_norm.default layer_norm.default native_layer_norm.default "
     "group_norm.default instance_norm.default rms_norm.default "
-    "linalg_vector_norm.default norm.ScalarOpt_dim _weight_norm.default dropout.default dropout_.default "
+    "linalg_vector_norm.default norm.ScalarOpt_dim dropout.default dropout_.default "
     "feature_dropout.default feature_dropout_.default "
     # activations
     "relu.default relu_.default relu6.default relu6_.default hardtanh.default hardtanh_.default sigmoid.default "
@@ -49,7 +49,8 @@ OPERATORS = frozenset(
     # arithmetic
     "add.Tensor add_.Tensor add.Scalar add_.Scalar sub.Tensor sub_.Tensor sub.Scalar rsub.Tensor rsub.Scalar "
     "mul.Tensor mul_.Tensor mul.Scalar mul_.Scalar div.Tensor div_.Tensor div.Scalar div.Tensor_mode "
-    "div.Scalar_mode floor_divide.default remainder.Scalar remainder.Tensor neg.default abs.default exp.default "
+    "div.Scalar_mode floor_divide.default remainder.Scalar remainder.Tensor "
+    "fmod.Scalar fmod.Tensor neg.default abs.default exp.default "
     "expm1.default log.default log1p.default log2.default erf.default sin.default cos.default atan.default "
     "sqrt.default rsqrt.default square.default reciprocal.default pow.Tensor_Scalar pow.Tensor_Tensor pow.Scalar "
     "sign.default floor.default ceil.default round.default trunc.default minimum.default maximum.default "
