@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from archives import Hostile, exported, save
-from patchproof.classifier import graph, load_classifier
+from patchproof.classifier import description, load_classifier
 from patchproof.strict import Refused
 
 PROGRAM = "models/model.json"
@@ -395,10 +395,10 @@ def test_hostile_descriptions(name, hostile, watch):
 
 
 def test_more_operators_than_any_network_has_are_refused(hostile, watch, monkeypatch):
-    monkeypatch.setattr(graph, "MAX_STEPS", len(nodes(json.loads(hostile.members[f"{hostile.root}/{PROGRAM}"]))))
+    monkeypatch.setattr(description, "MAX_STEPS", len(nodes(json.loads(hostile.members[f"{hostile.root}/{PROGRAM}"]))))
     assert isinstance(answer(hostile, watch), Tensor)
     hostile.edit(PROGRAM, lambda c: nodes(c).append(nodes(c)[0]))
-    assert f"more than {graph.MAX_STEPS} operators" in answer(hostile, watch)
+    assert f"more than {description.MAX_STEPS} operators" in answer(hostile, watch)
 
 
 TEXTS = {

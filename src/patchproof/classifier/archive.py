@@ -1,7 +1,7 @@
 """A torch.export archive, read without torch.export: its program as JSON, its weights as tensors.
 
-In: the bytes of NAME.pt2, from anyone. Out: what its JSON says, of which nothing is believed yet (see graph.py), and
-plain tensors, or a refusal. Members are allowed by list, so what a later torch adds is refused until it is looked at.
+In: the bytes of NAME.pt2, from anyone. Out: plain tensors and what its JSON says, of which nothing is believed yet (see
+description.py), or a refusal. Members are allowed by list, so what a later torch adds is refused until it is looked at.
 Left out on purpose, because they are or may be pickles: sample inputs (in honest files too: never read), tensor
 subclasses, custom and opaque objects, layouts older than torch 2.9's; and compiled libraries.
 

@@ -3,9 +3,9 @@
 The JSON says `input_px`, the side of the square that the program takes, and `labels`: a list, or the name of a JSON
 file beside it that holds one. The program takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits.
 A program exported for one batch size, or for a range of them, is called in such batches.
-No pickle and no code of the file is executed, since none is looked for: archive.py reads tensors and JSON, graph.py
-computes the operators that the JSON names, if they are on the list in operators.py. torch's own loader, which writes
-names of the file into Python, is not called.
+Nothing of the file is executed: archive.py reads tensors and JSON, description.py the graph from it, and graph.py
+computes its operators, which are on the list in operators.py. torch's own loader, which writes names of the file into
+Python, is not called.
 
 To make one: `torch.export.save(torch.export.export(network.eval(), (torch.rand(2, 3, S, S),),
 dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)), "NAME.pt2")`.
@@ -21,7 +21,7 @@ import torch
 
 from patchproof.classifier.archive import Unwanted, read_archive
 from patchproof.classifier.batches import InBatches
-from patchproof.classifier.graph import read_program
+from patchproof.classifier.description import read_program
 from patchproof.classifier.network import Classifier
 from patchproof.strict import Refused
 
