@@ -22,6 +22,7 @@ from torch.nn import functional as F
 
 from archives import Hostile, exported, save
 from patchproof.classifier import description, load_classifier
+from patchproof.classifier.operators import operator_named
 from patchproof.strict import Refused
 
 PROGRAM = "models/model.json"
@@ -392,6 +393,26 @@ def test_hostile_descriptions(name, hostile, watch):
         assert isinstance(result, Tensor)
     else:
         assert re.search(sentence, str(result)), result
+
+
+def test_kernels_that_check_no_sizes_are_not_called_themselves():
+    """Called directly, the attention reads memory that is not its own here, and so do the others or they may."""
+
+    def compute(name, *arguments):
+        return operator_named(f"torch.ops.aten.{name}.default")[0](*arguments)
+
+    one, picture = torch.rand(1), torch.rand(2, 4, 3, 3)
+    q, k = torch.rand(16, 4, 32, 8), torch.rand(1, 1, 32, 8)
+    expected = (q @ k.mT / 8**0.5).softmax(-1) @ k
+    torch.testing.assert_close(compute("_scaled_dot_product_flash_attention_for_cpu", q, k, k)[0], expected)
+    for name, arguments in {
+        "_native_batch_norm_legit_no_training": (picture, one, one, one, one, 0.1, 1e-5),
+        "native_group_norm": (picture, one, one, 2, 400, 9, 2, 1e-5),
+        "as_strided": (picture, [2, 4, 3, 3], [36, 9, 1, 3]),
+        "as_strided ": (picture, [2, 4, 3, 4], [36, 9, 3, 1]),
+    }.items():
+        with pytest.raises(RuntimeError):
+            compute(name.strip(), *arguments)
 
 
 def test_more_operators_than_any_network_has_are_refused(hostile, watch, monkeypatch):

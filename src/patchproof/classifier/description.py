@@ -168,8 +168,10 @@ class _Reader:
                 return whole(content, -_INT64, _INT64 - 1)
             case "as_ints" | "as_floats" | "as_bools":
                 return [self._argument({kind[:-1]: item}) for item in _few(content)]
-            case "as_float" if type(content) is float or content in _FLOATS:
-                return _FLOATS.get(content, content)
+            case "as_float" if type(content) is float:
+                return content
+            case "as_float" if content in _FLOATS:
+                return _FLOATS[content]
             case "as_bool" if type(content) is bool:
                 return content
             case "as_string" if _WORD.fullmatch(content):

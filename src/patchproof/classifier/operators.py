@@ -125,7 +125,7 @@ def _attention(q: Tensor, k: Tensor, v: Tensor, dropout_p: float = 0.0, is_causa
 
 
 # kernels that leave checks of sizes to the operators above them, and those operators in their place
-_CHECKED = {
+_CHECKED: dict[str, Callable[..., Any]] = {
     "as_strided.default": _as_strided,
     "_native_batch_norm_legit_no_training.default": _batch_norm,
     "native_group_norm.default": _group_norm,
@@ -158,7 +158,9 @@ def operator_named(target: str) -> tuple[Callable[..., Any], Sequence[Any] | Non
         return None
     packet, _, overload = name.partition(".")
     kernel = getattr(getattr(torch.ops.aten, packet, None), overload, None)
-    return kernel and (_CHECKED.get(name, kernel), kernel._schema.arguments)
+    if kernel is None:
+        return None
+    return _CHECKED[name] if name in _CHECKED else kernel, kernel._schema.arguments
 
 
 def is_check(target: str) -> bool:
