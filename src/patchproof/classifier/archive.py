@@ -1,13 +1,11 @@
-"""A torch.export archive made harmless before torch reads it.
+"""A torch.export archive, read without torch.export: its program as JSON, its weights as tensors.
 
-In: the bytes of NAME.pt2, from anyone. Out: the same program in memory, rewritten from what was checked, or a refusal.
-An archive can make torch.export.load run code in many ways, and each is shut here: pickled weights and constants
-(`use_pickle`, custom and opaque objects, older layouts), sample inputs (a pickle even in honest files: left out),
-compiled libraries, and, in the program's JSON itself, operator names that resolve to any Python function, shape
-expressions and guards that are evaluated as Python, and tree specifications that import modules. Members and operators
-are allowed by list, so what a later torch adds is refused until it is looked at. The second lock is in program.py.
+In: the bytes of NAME.pt2, from anyone. Out: plain tensors and what its JSON says, of which nothing is believed yet (see
+description.py), or a refusal. Members are allowed by list, so what a later torch adds is refused until it is looked at.
+Left out on purpose, because they are or may be pickles: sample inputs (in honest files too: never read), tensor
+subclasses, custom and opaque objects, layouts older than torch 2.9's; and compiled libraries.
 
-Source: torch/export/pt2_archive/_package.py, torch/_export/serde/serialize.py, torch/export/_unlift.py (torch 2.13).
+Source: torch/export/pt2_archive/_package.py, torch/_export/serde/schema.py (torch 2.13).
 """
 
 from __future__ import annotations
@@ -18,57 +16,76 @@ import math
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
 
 from patchproof.strict import Refused
 
-MAX_JSON_BYTES = 256 << 20
-MAX_NUMBERS = 1 << 31  # in one tensor
+MAX_JSON_BYTES = 32 << 20  # MobileNetV2's has 135 thousand bytes
+MAX_NUMBERS = 1 << 31  # in all weights together
+MAX_DIMENSIONS = 12
 
 _WEIGHTS, _CONSTANTS = "data/weights/model_weights_config.json", "data/constants/model_constants_config.json"
 _PROGRAM, _SAMPLE = "models/model.json", "data/sample_inputs/model.pt"
+_JSON = (_WEIGHTS, _CONSTANTS, _PROGRAM)
 _KEPT = re.compile(r"archive_format|archive_version|byteorder|data/weights/weight_\d+|data/constants/tensor_\d+")
 _LEFT_OUT = re.compile(r"\.data/(version|serialization_id)|\.format_version|\.storage_alignment|extra/[\w./ -]*")
+_SAVE = "save the network with torch.export.save, torch 2.9 or later"
 
-_OPERATOR = re.compile(r"torch\.ops\.(aten|prims)\.(\w+)\.(\w+)")
-_ARITHMETIC = frozenset(
-    [f"_operator.{name}" for name in "getitem add sub mul truediv floordiv mod neg eq ne lt le gt ge and_ or_".split()]
-    + [f"torch.sym_{name}" for name in "int float max min not ite sum".split()]
-    + ["math.ceil", "math.floor", "math.trunc"]
-)
-_ARGUMENTS = frozenset(
-    "as_none as_tensor as_tensors as_optional_tensor as_optional_tensors as_nested_tensors as_int as_ints as_int_lists "
-    "as_float as_floats as_float_lists as_bool as_bools as_complex as_string as_strings as_sym_int as_sym_ints "
-    "as_sym_float as_sym_floats as_sym_bool as_sym_bools as_scalar_type as_memory_format as_layout as_device as_name "
-    "as_expr".split()
-)
-# A shape such as "Mul(Integer(49), Symbol('s77', positive=True))" or "49*s77": numbers, symbols and these names. No
-# attribute, no index, no other string, and no power, which alone could run for ever.
-_SHAPE = re.compile(
-    r"(?:'[suz]\d{1,9}'|[suz]\d{1,9}|\d{1,18}(?:\.\d{1,18})?|\*(?!\*)|[-+/(),= ]"
-    r"|Symbol|Integer|Add|Mul|Max|Min|Mod|PythonMod|FloorDiv|CeilDiv|CleanDiv|IntTrueDiv|TruncToInt|CeilToInt|FloorToInt"
-    r"|positive|nonnegative|integer|True|False){1,2000}"
-)
-_TREES = frozenset([None, "builtins.tuple", "builtins.list", "builtins.dict"])
+# the numbers of ScalarType and Layout in schema.py
+DTYPES = {
+    1: torch.uint8,
+    2: torch.int8,
+    3: torch.int16,
+    4: torch.int32,
+    5: torch.int64,
+    6: torch.float16,
+    7: torch.float32,
+    8: torch.float64,
+    12: torch.bool,
+    13: torch.bfloat16,
+}
+STRIDED = 7
 
 
-def harmless_copy(stored: bytes, path: Path) -> io.BytesIO:
-    """The archive, rewritten from its checked members; refused in one sentence where there is anything else in it."""
+class Unwanted(Exception):
+    """Something in the archive that is not allowed; the text follows "the file with"."""
+
+
+def quoted(value: Any) -> str:
+    """Whatever stands in the file, short and on one line."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def whole(value: Any, low: int, high: int) -> int:
+    """A whole number from `low` to `high`, and not one in disguise."""
+    if type(value) is not int or not low <= value <= high:
+        raise Unwanted(f"{quoted(value)} for a whole number from {low} to {high}")
+    return value
+
+
+def read_archive(stored: bytes, path: Path) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
+    """The program's JSON, and the tensors by their names in the file under "weights" and "constants"."""
     try:
         with zipfile.ZipFile(io.BytesIO(stored)) as archive:
             members = _members(archive, len(stored), path)
-            clean = _clean_members({name: archive.read(info) for name, info in members.items()}, path)
+            contents = {name: archive.read(info) for name, info in members.items()}
     except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise Refused("a torch.export program", f"{path}, which is no whole zip archive ({error})", _SAVE) from error
-    copy = io.BytesIO()
-    with zipfile.ZipFile(copy, "w", zipfile.ZIP_STORED) as archive:
-        for name, content in clean.items():
-            archive.writestr(f"program/{name}", content)
-    copy.seek(0)
-    return copy
-
-
-_SAVE = "save the network with torch.export.save, torch 2.9 or later"
+    marks = [contents["archive_format"], contents["archive_version"], contents.get("byteorder", b"little")]
+    if marks != [b"pt2", b"0", b"little"]:
+        raise Refused("a little-endian torch.export program", f"{path} in another format", _SAVE)
+    program, weights, constants = (_parsed(contents.pop(name)) for name in (_PROGRAM, _WEIGHTS, _CONSTANTS))
+    tensors = {
+        "weights": _tensors(weights, "data/weights/weight_", contents),
+        "constants": _tensors(constants, "data/constants/tensor_", contents),
+    }
+    if sum(tensor.numel() for group in tensors.values() for tensor in group.values()) > MAX_NUMBERS:
+        raise Unwanted("weights of an absurd size")
+    return program, tensors
 
 
 def _members(archive: zipfile.ZipFile, size: int, path: Path) -> dict[str, zipfile.ZipInfo]:
@@ -79,123 +96,78 @@ def _members(archive: zipfile.ZipFile, size: int, path: Path) -> dict[str, zipfi
     for info in infos:
         folder, _, name = info.filename.partition("/")
         if (name.endswith((".pkl", ".pt", ".pth")) and name != _SAMPLE) or "/" not in info.filename:
-            got = f"{path} with {info.filename}, a pickle or an older layout"
+            got = f"{path} with {quoted(info.filename)[1:-1]}, a pickle or an older layout"
             raise Refused("a torch.export program without pickles", got, _SAVE)
-        wanted = _KEPT.fullmatch(name) or name in (_WEIGHTS, _CONSTANTS, _PROGRAM)
+        wanted = _KEPT.fullmatch(name) or name in _JSON
         strange = folder != root or ".." in info.filename or name in members
         if strange or not (wanted or name == _SAMPLE or _LEFT_OUT.fullmatch(name)):
-            raise Refused("a torch.export program with the usual members", f"{path} with {info.filename!r}", _SAVE)
+            got = f"{path} with {quoted(info.filename)}"
+            raise Refused("a torch.export program with the usual members", got, _SAVE)
         if wanted:
             members[name] = info
     # torch stores without compression, so members cannot be larger than their file, unless they overlap or are a bomb
     if sum(info.file_size for info in members.values()) > size:
         raise Refused("a torch.export program", f"{path}, whose members are larger than the file", _SAVE)
-    missing = {"archive_format", "archive_version", _WEIGHTS, _CONSTANTS, _PROGRAM} - members.keys()
+    missing = {"archive_format", "archive_version", *_JSON} - members.keys()
     if missing:
         raise Refused("a torch.export program", f"{path} without {sorted(missing)[0]}", _SAVE)
     return members
 
 
-def _clean_members(contents: dict[str, bytes], path: Path) -> dict[str, bytes]:
-    """Contents with checked configurations and a harmless program, and no sample inputs (none is a valid choice)."""
-    if contents["archive_format"] != b"pt2" or contents.get("byteorder", b"little") != b"little":
-        raise Refused("a little-endian torch.export program", f"{path} in another format", _SAVE)
-    try:
-        for config in (_WEIGHTS, _CONSTANTS):
-            contents[config] = _dumped(_clean_config(_parsed(contents[config]), config, contents))
-        contents[_PROGRAM] = _dumped(_clean_program(_parsed(contents[_PROGRAM])))
-    except _Unwanted as error:
-        raise Refused("a torch.export program of plain tensors and operators", f"{path} with {error}", _EVAL) from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        got = f"{path}, whose description cannot be read ({type(error).__name__})"
-        raise Refused("a torch.export program", got, _SAVE) from error
-    # torch.load of no bytes is not called at all
-    return {**contents, _SAMPLE: b"", ".data/version": b"6\n"}
-
-
-_EVAL = "export it in evaluation mode, without custom operators, control flow or tensor subclasses"
-
-
-class _Unwanted(Exception):
-    """Something in the archive that could run code."""
-
-
 def _parsed(content: bytes) -> dict[str, Any]:
     if len(content) > MAX_JSON_BYTES:
-        raise _Unwanted(f"a description of more than {MAX_JSON_BYTES >> 20} MiB")
-    return json.loads(content)
+        raise Unwanted(f"a description of more than {MAX_JSON_BYTES >> 20} MiB")
+    return json.loads(content, parse_constant=_no_number, object_pairs_hook=_object)
 
 
-def _dumped(value: dict[str, Any]) -> bytes:
-    """JSON from what was checked: another parser cannot see other values in it, such as a second equal key."""
-    return json.dumps(value).encode()
+def _no_number(name: str) -> NoReturn:
+    raise Unwanted(f"{name}, which is no JSON")
 
 
-def _clean_config(config: dict[str, Any], name: str, contents: dict[str, bytes]) -> dict[str, Any]:
-    """A list of tensors, each of them raw bytes that are there."""
-    folder, prefix = name.rpartition("/")[0], "weight_" if name == _WEIGHTS else "tensor_"
-    for tensor, meta in config["config"].items():
-        if meta["use_pickle"] is not False or not str(meta["path_name"]).startswith(prefix):
-            raise _Unwanted(f"{tensor!r} stored as a pickle")
-        if f"{folder}/{meta['path_name']}" not in contents:
-            raise _Unwanted(f"{tensor!r} stored nowhere")
-        if math.prod(int(size["as_int"]) for size in meta["tensor_meta"]["sizes"]) > MAX_NUMBERS:
-            raise _Unwanted(f"{tensor!r} of an absurd size")
-    return config
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object in which no key stands twice, so that no two readers can see different programs."""
+    table = dict(pairs)
+    if len(table) != len(pairs):
+        raise Unwanted("the same key twice")
+    return table
 
 
-def _clean_program(program: dict[str, Any]) -> dict[str, Any]:
-    """The program without guards, notes and anything that resolves to other than an operator on tensors."""
-    if "guards_code" in program:
-        program["guards_code"] = []  # torch would run them as Python; ranges of sizes are checked without them
-    module = program["graph_module"]
-    module["metadata"] = {}
-    for node in module["graph"]["nodes"]:
-        node["metadata"] = {}  # where each operator came from: only names, but names that are looked up
-        _check_operator(node["target"])
-    if module["graph"].get("custom_obj_values"):
-        raise _Unwanted("custom objects")
-    _check_tree(program)
-    return program
+def _tensors(config: dict[str, Any], prefix: str, contents: dict[str, bytes]) -> dict[str, Tensor]:
+    """The tensors that a configuration lists, each of them a view of raw bytes that are there."""
+    files: dict[str, Tensor] = {}
+    tensors = {}
+    for name, meta in config["config"].items():
+        file = f"{prefix.rpartition('/')[0]}/{meta['path_name']}"
+        if meta["use_pickle"] is not False or not file.startswith(prefix):
+            raise Unwanted(f"{quoted(name)} stored as a pickle")
+        if file not in contents:
+            raise Unwanted(f"{quoted(name)} stored nowhere")
+        if file not in files:  # several tensors may share one; torch's own memory is aligned for vector units
+            files[file] = torch.empty(len(contents[file]), dtype=torch.uint8)
+            files[file].numpy()[:] = memoryview(contents[file])
+        tensors[name] = _tensor(name, meta["tensor_meta"], files[file])
+    return tensors
 
 
-def _check_tree(value: Any) -> None:
-    """Every dictionary in the program, wherever it lies: argument kinds, shape expressions and tree specifications."""
-    if isinstance(value, list):
-        for item in value:
-            _check_tree(item)
-    if not isinstance(value, dict):
-        return
-    for key, item in value.items():
-        if key.startswith("as_") and key not in _ARGUMENTS:
-            raise _Unwanted(f"an argument of kind {key!r}")
-        if key == "expr_str" and not _SHAPE.fullmatch(item):
-            raise _Unwanted(f"the shape {item[:60]!r}")
-        if key in ("in_spec", "out_spec") and item:
-            _check_pytree(json.loads(item)[1])
-        _check_tree(item)
-
-
-def _check_pytree(spec: dict[str, Any]) -> None:
-    context = json.loads(spec["context"]) if spec["context"] is not None else None
-    names = isinstance(context, list) and all(isinstance(key, str) for key in context)
-    if spec["type"] not in _TREES or not (context is None or names):
-        raise _Unwanted(f"inputs or outputs of type {spec['type']!r}")
-    for child in spec["children_spec"]:
-        _check_pytree(child)
-
-
-def _check_operator(target: str) -> None:
-    """Only tensor operators of ATen that touch no file, and arithmetic on sizes."""
-    import torch
-
-    match = _OPERATOR.fullmatch(target)
-    if match:
-        packet = getattr(getattr(torch.ops, match[1]), match[2], None)
-        operator = getattr(packet, match[3], None)
-        if isinstance(operator, torch._ops.OpOverload):
-            if not any("filename" in argument.name for argument in operator._schema.arguments):
-                return
-    elif target in _ARITHMETIC:
-        return
-    raise _Unwanted(f"the operator {target[:80]!r}")
+def _tensor(name: str, meta: dict[str, Any], stored: Tensor) -> Tensor:
+    """One tensor, if its sizes, strides and offset stay inside its bytes."""
+    dtype = DTYPES.get(whole(meta["dtype"], 0, 99))
+    if dtype is None or whole(meta["layout"], 0, 99) != STRIDED:
+        raise Unwanted(f"{quoted(name)} of a type that is not supported")
+    sizes, strides = ([whole(size["as_int"], 0, 1 << 62) for size in meta[key]] for key in ("sizes", "strides"))
+    offset = whole(meta["storage_offset"]["as_int"], 0, 1 << 62)
+    if len(sizes) > MAX_DIMENSIONS or math.prod(max(1, size) for size in sizes) > MAX_NUMBERS:
+        raise Unwanted(f"{quoted(name)} of an absurd size")
+    if len(sizes) != len(strides):
+        raise Unwanted(f"{quoted(name)} of {len(sizes)} sizes and {len(strides)} strides")
+    if 0 in sizes:
+        return torch.empty(sizes, dtype=dtype)
+    if max(strides, default=0) > MAX_NUMBERS:
+        raise Unwanted(f"{quoted(name)} with a stride of {max(strides)}")
+    last = offset + sum((size - 1) * stride for size, stride in zip(sizes, strides, strict=True))
+    if (last + 1) * dtype.itemsize > len(stored):
+        raise Unwanted(f"{quoted(name)} outside of its bytes")
+    bare = stored[: len(stored) // dtype.itemsize * dtype.itemsize]
+    if dtype == torch.bool:  # any other byte than 0 and 1 is no truth value
+        return bare.as_strided(sizes, strides, offset) != 0
+    return bare.view(dtype).as_strided(sizes, strides, offset)

@@ -1,0 +1,108 @@
+"""A program's graph, computed one operator after the other.
+
+In: weights, steps and the sizes of the input, as description.py read them. Out: a Program, N×3×S×S → N×K. Values have
+numbers and no names; the only functions called are the operators of the steps. Before pictures of a new shape are
+computed, the steps are tried on tensors without memory: there a value of absurd size, a wrong input and a change of the
+weights or of the input are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from patchproof.classifier.archive import MAX_DIMENSIONS, quoted
+
+MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
+MAX_SPLIT = 1 << 16  # along a dimension of what is split into several tensors
+
+
+@dataclass(frozen=True)
+class Value:
+    """In an argument: the value with that number."""
+
+    number: int
+
+
+class Here:
+    """In an argument, the class itself: the device that the pictures are on."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operator, where its results go, and which values nobody needs afterwards."""
+
+    compute: Callable[..., Any]
+    arguments: list[Any]
+    keywords: dict[str, Any]
+    results: list[int]
+    several: bool  # the operator returns a sequence
+    spent: list[int]
+
+
+class Program(torch.nn.Module):
+    """The graph as a function of pictures; weights are buffers, so that they move with the module."""
+
+    def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None]):
+        super().__init__()
+        for number, weight in enumerate(weights):
+            self.register_buffer(f"w{number}", weight)
+        self.steps, self.output, self.sizes = steps, output, sizes
+        self.weighed: set[torch.Size] = set()
+
+    def forward(self, photos: Tensor) -> Tensor:
+        """N×3×S×S → N×K."""
+        if photos.shape not in self.weighed:
+            self._weigh(photos.shape)
+        return self._computed(list(self.buffers()), photos, None)
+
+    def _computed(self, weights: list[Tensor], photos: Tensor, limit: int | None) -> Tensor:
+        values: dict[int, Any] = dict(enumerate([*weights, photos]))
+        for step in self.steps:
+            arguments = [_filled(argument, values, photos) for argument in step.arguments]
+            keywords = {name: _filled(argument, values, photos) for name, argument in step.keywords.items()}
+            if limit is not None and step.several:
+                _check_split(arguments)
+            results = step.compute(*arguments, **keywords)
+            for number, result in zip(step.results, results if step.several else [results], strict=True):
+                values[number] = result
+                if limit is not None:
+                    _check_value(result, limit)
+            for number in step.spent:  # memory is used again while it is in the cache
+                del values[number]
+        return values[self.output]
+
+    def _weigh(self, shape: torch.Size) -> None:
+        """Refuse, before memory is taken, pictures of other sizes and values of absurd ones."""
+        if any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True)):
+            raise ValueError(f"it takes {'×'.join(str(size or 'N') for size in self.sizes)}")
+        with torch.inference_mode(False), torch.no_grad():
+            weights = [weight.to("meta") for weight in self.buffers()]
+            photos = torch.empty(shape, device="meta")
+            self._computed(weights, photos, MAX_VALUE * len(photos))
+        if any(tensor._version for tensor in [*weights, photos]):
+            raise ValueError("it changes its weights or its input")
+        self.weighed.add(shape)
+
+
+def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
+    """An argument with the values that it names."""
+    if type(argument) is Value:
+        return values[argument.number]
+    if type(argument) is list:
+        return [_filled(item, values, photos) for item in argument]
+    return photos.device if argument is Here else argument
+
+
+def _check_value(value: Any, limit: int) -> None:
+    if isinstance(value, Tensor) and (value.numel() > limit or value.dim() > MAX_DIMENSIONS):
+        raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(value.shape))}")
+
+
+def _check_split(arguments: list[Any]) -> None:
+    if any(size > MAX_SPLIT for tensor in arguments if isinstance(tensor, Tensor) for size in tensor.shape):
+        raise ValueError("it splits a tensor of an absurd size")
