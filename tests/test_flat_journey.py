@@ -28,7 +28,7 @@ from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
-from patchproof.scene.conditions import with_values
+from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.patch_scene import PatchScene, load_mesh_scene
 from patchproof.scene.placement import place_card
 from patchproof.settings import SceneSettings
@@ -46,6 +46,7 @@ WORLD = SceneSettings.model_validate(
         "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
         "patch": {"side": "+z", "width_mm": PIECE_MM, "height_mm": PIECE_MM},
         "target": {"label": "carton", "models": ["builtin"]},
+        "background": {"color": (0.5, 0.5, 0.5)},
         "view": {
             "azimuth_deg": (-30, 30),
             "elevation_deg": (0, 25),
@@ -89,9 +90,9 @@ class Journey:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_views():
-    """A promise of 8 views and a selection of 4, since no rate is tested here."""
+    """A promise of 24 views and a selection of 4, since no rate is tested here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 24)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         yield
 
@@ -109,7 +110,7 @@ def photos(tmp_path_factory):
     (folder / "small_blank.toml").write_text(text, encoding="utf-8")
     assert command("sheet", "--template", folder / "small_blank.toml", "--out", folder / "BLANK.pdf") == 0
     world = hang(load_mesh_scene(WORLD, folder, 3), load_manifest(folder / "BLANK.json"))
-    conditions = world.draw("promise", PHOTOS)
+    conditions = draw(WORLD, "promise", PHOTOS, 3)
     shoot(world, folder / "BLANK.pdf", conditions, folder / "photos")
     return optimized(folder, world, conditions, 'photos = "photos"\nsheet = "BLANK.json"', "", "assist")
 

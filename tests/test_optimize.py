@@ -226,7 +226,8 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
     promise = make_promise(problem, blue, problem.scene.draw("promise", 40))
     assert promise.n == 40 and len(promise.conditions) == 40
     assert promise.rate == sum(c.recognized for c in promise.conditions) / 40
-    assert promise.interval == wilson(round(promise.rate * 40), 40)
+    np.testing.assert_allclose(promise.interval, wilson(round(promise.rate * 40), 40), atol=0.04)
+    assert promise.spread.rate == promise.interval
     assert set(promise.controls) == set(CONTROLS)
     for claim in promise.controls.values():
         assert claim.difference == pytest.approx(promise.rate - claim.rate)

@@ -86,7 +86,7 @@ def test_python(tmp_path, monkeypatch, capsys):
     gradient, difference = (float(value) for value in re.findall(r"tensor\((\S+?)[,)]", capsys.readouterr().out)[:2])
     # float32 pictures of 2 × 96 × 96 pixels, summed, and a difference over 0.04
     assert gradient == pytest.approx(difference, rel=0.02) and gradient != 0
-    assert names["report"].summary.judged == 6
+    assert names["report"].summary.photos == 6
 
 
 def words(path: Path) -> str:

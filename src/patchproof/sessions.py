@@ -41,8 +41,10 @@ class Spread:
 
     @property
     def rate(self) -> tuple[float, float]:
-        """The rate's 95 % interval, over sessions."""
-        return _quantile(self.rates, self.weights, TAIL), _quantile(self.rates, self.weights, 1 - TAIL)
+        """The rate's 95 % interval, over sessions; it reaches 0 or 1 where the grid ends."""
+        low, high = (_quantile(self.rates, self.weights, share) for share in (TAIL, 1 - TAIL))
+        first, last = _grid()[0][[0, -1]]
+        return (low if low > first else 0.0), (high if high < last else 1.0)
 
     @property
     def correlation(self) -> tuple[float, tuple[float, float]]:

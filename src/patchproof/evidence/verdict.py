@@ -69,8 +69,9 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
 
 def asked_rate(promise: Promise) -> float:
     """The rate that photographs have to prove: the promise's with its slack, and no worse than the best control's."""
-    sign, control = promise.target.goal.sign, promise.controls[promise.best_control].rate
-    return sign * max(sign * promise.rate - SLACK, sign * control)
+    sign = promise.target.goal.sign
+    controls = (sign * control.rate for control in promise.controls.values())
+    return sign * max([sign * promise.rate - SLACK, *controls])
 
 
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:

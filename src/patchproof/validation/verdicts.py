@@ -35,11 +35,11 @@ _STEPS = 26  # of true rates in the figure
 class VerdictsSettings(Strict):
     """One promise as it might be made, and photographs as they might be taken."""
 
-    rate: Share = 0.85
+    rate: Share = 0.85  # that is promised
     control: Share = 0.3  # the best control's rate
     # of two photographs of one session
     correlations: Annotated[tuple[Annotated[Positive, Field(le=0.9)], ...], Field(min_length=1)] = (0.02, 0.05, 0.1)
-    photos: Count = 40
+    photos: Count = 40  # of the print, in all
     sessions: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 2, 4, 8)  # that the photographs are spread over
     below: tuple[Share, ...] = (0.0, 0.1, 0.15, 0.2)  # how far true rates lie under the promised one
     promises: Count = 20  # drawn for each correlation
