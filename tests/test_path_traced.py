@@ -111,7 +111,7 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
     assert middle.sum() > 500
     assert (
         abs(traced[:, middle].mean() - ours[:, middle].mean()) < 0.015
-    )  # the object lights and shades the card a little
+    )  # the object shades it a little
 
 
 def test_the_piece_lies_where_the_truth_has_it(scene, monkeypatch):
