@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from patchproof.scene.backgrounds import FEW, LEAST_PLACES, load_backgrounds
+from patchproof.scene.backgrounds import ENOUGH, FEW, ROOMS, load_backgrounds
 from patchproof.scene.rooms import PLACE_PX, place
 from patchproof.scene.scene import make_scene
 from patchproof.settings import BackgroundSettings
@@ -37,15 +37,15 @@ def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
     files = [file for own, _ in parts.values() for file in own]
     made = [number for _, own in parts.values() for number in own]
     assert sorted(files) == list(range(count)) and len(set(made)) == len(made)
-    assert all(len(parts[stream][0]) + len(parts[stream][1]) >= LEAST_PLACES[stream] for stream in STREAMS)
+    assert all(len(own) >= ENOUGH or len(rooms) == ROOMS[stream] for stream, (own, rooms) in parts.items())
     assert shown(backgrounds, "reprint") == parts["evaluate"]
     assert bool(backgrounds.notes) == (count < FEW)
-    if count == FEW:  # half of the views show real places
+    if count == FEW:  # three of them, and each as often as four procedural ones
         chosen = backgrounds.chosen("promise", (np.arange(4000) + 0.5) / 4000) * len(backgrounds.pictures)
         real = [not isinstance(backgrounds.pictures[int(each)], int) for each in chosen]
-        assert np.mean(real) == pytest.approx(0.5, abs=0.02)
+        assert np.mean(real) == pytest.approx(12 / (12 + ROOMS["promise"]), abs=0.01)
     if count == 200:
-        assert len(made) == 0 and len(parts["promise"][0]) == 60
+        assert len(parts["promise"][0]) == 60 and {stream for stream in STREAMS if parts[stream][1]} == {"select"}
 
 
 def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):

@@ -109,9 +109,7 @@ def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch)
     bare = photograph(stage, None, conditions, (200, 150), jpeg=False)[0].numpy()
     middle = np.abs(ours - bare).max(0) > 0.01  # the piece
     assert middle.sum() > 500
-    assert (
-        abs(traced[:, middle].mean() - ours[:, middle].mean()) < 0.015
-    )  # the object shades it a little
+    assert abs(traced[:, middle].mean() - ours[:, middle].mean()) < 0.015  # the object shades it a little
 
 
 def test_the_piece_lies_where_the_truth_has_it(scene, monkeypatch):

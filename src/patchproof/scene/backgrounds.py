@@ -5,7 +5,7 @@ The photograph and its centered square show the same crop, so that what trains a
 
 Each file of a folder belongs to one part only: to what trains, selects, promises, or is reprinted and evaluated. A rate
 in places that training knows would say little of the place where somebody will take photographs. Parts with few files
-are filled up with procedural places (`rooms`), which are seen as often as the files. A picture that is named itself is
+have procedural places (`rooms`) beside them, and a file counts as several of those. A picture that is named itself is
 the known place of all parts.
 """
 
@@ -26,7 +26,10 @@ from patchproof.strict import Refused, expand
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits
 FEW = 10  # files of which the scene is told that they are few
-LEAST_PLACES = {"train": 28, "select": 12, "promise": 24, "evaluate": 24}  # of a part, the procedural ones included
+ENOUGH = 24  # files of one part that need no procedural places beside them
+# Those of each part: where a promise knows few places, it does not know how much places differ.
+ROOMS = {"train": 24, "select": 24, "promise": 72, "evaluate": 72}
+OFTEN = 4  # a file is seen as often as so many procedural places
 # whose the files are, in the order of a hash of their names, again and again
 _DEALT = ("train", "promise", "evaluate", "select", "train", "promise", "train", "evaluate", "promise", "train")
 _PART = 1000  # procedural places of a part are numbered from its own thousand
@@ -113,11 +116,10 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
     files = sorted(files, key=lambda file: hashlib.sha256(file.name.encode()).digest())
     pictures: list[np.ndarray | int] = []
     ends, filled = {}, 0
-    for part, (name, least) in enumerate(LEAST_PLACES.items()):
+    for part, (name, rooms) in enumerate(ROOMS.items()):
         first, own = len(pictures), [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
-        more = max(0, least - len(own))
-        often = max(1, round(more / max(1, len(own))))
-        pictures += [*often * list(map(_read, own)), *(_PART * part + i for i in range(more))]
+        more = 0 if len(own) >= ENOUGH else rooms
+        pictures += [*(OFTEN if more else 1) * list(map(_read, own)), *(_PART * part + i for i in range(more))]
         ends[name], filled = (first, len(pictures)), filled + more
     notes = ()
     if 0 < len(files) < FEW:
