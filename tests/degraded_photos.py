@@ -33,14 +33,14 @@ FOCAL = FOCAL_35MM / 43.2666 * float(np.hypot(*SIZE))
 CENTER = np.array([SIDE_MM, SIDE_MM]) / 2
 
 Place = Callable[[np.ndarray], np.ndarray]
-"""Page millimeters N×2 from the sheet's middle to points N×3 in space; z points into the paper, (0, 0) to the origin."""
+"""Page millimeters N×2 from the sheet's middle to points N×3 in space; z points into the paper, (0, 0) becomes 0."""
 
 
 @dataclass(frozen=True)
 class Degraded:
     """A file and its truth: `px` of page points; azimuth, elevation, distance and tilt as the sheet's middle has them.
 
-    `ours` is False where no sheet of this photograph may count as measured.
+    Tilt is that of the sheet without its wobble.
     """
 
     jpeg: bytes
@@ -215,11 +215,8 @@ def _wave(rng):
 
 
 def _ear(rng):
-    return (
-        bent(lambda way: np.radians(rng_angle) * (way > reach), np.pi / 4)
-        if ((rng_angle := rng.uniform(30, 80)), (reach := rng.uniform(55, 75)))
-        else flat
-    )
+    angle, reach = np.radians(rng.uniform(30, 80)), rng.uniform(55, 75)
+    return bent(lambda way: angle * (way > reach), np.pi / 4)
 
 
 def _shade(d: Draw) -> Draw:
@@ -363,9 +360,8 @@ def take(kind: str, seed: int) -> tuple[Degraded, Surface, Promised]:
     for change in draw.on_light:
         light = change(light)
     codes = _exposed(light, draw)
-    step = 0.01
-    ahead = np.array([CENTER + [step, 0], CENTER - [step, 0], CENTER + [0, step], CENTER - [0, step]])
-    right, left, below, above = px(ahead)
+    around = 0.01 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    right, left, below, above = _projected(draw, draw.place(around), draw.camera_from_page, np.zeros_like)[0]
     large, small = np.linalg.svd(np.stack([right - left, below - above], 1), compute_uv=False)
     azimuth, _, distance = view_angles(draw.camera_from_page, (0, 0))
     tilt = float(np.degrees(np.arccos(small / large)))
@@ -410,7 +406,7 @@ def _background(draw: Draw) -> np.ndarray:
 
 
 def _laid_on(light, page, px, depth) -> np.ndarray:
-    """The page's samples thrown into the picture's light, each into the four pixels about it; hidden ones are left out."""
+    """The page's samples thrown into the picture's light, each into the four pixels about it, hidden ones left out."""
     height, width = light.shape[:2]
     inside = ((px > 1) & (px < [width - 1, height - 1])).all(1)
     px, depth, page = px[inside], depth[inside], page[inside]

@@ -34,7 +34,9 @@ MOST_TILT_DEG = 78.0  # foreshortened to a fifth
 MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
 MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
-MOST_BEND = 0.002  # the part of it that is no noise; corners of the design miss up to 4.5 times as much
+# The part of it that is no noise. Corners of the design miss up to 4.5 times as much. What is called rolled or behind a
+# lens has no business to leave any: of folds by 10° that a cylinder explains best, it is 0.0008.
+MOST_BEND, MOST_BEND_UNROLLED = 0.002, 0.0004
 _LEAST_AGREEING = 3  # markers: each has a slope of its own, so that three do not fit a plane where paper is bent
 MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
@@ -169,7 +171,8 @@ def _trouble(
     least = min(_LEAST_AGREEING, len(surface.piece_ids) or 1)
     odd = {i for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids} - set(fit.inlier_ids)
     bent = residual > most_residual or agreeing < 0.5 * markers or (bool(odd) and markers > 2)
-    bend, most_bend = geometry.bend_mm, MOST_BEND * side_mm
+    flat = geometry.homography_px_from_mm is not None
+    bend, most_bend = geometry.bend_mm, (MOST_BEND if flat else MOST_BEND_UNROLLED) * side_mm
     shift, most_shift = geometry.design_shift_mm or 0.0, MOST_SHIFT * side_mm
     most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
     uncertain = uncertainty > most_uncertain

@@ -151,7 +151,8 @@ def pose_of(view: View, placed: Placed, surface: Surface) -> tuple[Pose | None, 
         stance = flat_stance(placed.fit, view.matrix_px, view.focal_spread, surface.center_mm)
     else:
         stance = bent_stance(placed.unrolled.shape, view.matrix_px, view.focal_spread, surface.center_mm)
-    if stance.agrees is False:
+    # a camera file is what stretched prints are measured by, which perspective cannot tell from a wrong focal length
+    if stance.agrees is False and not view.calibrated:
         return None, "contradicted"
     ratio, angle, length = None, stance.azimuth_uncertainty_deg, stance.distance_uncertainty_mm
     if view.calibrated and placed.unrolled is None:
@@ -165,4 +166,4 @@ def pose_of(view: View, placed: Placed, surface: Surface) -> tuple[Pose | None, 
         distance_uncertainty_mm=None if far else length,
         scale_x_over_y=ratio,
     )
-    return pose, "confirmed" if stance.agrees else "unchecked"
+    return pose, "calibrated" if view.calibrated else "confirmed" if stance.agrees else "unchecked"

@@ -18,9 +18,9 @@ Status = Literal["judged", "measured", "rejected"]
 Word = Literal["kept", "broken", "cannot_tell"]
 Effect = Literal["shown", "not_shown", "not_tested"]
 Row = tuple[Finite, Finite, Finite]
-# of the focal length: a camera file's or EXIF's, confirmed by the sheet's own perspective, which tells too little to do
-# so, or contradicts it; thrown away, since EXIF is of another picture; none
-Focal = Literal["confirmed", "unchecked", "contradicted", "cropped", "unknown"]
+# where the focal length comes from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to
+# check, or contradicts; EXIF of another size or shape of picture, which is not used; nowhere
+Focal = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
 
 class Prediction(Strict):

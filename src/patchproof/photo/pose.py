@@ -23,8 +23,8 @@ from patchproof.photo.ratio import cosine, gradient, log_ratio
 from patchproof.photo.rectify import PageFit, root_of
 from patchproof.photo.shapes import Project, Shape
 
-_PRINT_STRETCH = 0.01  # of |r1| = |r2|: what printers do to proportions
-_PAPER = 0.003  # of both: paper that is not quite flat
+_PRINT_STRETCH = 0.015  # of |r1| = |r2|: what printers do to proportions
+_PAPER = 0.003  # of both, of angles in radians and of lengths: paper that is not quite flat or round, lenses
 _TOO_FAR = 13.8  # χ² of two degrees of freedom, 99.9 %
 _TOO_FAR_SIGMAS = 3.3
 _WEAK = 0.15  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
@@ -86,8 +86,10 @@ def tilt_uncertainty_deg(px: Project, parameters: np.ndarray, covariance: np.nda
     root, here = root_of_scaled(covariance), _stretch(px, parameters, point_mm)
     sides = [[_stretch(px, parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
     by_axis = (np.array(sides[0]) - np.array(sides[1])) / 2
-    draws = np.random.default_rng(0).standard_normal((1000, len(by_axis)))  # fixed: same photo, same bytes
-    off = _tilt_deg(here + np.einsum("nk,kij->nij", draws, by_axis)) - _tilt_deg(here[None])
+    rng = np.random.default_rng(0)  # fixed: same photo, same bytes
+    moved = here + np.einsum("nk,kij->nij", rng.standard_normal((1000, len(by_axis))), by_axis)
+    paper = np.eye(2) + _PAPER * rng.standard_normal((1000, 2, 2))
+    off = _tilt_deg(moved @ paper) - _tilt_deg(here[None])
     return float(np.percentile(np.abs(off), 95))
 
 
@@ -107,7 +109,8 @@ def root_of_scaled(covariance: np.ndarray) -> np.ndarray:
 def _stance(figures, parameters, root, agrees) -> Stance:
     apart = np.array([figures(parameters + axis) - figures(parameters - axis) for axis in root.T]) / 2
     apart[:, 0] = (apart[:, 0] + 90) % 180 - 90  # half of an angle's difference
-    (azimuth, distance), spread = figures(parameters), 1.96 * np.linalg.norm(apart, axis=0)
+    azimuth, distance = figures(parameters)
+    spread = 1.96 * np.hypot(np.linalg.norm(apart, axis=0), [np.degrees(_PAPER), _PAPER * distance])
     return Stance(float(azimuth), float(spread[0]), float(distance), float(spread[1]), agrees)
 
 

@@ -36,7 +36,7 @@ LEAST_MARKERS = 4
 
 @dataclass(frozen=True)
 class Unrolled:
-    """`srgb` shows the sheet flat, `fit` is its homography there, `shape` has the photograph's pixels of page points."""
+    """`srgb` shows the sheet flat, `fit` is its homography there, `shape` what any page point is there."""
 
     srgb: np.ndarray
     fit: PageFit
