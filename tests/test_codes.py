@@ -54,8 +54,10 @@ def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
 def test_a_marker_off_the_plane_and_a_corner_that_is_not_seen_are_said():
     borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
     found = MarkersInView(dict.fromkeys(PIECE_IDS, borders), (), ())
-    fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[1:])
-    assert measure._trouble(Geometry(**GOOD), fit, found, SURFACE).code == "curled"
+    for odd_mm, code in ((0.55, None), (0.57, "curled")):
+        fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[1:], odd_mm=odd_mm)
+        trouble = measure._trouble(Geometry(**GOOD), fit, found, SURFACE)
+        assert (trouble and trouble.code) == code
     fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS)
     assert measure._trouble(Geometry(**GOOD), fit, found, SURFACE, 4) is None
     assert measure._trouble(Geometry(**GOOD), fit, found, SURFACE, 3).code == "too_few_markers"

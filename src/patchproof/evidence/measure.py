@@ -37,6 +37,7 @@ MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3
 # The part of it that is no noise. Corners of the design miss up to 4.5 times as much. What is called rolled or behind a
 # lens has no business to leave any: of folds by 10° that a cylinder explains best, it is 0.0008.
 MOST_BEND, MOST_BEND_UNROLLED = 0.002, 0.0004
+MOST_ODD = 0.004  # of a marker that does not agree: a shadow's edge moves one by 0.2 %, folded corners by 1 % and more
 _LEAST_AGREEING = 3  # markers: each has a slope of its own, so that three do not fit a plane where paper is bent
 MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
@@ -169,8 +170,7 @@ def _trouble(
     side_px, most_residual = side_mm * geometry.px_per_mm, MOST_RESIDUAL * side_mm
     agreeing, markers = len(fit.inlier_ids), len(detected.markers)
     least = min(_LEAST_AGREEING, len(surface.piece_ids) or 1)
-    odd = {i for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids} - set(fit.inlier_ids)
-    bent = residual > most_residual or agreeing < 0.5 * markers or (bool(odd) and markers > 2)
+    bent = residual > most_residual or agreeing < 0.5 * markers
     flat = geometry.homography_px_from_mm is not None
     bend, most_bend = geometry.bend_mm, (MOST_BEND if flat else MOST_BEND_UNROLLED) * side_mm
     shift, most_shift = geometry.design_shift_mm or 0.0, MOST_SHIFT * side_mm
@@ -183,6 +183,7 @@ def _trouble(
         (agreeing < least, "too_few_markers", agreeing, least, _FEW_AGREE),
         (bent, "curled", residual, most_residual, _BENT),
         (bend > most_bend, "curled", bend, most_bend, _BENT),
+        (fit.odd_mm > MOST_ODD * side_mm, "curled", fit.odd_mm, MOST_ODD * side_mm, _BENT),
         (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW),
         (uncertain, "too_small", uncertainty, most_uncertain, _COME_CLOSER),
         (shift > most_shift, "curled", shift, most_shift, _SHIFTED),

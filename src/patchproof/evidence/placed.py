@@ -7,7 +7,7 @@ paper is of the tangent plane at the design's middle.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ MOST_SHIFT = 0.005  # of the design's shorter side, by which its own pixels may 
 _LEAST_CELLS = 3
 _SHARE = 80  # per cent of the cells; gloss, a shadow's edge or a thumb may lie over the others
 _SURE_SIGMAS = 2.0
+_ODD_GROWS = 2.0  # the design's corner beside a marker that does not agree may lie off by as much as that, or more
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
 MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
@@ -79,6 +80,8 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
             # a page that hangs elsewhere than its piece would drag the fit away
             if set(on_piece) <= set(together.inlier_ids):
                 fit = together
+        if not on_piece or len(fit.inlier_ids) > len(on_piece):
+            fit = replace(fit, odd_mm=0.0)  # the piece's own agree, or none is in view: a page may hang as it likes
     except (np.linalg.LinAlgError, CannotJudge):
         return None
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
@@ -104,6 +107,7 @@ def geometry_of(
     px_per_mm, tilt_deg = scale_and_tilt(placed.px, placed.parameters, surface.center_mm)
     blur, shift, corners = blur_px(detected.markers.values()), None, 4
     uncertainty = unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm)
+    uncertainty = float(np.hypot(uncertainty, _ODD_GROWS * fit.odd_mm))
     # a page in tiles shows none of the piece's markers, or a part of them
     if promised is not None and surface.piece_ids:
         cells = register(placed.srgb, fit.px_from_mm, surface.rect_mm, promised.design, px_per_mm, blur)

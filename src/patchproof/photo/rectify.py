@@ -29,6 +29,7 @@ CORNER_NOISE_PX = 0.045
 UNSEEN_NOISE_PX = 0.2  # of one marker, whose residual is 0 whatever its noise: more than sharp photographs have
 # What corners of the design miss where markers, beyond noise, miss 1: 2 to 4.5 on wavy, wobbly and folded paper
 _BEND_GROWS = 3.0
+_LEAST_CORNERS = 3  # of a marker's four that agree where it does
 _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is averaged down
 
 
@@ -36,7 +37,8 @@ _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is ave
 class PageFit:
     """`px_from_mm` 3×3, the 8×8 covariance of its first entries, what the corners that agree miss, and their ids.
 
-    `bend_mm` is the part of the residual that is no noise of the corners.
+    `bend_mm` is the part of the residual that is no noise of the corners, `odd_mm` what the worst marker misses of those
+    that do not agree.
     """
 
     px_from_mm: np.ndarray
@@ -44,6 +46,7 @@ class PageFit:
     residual_mm: float
     inlier_ids: tuple[int, ...]
     bend_mm: float = 0.0
+    odd_mm: float = 0.0
 
 
 def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]) -> PageFit:
@@ -63,7 +66,9 @@ def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.n
         if len(ids) < 3 or (again == keep).all():
             break
         keep = again
-    inlier_ids = tuple(i for i, agreeing in zip(ids, keep.reshape(-1, 4).sum(1), strict=True) if agreeing >= 3)
+    inlier_ids = tuple(
+        i for i, agreeing in zip(ids, keep.reshape(-1, 4).sum(1), strict=True) if agreeing >= _LEAST_CORNERS
+    )
     return _with_figures(homography, mm, px, keep, inlier_ids)
 
 
@@ -208,20 +213,27 @@ def _with_figures(homography, mm, px, keep, ids) -> PageFit:
         noise, bend = noise_and_bend(residual, whole, freedom)
     covariance = covariance_of(_jacobian(homography, mm[keep]), noise)
     length = rms_length_mm(_mm_from_px(homography, mm[keep]), residual)
-    return PageFit(homography, covariance, length, ids, bend_mm(bend, residual, length))
+    odd = keep.reshape(-1, 4).sum(1) < _LEAST_CORNERS
+    misses = [
+        rms_length_mm(_mm_from_px(homography, at), off)
+        for at, off in zip(mm.reshape(-1, 4, 2)[odd], every.reshape(-1, 4, 2)[odd], strict=True)
+    ]
+    return PageFit(homography, covariance, length, ids, bend_mm(bend, residual, length), max(misses, default=0.0))
 
 
-def noise_and_bend(residual: np.ndarray, markers: np.ndarray, freedom: int) -> tuple[float, float]:
+def noise_and_bend(
+    residual: np.ndarray, markers: np.ndarray, freedom: int, floor_px: float = CORNER_NOISE_PX
+) -> tuple[float, float]:
     """(px per coordinate to state uncertainties from, the part of px that is no noise) of residuals N×2 and M×4×2.
 
     The alternating sum of a marker's corners, its twist, is what smooth shifts leave alone and noise does not; without
     three whole markers to read it from, all that exceeds sharp corners' noise counts as no noise.
     """
     square = float((residual**2).sum()) / freedom
-    noise = max(CORNER_NOISE_PX, np.sqrt(square) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975))
+    noise = max(floor_px, np.sqrt(square) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975))
     if len(residual) < 12:  # of two markers a homography leaves little but noise
         return float(noise), 0.0
-    chance = CORNER_NOISE_PX**2
+    chance = floor_px**2
     if len(markers) > 2:
         twist = np.einsum("mki,k->mi", markers, [0.5, -0.5, 0.5, -0.5])
         chance = fdtri(freedom, twist.size, 0.9) * max(chance, float(np.mean(twist**2)))

@@ -52,7 +52,7 @@ class Shape:
         return self.project(self.parameters, np.asarray(mm, float))
 
 
-def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL) -> Shape | None:
+def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CORNER_NOISE_PX) -> Shape | None:
     """Paper round a cylinder, the best of the fits from `_starts`."""
     center, reach = mm.mean(0), np.ptp(mm, axis=0).max() / 2
     middle = np.array(size) / 2
@@ -99,7 +99,7 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL) -> Shape | 
     bend = best.x[7]
     if abs(bend) < 1e-6 or abs(bend) > np.pi / 2:
         return None
-    return replace(_shape(project, best, mm, px, reach / bend), tangent=tangent)
+    return replace(_shape(project, best, mm, px, reach / bend, floor_px), tangent=tangent)
 
 
 def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
@@ -143,12 +143,13 @@ def through_lens(flat, mm, px, size) -> Shape:
     unit = np.maximum(np.abs(flat.ravel()[:8]), 1e-9)
     start = np.append(flat.ravel()[:8] / unit, 0.0)
     rows = lambda p: (project(p, mm) - px).ravel()  # noqa: E731
-    return replace(_shape(project, least_squares(rows, start, max_nfev=40, method="lm"), mm, px, None), unit=unit)
+    fit = least_squares(rows, start, max_nfev=40, method="lm")
+    return replace(_shape(project, fit, mm, px, None, CORNER_NOISE_PX), unit=unit)
 
 
-def _shape(project: Project, fit, mm, px, radius_mm) -> Shape:
+def _shape(project: Project, fit, mm, px, radius_mm, floor_px) -> Shape:
     left = project(fit.x, mm) - px
-    noise, bend = noise_and_bend(left, left.reshape(-1, 4, 2), left.size - len(fit.x))
+    noise, bend = noise_and_bend(left, left.reshape(-1, 4, 2), left.size - len(fit.x), floor_px)
     return Shape(project, fit.x, covariance_of(fit.jac, noise, 1e-9), rms(left), radius_mm, bend)
 
 

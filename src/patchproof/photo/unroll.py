@@ -19,6 +19,7 @@ import numpy as np
 from patchproof.geometry import apply_homography, fit_homography, rect_corners
 from patchproof.photo.edges import GRID, REACH, border_frame, meet
 from patchproof.photo.rectify import (
+    CORNER_NOISE_PX,
     PageFit,
     bend_mm,
     common_corners,
@@ -32,6 +33,7 @@ from patchproof.photo.shapes import UNKNOWN_FOCAL, Shape, rms, rolled, through_l
 FLAT_PX = 0.15  # rms per coordinate up to which a plane needs no better explanation: three times the corners' own noise
 PAYS = 0.5  # of the plane's residual
 LEAST_MARKERS = 4
+_MENDED = 0.3  # of what is mended where straight lines were fitted to bent borders may still be wrong
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,9 @@ def explain(
     if best.rms_px > PAYS * plain:
         return None
     # the borders were fitted as straight lines, which on strongly bent paper misses the corners where they meet
-    px = px - _chord_shift(best, mm)
-    return Explained(flat, mm, px, _best(flat, mm, px, size_px, focal_px, focal_spread))
+    shift = _chord_shift(best, mm)
+    px, floor = px - shift, float(np.hypot(CORNER_NOISE_PX, _MENDED * rms(shift)))
+    return Explained(flat, mm, px, _best(flat, mm, px, size_px, focal_px, focal_spread, floor))
 
 
 def unroll(
@@ -111,9 +114,10 @@ def unroll(
     return Unrolled(picture, fit, _uncertainty_mm(best, rect_corners(rect_mm)), best)
 
 
-def _best(flat, mm, px, size, focal_px, focal_spread) -> Shape:
+def _best(flat, mm, px, size, focal_px, focal_spread, floor_px=CORNER_NOISE_PX) -> Shape:
     """The explanation that leaves least."""
-    paper, lens = rolled(flat, mm, px, size, focal_px, focal_spread), through_lens(flat, mm, px, size)
+    paper = rolled(flat, mm, px, size, focal_px, focal_spread, floor_px)
+    lens = through_lens(flat, mm, px, size)
     return lens if paper is None or lens.rms_px < paper.rms_px else paper
 
 
