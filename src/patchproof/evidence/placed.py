@@ -69,7 +69,9 @@ def place(view: View, detected: MarkersInView, surface: Surface) -> Placed | Non
 
 
 def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
-    """The homography of the piece, with the page's own markers where they lie in the same plane."""
+    """The homography of the piece, with the page's own markers where they lie in the same plane; only the piece's count
+    as odd.
+    """
     sure = {i: b.corners_px for i, b in detected.markers.items() if b.fitted}
     corners = sure or detected.corners_px
     on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
@@ -79,9 +81,9 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
             together = fit_page(corners, surface.corners_mm)
             # a page that hangs elsewhere than its piece would drag the fit away
             if set(on_piece) <= set(together.inlier_ids):
-                fit = together
-        if not on_piece or len(fit.inlier_ids) > len(on_piece):
-            fit = replace(fit, odd_mm=0.0)  # the piece's own agree, or none is in view: a page may hang as it likes
+                fit = replace(together, odd_mm=0.0)
+        if not on_piece:
+            fit = replace(fit, odd_mm=0.0)
     except (np.linalg.LinAlgError, CannotJudge):
         return None
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None

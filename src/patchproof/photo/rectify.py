@@ -37,7 +37,7 @@ _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is ave
 class PageFit:
     """`px_from_mm` 3×3, the 8×8 covariance of its first entries, what the corners that agree miss, and their ids.
 
-    `bend_mm` is the part of the residual that is no noise of the corners, `odd_mm` what the worst marker misses of those
+    `bend_mm` is the part of the residual that is no noise of the corners, `odd_mm` what the worst of the markers misses
     that do not agree.
     """
 
