@@ -61,8 +61,8 @@ def test_the_focal_length_is_scaled_to_the_photos_own_diagonal(tmp_path):
         ((400, 300), {0xA002: 4000, 0xA003: 3000}, None, True),  # a part, or all of it made smaller: nobody knows
         ((400, 300), {0xA404: 2.0}, None, True),
         ((400, 300), {0xA404: 1.0}, 0.03, False),
-        ((400, 296), {}, 0.03, False),
-        ((400, 290), {}, None, True),
+        ((400, 297), {}, 0.03, False),
+        ((400, 296), {}, None, True),
         ((300, 300), {}, None, True),
         ((480, 270), {}, 0.1, False),
         ((400, 300), {0x0131: "Adobe Photoshop 25.1"}, 0.1, False),
