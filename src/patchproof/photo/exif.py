@@ -33,9 +33,9 @@ def focal_of(image) -> tuple[float | None, float, bool]:
     focal_35mm, zoom = _number(details.get(_FOCAL_35MM)), _number(details.get(_ZOOM))
     if focal_35mm is None:  # 0 means unknown in EXIF
         return None, EXIF_SPREAD, False
-    stated = [_number(details.get(key)) for key in (_WIDTH, _HEIGHT)]
+    stated = [side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None]
     long, short = max(image.size), min(image.size)
-    resized = None not in stated and sorted(stated) != [short, long]
+    resized = len(stated) == 2 and sorted(stated) != [short, long]
     if resized or (zoom is not None and zoom > 1.01) or not _has_shape(long, short, _SENSOR_SHAPES + _CUT_SHAPES):
         return None, EXIF_SPREAD, True
     edited = bool(_EDITORS.search(str(exif.get(_SOFTWARE, ""))))

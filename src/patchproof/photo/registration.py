@@ -49,22 +49,23 @@ def register(
     finer = min(px_per_mm, _FINEST_PX / min(w, h))
     part, to_part = crop(srgb, px_from_mm, rect_corners(rect_mm), 4)
     light = rectify(luminance(part)[..., None], to_part, rect_mm, finer)
-    light = light.reshape(light.shape[:2])
+    height, width = light.shape[:2]
+    light = light.reshape(height, width)
     printed = _blurred(design @ np.array(LUMINANCE, np.float32), blur_px / px_per_mm * design.shape[1] / w)
-    way = cv2.INTER_AREA if light.shape[1] <= design.shape[1] else cv2.INTER_LINEAR
-    printed = cv2.resize(printed, light.shape[::-1], interpolation=way)
-    size = max(8, round(min(light.shape) / _CELLS))
+    way = cv2.INTER_AREA if width <= design.shape[1] else cv2.INTER_LINEAR
+    printed = cv2.resize(printed, (width, height), interpolation=way)
+    size = max(8, round(min(width, height) / _CELLS))
     reach = max(3, round(_SEARCH * size))
     around = cv2.copyMakeBorder(light, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
     rows = []
-    for top in _starts(light.shape[0], size):
-        for left in _starts(light.shape[1], size):
+    for top in _starts(height, size):
+        for left in _starts(width, size):
             cell = printed[top : top + size, left : left + size]
             vague = _vagueness(cell)
             if vague is not None:
                 window = around[top : top + size + 2 * reach, left : left + size + 2 * reach]
-                dx, dy, height = _peak(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
-                sigma = vague * np.sqrt(1 / height**2 - 1)
+                dx, dy, peak = _peak(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
+                sigma = vague * np.sqrt(1 / peak**2 - 1)
                 rows.append([left + size / 2, top + size / 2, dx - reach, dy - reach, sigma])
     table = np.array(rows).reshape(-1, 5) / finer
     return Registration(table[:, :2] + [x, y], table[:, 2:4], table[:, 4])
