@@ -7,6 +7,7 @@ import pytest
 
 from patchproof.evidence import measure
 from patchproof.evidence.camera import View
+from patchproof.evidence.placed import Placed, pose_of
 from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
 from patchproof.geometry import intrinsics
@@ -19,6 +20,7 @@ from test_verify_run import measured, shot
 
 SURFACE = surface_of(make_manifest())
 GOOD = dict(tilt_deg=10.0, blur_px=1.0, contrast=0.5, px_per_mm=2.0, residual_mm=0.05, corner_uncertainty_mm=0.05)
+FLAT = {"homography_px_from_mm": np.eye(3).tolist()}
 
 
 def trouble(markers=8, module_px=4.0, **figures):
@@ -37,6 +39,9 @@ def trouble(markers=8, module_px=4.0, **figures):
         ("too_small", {"px_per_mm": 0.172}, {"px_per_mm": 0.171}),  # 24 px across 140 mm
         ("too_small", {"corner_uncertainty_mm": 1.49}, {"corner_uncertainty_mm": 1.51}),
         ("curled", {"residual_mm": 1.39}, {"residual_mm": 1.41}),
+        ("curled", {"bend_mm": 0.27} | FLAT, {"bend_mm": 0.29} | FLAT),
+        ("curled", {"bend_mm": 0.055, "curl_radius_mm": 100}, {"bend_mm": 0.057, "curl_radius_mm": 100}),
+        ("curled", {"design_shift_mm": 0.69}, {"design_shift_mm": 0.71}),
     ],
 )
 def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
@@ -44,6 +49,18 @@ def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
     cannot = trouble(**bad)
     assert cannot.code == code and len(cannot.advice) > 15
     assert cannot.figure is not None and cannot.threshold is not None
+
+
+def test_a_marker_off_the_plane_and_a_corner_that_is_not_seen_are_said():
+    borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
+    found = MarkersInView(dict.fromkeys(PIECE_IDS, borders), (), ())
+    for odd_mm, code in ((0.55, None), (0.57, "curled")):
+        fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS[1:], odd_mm=odd_mm)
+        trouble = measure._trouble(Geometry(**GOOD), fit, found, SURFACE)
+        assert (trouble and trouble.code) == code
+    fit = PageFit(np.eye(3), np.eye(8), 0.05, PIECE_IDS)
+    assert measure._trouble(Geometry(**GOOD), fit, found, SURFACE, 4) is None
+    assert measure._trouble(Geometry(**GOOD), fit, found, SURFACE, 3).code == "too_few_markers"
 
 
 @pytest.mark.parametrize(
@@ -60,7 +77,7 @@ def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     seen = View(np.zeros((900, 1200, 3), np.uint8), matrix, False)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
-        pose = measure._pose(seen, fit_page(corners, marker_corners()), True, SURFACE)
+        pose, _ = pose_of(seen, Placed(seen.srgb, fit_page(corners, marker_corners()), None), SURFACE)
         assert (pose.azimuth_deg is not None) == tells == (pose.azimuth_uncertainty_deg < 10)
         if tells:
             assert pose.azimuth_deg == pytest.approx(10, abs=2) and pose.distance_mm == pytest.approx(1500, rel=0.01)

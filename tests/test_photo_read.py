@@ -53,6 +53,34 @@ def test_the_focal_length_is_scaled_to_the_photos_own_diagonal(tmp_path):
     assert read_photo(tmp_path / "b.jpg").focal_px is None
 
 
+@pytest.mark.parametrize(
+    ("size", "tags", "spread", "cropped"),
+    [
+        ((400, 300), {0xA002: 400, 0xA003: 300}, 0.03, False),
+        ((300, 400), {0xA002: 400, 0xA003: 300}, 0.03, False),  # turned without a word
+        ((400, 300), {0xA002: 4000, 0xA003: 3000}, None, True),  # a part, or all of it made smaller: nobody knows
+        ((400, 300), {0xA404: 2.0}, None, True),
+        ((400, 300), {0xA404: 1.0}, 0.03, False),
+        ((400, 297), {}, 0.03, False),
+        ((400, 296), {}, None, True),
+        ((300, 300), {}, None, True),
+        ((480, 270), {}, 0.1, False),
+        ((400, 300), {0x0131: "Adobe Photoshop 25.1"}, 0.1, False),
+        ((400, 300), {0x0131: "HDR+ 1.0"}, 0.03, False),
+    ],
+)
+def test_a_focal_length_of_another_picture_is_not_used(tmp_path, size, tags, spread, cropped):
+    exif = Image.Exif()
+    details = exif.get_ifd(0x8769)
+    for key, value in ({0xA405: 26} | tags).items():
+        (exif if key == 0x0131 else details)[key] = value
+    Image.new("RGB", size).save(tmp_path / "a.jpg", exif=exif)
+    photo = read_photo(tmp_path / "a.jpg")
+    assert photo.cropped == cropped and (photo.focal_px is None) == cropped
+    if spread is not None:
+        assert photo.focal_spread == spread and photo.focal_px == pytest.approx(26 / 43.2666 * math.hypot(*size))
+
+
 @pytest.mark.parametrize("mode", ["CMYK", "L", "P", "RGBA", "LA", "1", "I;16"])
 def test_every_mode_becomes_rgb(tmp_path, mode):
     gray = np.full((30, 40), 128, np.uint8)

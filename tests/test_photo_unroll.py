@@ -8,10 +8,13 @@ import pytest
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
-from patchproof.evidence.surface import surface_of
+from patchproof.evidence.surface import surface_of, with_markers
 from patchproof.geometry import apply_homography, intrinsics, look_at, rect_corners
+from patchproof.photo.pose import bent_stance, flat_stance
 from patchproof.photo.read import Photo
-from patchproof.photo.unroll import unroll
+from patchproof.photo.rectify import fit_page
+from patchproof.photo.registration import register
+from patchproof.photo.unroll import explain, unroll
 from test_photo_synthetic import (
     CUT_MM,
     DESIGN_MM,
@@ -101,3 +104,42 @@ def test_the_unrolled_picture_shows_the_design_where_its_homography_says():
     off = np.abs(flat.srgb[y0:y1, x0:x1].astype(float) - expected[y0:y1, x0:x1]).mean()
     bent = np.abs(photo[y0:y1, x0:x1].astype(float) - expected[y0:y1, x0:x1]).mean()
     assert off < 6 and off < bent / 2
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 10.0, 25.0, 40.0])
+@pytest.mark.parametrize("radius_mm", [-100.0, 100.0, 600.0])
+def test_rolled_paper_says_where_the_camera_stood_by_its_own_middle(azimuth, radius_mm):
+    """By the homography of the unrolled sheet, 10°, 25° and 40° at a radius of 100 mm were 18°, 41° and 57°."""
+    corners = {i: rolled_px(mm, 1 / radius_mm, pose(azimuth)) for i, mm in markers_mm().items()}
+    shape = explain(corners, markers_mm(), SIZE, MATRIX[0, 0], 0.03).shape
+    stance = bent_stance(shape, MATRIX, 0.03, CENTER)
+    # exact corners, not where straight borders would meet: the correction for that is what remains
+    assert stance.azimuth_deg == pytest.approx(azimuth, abs=0.6) and stance.azimuth_uncertainty_deg > 0.3
+    assert stance.distance_mm == pytest.approx(450, rel=0.02) and stance.agrees is not False
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "longer", "agrees"), [(35.0, 1.0, True), (35.0, 0.6, False), (2.0, 0.6, None), (35.0, 1.06, True)]
+)
+def test_perspective_confirms_a_focal_length_contradicts_it_or_cannot_tell(azimuth, longer, agrees):
+    true = view(azimuth, 3, 450)
+    fit = fit_page({i: apply_homography(true, mm) for i, mm in markers_mm().items()}, markers_mm())
+    stance = flat_stance(fit, MATRIX @ np.diag([longer, longer, 1.0]), 0.03, CENTER)
+    assert stance.agrees is agrees
+
+
+def test_the_designs_own_pixels_say_where_it_lies():
+    """Shifted by 2 mm it is found there, to a tenth of that; what is covered is left out."""
+    manifest, true = make_manifest(), view(20, 10, 450)
+    page, surface = page_raster(manifest, only_piece=True), surface_of(manifest)
+    design = with_markers(page_raster(manifest, True)[600:2000:4, 350:1750:4], surface, np.zeros(3))
+    photo = photograph(page, true, SIZE, blur_px=0.6, fine=2)
+    moved = true @ np.array([[1, 0, 2.0], [0, 1, 0], [0, 0, 1]])
+    for homography, shift in ((true, 0.0), (moved, -2.0)):
+        cells = register(photo, homography, DESIGN_MM, design, 2.5, 0.7)
+        sure = cells.sigma_mm < 0.3
+        assert sure.sum() > 8 and np.median(cells.shift_mm[sure], 0) == pytest.approx([shift, 0], abs=0.2)
+    photo[:, :600] = 90
+    shown = np.isfinite(register(photo, true, DESIGN_MM, design, 2.5, 0.7).shift_mm[:, 0])
+    left = register(photo, true, DESIGN_MM, design, 2.5, 0.7).middle_mm[:, 0] < CENTER[0] - 15
+    assert not shown[left].any() and shown[~left].sum() > 8

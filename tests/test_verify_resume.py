@@ -16,7 +16,7 @@ import torch
 
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
-from patchproof.evidence import batch, measure
+from patchproof.evidence import batch, measure, placed
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options, task_of
@@ -161,9 +161,9 @@ def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
         names.append(name)
         return measure.measure(view, name, *rest)
 
-    blur_px = measure.blur_px
+    blur_px = placed.blur_px
     monkeypatch.setattr(batch, "measure", wrong)
-    monkeypatch.setattr(measure, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
+    monkeypatch.setattr(placed, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
     found = gather_evidence(folder, make_manifest(promise()), Options([NET], identity_printer())).photos
     assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]
 

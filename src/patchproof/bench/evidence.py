@@ -28,7 +28,8 @@ from patchproof.geometry import apply_homography, fit_homography
 from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import DICTIONARY
 from patchproof.photo.rectify import fit_page
-from patchproof.photo.unroll import explain, rolled, through_lens
+from patchproof.photo.shapes import rolled, through_lens
+from patchproof.photo.unroll import explain
 
 WRONG_PX = 4.0  # by which a marker is moved that was glued on again
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from patchproof.channel import lens
+from patchproof.photo.exif import EXIF_SPREAD
 from patchproof.photo.read import Photo
 
 FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
@@ -21,11 +22,15 @@ FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
 
 @dataclass(frozen=True)
 class View:
-    """A photograph with straight lines straight, its matrix (None: unknown), and whether a camera file says so."""
+    """A photograph with straight lines straight, its matrix (None: unknown), whether a camera file says so, the
+    standard deviation of the focal length's logarithm, and whether EXIF has one that is not this picture's.
+    """
 
     srgb: np.ndarray
     matrix_px: np.ndarray | None
     calibrated: bool
+    focal_spread: float = EXIF_SPREAD
+    cropped: bool = False
 
 
 def view_of(photo: Photo, camera: lens.Camera | None) -> View:
@@ -35,10 +40,10 @@ def view_of(photo: Photo, camera: lens.Camera | None) -> View:
         for held in (camera, _turned(camera)):
             if abs(width * held.image_px[1] / (height * held.image_px[0]) - 1) <= lens.ASPECT_TOLERANCE:
                 matrix = lens.matrix_px(held, (width, height))
-                return View(_straightened(photo.srgb, held, matrix), matrix, True)
+                return View(_straightened(photo.srgb, held, matrix), matrix, True, FOCAL_ERROR / 1.96)
     focal = photo.focal_px
     matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return View(photo.srgb, matrix, False)
+    return View(photo.srgb, matrix, False, photo.focal_spread, photo.cropped)
 
 
 def _turned(camera: lens.Camera) -> lens.Camera:

@@ -15,19 +15,18 @@ from functools import partial
 import numpy as np
 
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
-from patchproof.evidence.camera import FOCAL_ERROR, View
+from patchproof.evidence.camera import View
+from patchproof.evidence.placed import MOST_SHIFT, geometry_of, place, pose_of
 from patchproof.evidence.ranges import PromisedRanges
-from patchproof.evidence.results import Geometry, PhotoEntry, Pose, Remark, Scale
+from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import MM_PER_INCH, apply_homography, local_scale, plane_pose, rect_corners, view_angles
+from patchproof.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
-from patchproof.photo.quality import FrameLight, blur_px, frame_light
-from patchproof.photo.ratio import x_over_y
-from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page, view_uncertainty
-from patchproof.photo.unroll import Unrolled, unroll
+from patchproof.photo.quality import FrameLight, frame_light
+from patchproof.photo.rectify import PageFit
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighboring cells melt together
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
@@ -35,17 +34,20 @@ MOST_TILT_DEG = 78.0  # foreshortened to a fifth
 MOST_UNCERTAIN = 0.03  # corner uncertainty as a share of the design's shorter side,
 MOST_UNCERTAIN_MM = 1.5  # and never more than this: what counts as measured should not be 2 mm off
 MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3 %, lenses of phones too
+# The part of it that is no noise. Corners of the design miss up to 4.5 times as much. What is called rolled or behind a
+# lens has no business to leave any: of folds by 10° that a cylinder explains best, it is 0.0008.
+MOST_BEND, MOST_BEND_UNROLLED = 0.002, 0.0004
+MOST_ODD = 0.004  # of a marker that does not agree: a shadow's edge moves one by 0.2 %, folded corners by 1 % and more
 _LEAST_AGREEING = 3  # markers: each has a slope of its own, so that three do not fit a plane where paper is bent
 MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
 _SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
-MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
-# Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
-MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
 _COME_CLOSER = "come closer or use the camera's full resolution"
 _FEW = "show more of the piece: its markers fix where it lies"
 _FEW_AGREE = "too few markers agree to tell flat paper from bent: show all of the piece"
 _BENT = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
+_SHIFTED = "the design lies elsewhere than its markers say, on paper that is bent between them: press the sheet flat"
+_HIDDEN = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
 @dataclass(frozen=True)
@@ -76,21 +78,21 @@ def measure(
         return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(cannot)), False)
     size_px = view.srgb.shape[1], view.srgb.shape[0]
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
-    fit = _fit(detected, surface)
-    if fit is None:
+    placed = place(view, detected, surface)
+    if placed is None:
         advice = "the marker in view is distorted: show the whole patch"
         few = CannotJudge("too_few_markers", len(detected.markers), 1, advice)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True)
     light = frame_light(view.srgb, detected.markers.values())
-    unrolled = _unrolled(view, detected, surface)
-    srgb, fit = (view.srgb, fit) if unrolled is None else (unrolled.srgb, unrolled.fit)
-    geometry = _geometry(fit, unrolled, detected, light, surface)
-    pose = _pose(view, fit, unrolled is None, surface)
+    fit = placed.fit
+    geometry, corners = geometry_of(placed, detected, light, surface, promised)
+    pose, focal = pose_of(view, placed, surface)
+    geometry = geometry.changed(focal=focal)
     entry = partial(entry, geometry=geometry, pose=pose)
     page_check = _is_uncut(fit, detected, surface)
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
-    trouble = _trouble(geometry, fit, detected, surface)
+    trouble = _trouble(geometry, fit, detected, surface, corners)
     try:
         if page_check and surface.page_mm is not None:
             refuse_other_page(view.srgb, fit.px_from_mm, surface.page_mm, surface.label)
@@ -101,7 +103,7 @@ def measure(
     color, pictures = None, {}
     # a page in tiles shows none of the piece's markers, or a part of them
     if trouble is None and promised is not None and surface.piece_ids:
-        color, pictures = appearance(srgb, fit.px_from_mm, surface, promised, light, geometry)
+        color, pictures = appearance(placed.srgb, fit.px_from_mm, surface, promised, light, geometry)
         if color.clipped_share > MOST_CLIPPED:
             advice = "the patch is overexposed: lower the exposure by one or two steps"
             trouble = CannotJudge("clipped", color.clipped_share, MOST_CLIPPED, advice)
@@ -151,75 +153,17 @@ def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
     return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 
-def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
-    """The homography of the piece, with the page's own markers where they lie in the same plane."""
-    sure = {i: b.corners_px for i, b in detected.markers.items() if b.fitted}
-    corners = sure or detected.corners_px
-    on_piece = {i: c for i, c in corners.items() if i in surface.piece_ids}
-    try:
-        fit = fit_page(on_piece or corners, surface.corners_mm)
-        if on_piece and len(on_piece) < len(corners):
-            together = fit_page(corners, surface.corners_mm)
-            # a page that hangs elsewhere than its piece would drag the fit away
-            if set(on_piece) <= set(together.inlier_ids):
-                fit = together
-    except (np.linalg.LinAlgError, CannotJudge):
-        return None
-    return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
-
-
-def _unrolled(view: View, detected: MarkersInView, surface: Surface) -> Unrolled | None:
-    """The piece made flat where its markers do not lie in one plane and a cylinder or a lens says why."""
-    corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
-    focal_px = None if view.matrix_px is None else float(view.matrix_px[0, 0])
-    try:
-        return unroll(view.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, focal_px)
-    except (np.linalg.LinAlgError, ValueError):
-        return None  # a shape that no camera sees is no explanation; the plane's residual decides
-
-
 def _is_uncut(fit: PageFit, detected: MarkersInView, surface: Surface) -> bool:
     pages = set(fit.inlier_ids) & surface.page_ids
     return bool(pages) or not (detected.markers.keys() & surface.piece_ids)
 
 
-def _geometry(
-    fit: PageFit, unrolled: Unrolled | None, detected: MarkersInView, light: FrameLight, surface: Surface
-) -> Geometry:
-    px_per_mm, tilt_deg = local_scale(fit.px_from_mm, surface.center_mm)
-    return Geometry(
-        residual_mm=fit.residual_mm,
-        px_per_mm=px_per_mm,
-        tilt_deg=tilt_deg,
-        contrast=light.contrast,
-        blur_px=blur_px(detected.markers.values()),
-        corner_uncertainty_mm=unrolled.uncertainty_mm if unrolled else corner_uncertainty_mm(fit, surface.rect_mm),
-        curl_radius_mm=unrolled and unrolled.radius_mm,
-        # none maps a page that was unrolled to the photograph
-        homography_px_from_mm=None if unrolled else fit.px_from_mm.tolist(),
-    )
-
-
-def _pose(view: View, fit: PageFit, flat: bool, surface: Surface) -> Pose | None:
-    """Where the camera stood; None where its focal length is not known."""
-    if view.matrix_px is None:
-        return None
-    azimuth, _, distance = view_angles(plane_pose(fit.px_from_mm, view.matrix_px), surface.center_mm)
-    angle, length = view_uncertainty(fit, view.matrix_px, surface.center_mm)
-    ratio = None
-    if view.calibrated and flat:
-        ratio, uncertainty = x_over_y(fit, view.matrix_px, FOCAL_ERROR)
-        ratio = ratio if uncertainty <= MOST_RATIO_ERROR else None
-    return Pose(
-        azimuth_uncertainty_deg=angle,
-        azimuth_deg=azimuth if angle <= MOST_AZIMUTH_ERROR_DEG else None,
-        distance_mm=distance if length <= MOST_DISTANCE_ERROR * distance else None,
-        scale_x_over_y=ratio,
-    )
-
-
-def _trouble(geometry: Geometry, fit: PageFit, detected: MarkersInView, surface: Surface) -> CannotJudge | None:
-    """Why geometry or color cannot be trusted, the nearest cause first; None where they can."""
+def _trouble(
+    geometry: Geometry, fit: PageFit, detected: MarkersInView, surface: Surface, corners: int = 4
+) -> CannotJudge | None:
+    """Why geometry or color cannot be trusted, the nearest cause first; None where they can. The design shows itself in
+    so many of its corners.
+    """
     tilt, blur, residual = geometry.tilt_deg, geometry.blur_px, geometry.residual_mm
     side_mm, uncertainty = min(surface.rect_mm[2:]), geometry.corner_uncertainty_mm
     most_blur = MOST_BLUR * float(np.median([b.module_px for b in detected.markers.values()]))
@@ -227,6 +171,9 @@ def _trouble(geometry: Geometry, fit: PageFit, detected: MarkersInView, surface:
     agreeing, markers = len(fit.inlier_ids), len(detected.markers)
     least = min(_LEAST_AGREEING, len(surface.piece_ids) or 1)
     bent = residual > most_residual or agreeing < 0.5 * markers
+    flat = geometry.homography_px_from_mm is not None
+    bend, most_bend = geometry.bend_mm, (MOST_BEND if flat else MOST_BEND_UNROLLED) * side_mm
+    shift, most_shift = geometry.design_shift_mm or 0.0, MOST_SHIFT * side_mm
     most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
     uncertain = uncertainty > most_uncertain
     for wrong, code, figure, limit, advice in (
@@ -235,8 +182,12 @@ def _trouble(geometry: Geometry, fit: PageFit, detected: MarkersInView, surface:
         (side_px < SMALLEST_DESIGN_PX, "too_small", side_px, SMALLEST_DESIGN_PX, _COME_CLOSER),
         (agreeing < least, "too_few_markers", agreeing, least, _FEW_AGREE),
         (bent, "curled", residual, most_residual, _BENT),
+        (bend > most_bend, "curled", bend, most_bend, _BENT),
+        (fit.odd_mm > MOST_ODD * side_mm, "curled", fit.odd_mm, MOST_ODD * side_mm, _BENT),
         (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW),
         (uncertain, "too_small", uncertainty, most_uncertain, _COME_CLOSER),
+        (shift > most_shift, "curled", shift, most_shift, _SHIFTED),
+        (corners < 4, "too_few_markers", corners, 4, _HIDDEN),
     ):
         if wrong:
             return CannotJudge(code, figure, limit, advice)

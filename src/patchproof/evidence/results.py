@@ -18,6 +18,9 @@ Status = Literal["judged", "measured", "rejected"]
 Word = Literal["kept", "broken", "cannot_tell"]
 Effect = Literal["shown", "not_shown", "not_tested"]
 Row = tuple[Finite, Finite, Finite]
+# where the focal length comes from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to
+# check, or contradicts; EXIF of another size or shape of picture, which is not used; nowhere
+Focal = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
 
 class Prediction(Strict):
@@ -40,14 +43,19 @@ class Geometry(Strict):
     corner_uncertainty_mm: Finite
     curl_radius_mm: Finite | None = None  # of paper that was unrolled; negative where it is hollow
     homography_px_from_mm: tuple[Row, Row, Row] | None = None  # null for paper that was unrolled
+    tilt_uncertainty_deg: Finite | None = None  # 95 %, as all uncertainties are
+    bend_mm: Finite = 0.0  # the part of the residual that is no noise: of paper that no plane and no cylinder explains
+    design_shift_mm: Finite | None = None  # of the design's own cells, 90 % point; null where it shows no texture
+    focal: Focal = "unknown"
 
 
 class Pose(Strict):
     """What a camera of known focal length says besides; null where it cannot tell."""
 
-    azimuth_uncertainty_deg: Finite  # 95 %, from the corners alone
+    azimuth_uncertainty_deg: Finite  # 95 %, from the corners and the focal length
     azimuth_deg: Finite | None = None  # null where the uncertainty is too large to tell left from right
     distance_mm: Finite | None = None
+    distance_uncertainty_mm: Finite | None = None
     scale_x_over_y: Finite | None = None  # the print's proportions alone, from a calibrated camera
 
 
@@ -86,7 +94,8 @@ _PARTS = {"geometry": Geometry, "pose": Pose, "scale": Scale, "color": Color, "r
 # one photograph in report.json, in this order
 KEYS = """
     file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
-    scale_x_over_y tilt_deg azimuth_deg azimuth_uncertainty_deg distance_mm contrast blur_px corner_uncertainty_mm
+    scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
+    distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
     curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm
     predictions""".split()
 

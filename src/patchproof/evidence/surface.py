@@ -129,6 +129,8 @@ def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.nd
     }
     if not on_it:
         return design  # in a frame of markers, as pieces once were
+    finer = max(1, DESIGN_PX // max(design.shape))  # a design of few pixels: markers' modules are smaller
+    design = design.repeat(finer, 0).repeat(finer, 1)
     x, y, *size_mm = surface.rect_mm
     markers = tuple(marker_at(i, tuple(c[0] - (x, y)), float(c[1, 0] - c[0, 0])) for i, c in on_it.items())
     piece = Piece((size_mm[0], size_mm[1]), markers, marker_rect(markers[0])[2] / MODULES)

@@ -49,20 +49,22 @@ def find_sheet(
 ) -> MarkersInView:
     """The markers of `corners_mm` (page mm by id) that are in the picture.
 
-    The search ends when every one of `expected` is found, or shown to be out of the picture or covered.
+    The search ends when every one of `expected` is found, or shown to be out of the picture or covered, and none or
+    several are at two places.
     """
     printed = printed_markers(dictionary)
     detections: dict[int, list[np.ndarray]] = {}
     box, view = whole(srgb), MarkersInView({}, (), ())
     for level in levels(srgb, box, coarsest_px):
-        before = set(detections)
+        before = sum(map(len, detections.values()))
         look(srgb, box, level, printed, detections)
-        if detections.keys() != before:
+        if sum(map(len, detections.values())) != before:
             view = complete(srgb, fitted(srgb, detections, set(corners_mm), dictionary), corners_mm, dictionary)
         wanted = expected - view.markers.keys()
         if wanted and view.markers:
             wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
-        if not wanted:
+        # one marker at two places is clutter, or the first that is read of a second print: a finer level tells
+        if not wanted and len(view.doubled) != 1:
             break
     return view
 

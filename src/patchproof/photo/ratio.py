@@ -19,35 +19,37 @@ def x_over_y(fit: PageFit, matrix_px: np.ndarray, focal_error: float) -> tuple[f
     """(ratio, its 95 % uncertainty); `focal_error` is the focal length's relative 95 % uncertainty."""
     back = np.linalg.inv(matrix_px)
     entries = fit.px_from_mm.ravel()[:8]
-    skew, by_skew = _cosine(entries, back), _gradient(_cosine, entries, back)
+    skew, by_skew = cosine(entries, back), gradient(cosine, entries, back)
     spread = fit.covariance @ by_skew
     variance = float(by_skew @ spread)
     if variance > 0:
         entries = entries - spread * (skew / variance)
-    by_ratio = _gradient(_log_ratio, entries, back)
+    by_ratio = gradient(log_ratio, entries, back)
     covariance = fit.covariance - np.outer(spread, spread) / max(variance, 1e-300)
     noise = np.sqrt(max(float(by_ratio @ covariance @ by_ratio), 0.0))
     longer = matrix_px.copy()
     longer[[0, 1], [0, 1]] *= 1 + focal_error
-    ratio = _log_ratio(entries, back)
-    return float(np.exp(ratio)), float(np.hypot(2 * noise, _log_ratio(entries, np.linalg.inv(longer)) - ratio))
+    ratio = log_ratio(entries, back)
+    return float(np.exp(ratio)), float(np.hypot(2 * noise, log_ratio(entries, np.linalg.inv(longer)) - ratio))
 
 
 def _columns(entries, back) -> np.ndarray:
     return (back @ np.append(entries, 1.0).reshape(3, 3))[:, :2]
 
 
-def _log_ratio(entries, back) -> float:
+def log_ratio(entries, back) -> float:
+    """Of the lengths of a homography's first two columns, the inverse matrix `back` of the camera taken off."""
     x, y = np.linalg.norm(_columns(entries, back), axis=0)
     return float(np.log(x / y))
 
 
-def _cosine(entries, back) -> float:
+def cosine(entries, back) -> float:
+    """Of the angle between them."""
     x, y = _columns(entries, back).T
     return float(x @ y / np.linalg.norm(x) / np.linalg.norm(y))
 
 
-def _gradient(function, entries, back) -> np.ndarray:
+def gradient(function, entries, back) -> np.ndarray:
     """Central differences; the entries differ by orders of magnitude, and with them their steps."""
     steps = 1e-6 * np.maximum(np.abs(entries), np.abs(entries).max() * 1e-6)
     rows = entries + np.diag(steps), entries - np.diag(steps)

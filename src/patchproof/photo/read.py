@@ -9,7 +9,6 @@ never stops a batch. Ignored on purpose: the DPI that a photograph claims, and s
 from __future__ import annotations
 
 import io
-import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,22 +17,26 @@ import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.exif import EXIF_SPREAD, focal_of
 from patchproof.strict import Refused
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 # an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
 LARGEST_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
-_DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
-_ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
 class Photo:
-    """An upright photograph: uint8 H×W×3 sRGB, focal length in its own pixels or None."""
+    """An upright photograph: uint8 H×W×3 sRGB, focal length in its own pixels or None, the standard deviation of its
+    logarithm, and whether EXIF has one that does not fit this picture.
+    """
 
     srgb: np.ndarray
     focal_px: float | None
+    focal_spread: float = EXIF_SPREAD
+    cropped: bool = False
 
 
 def read_photo(path: str | Path) -> Photo:
@@ -51,7 +54,7 @@ def read_photo(path: str | Path) -> Photo:
                 if pixels > LARGEST_PX:
                     advice = f"{pixels / 1e6:.0f} megapixels are too many: save it smaller"
                     raise _unreadable(advice, pixels, LARGEST_PX)
-                focal_35mm = _focal_35mm(image)
+                focal = focal_of(image)
                 # turning and converting copy the picture, which for most is not needed and takes as long as decoding
                 turned = image.getexif().get(_ORIENTATION, 1) != 1
                 upright = ImageOps.exif_transpose(image) if turned else image
@@ -60,8 +63,7 @@ def read_photo(path: str | Path) -> Photo:
         raise
     except Exception as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...), all alike here
         raise _unreadable(_why(path, error)) from error
-    diagonal_px = math.hypot(*srgb.shape[:2])
-    return Photo(srgb, focal_35mm / _DIAGONAL_35MM * diagonal_px if focal_35mm else None)
+    return Photo(srgb, *focal)
 
 
 def list_photos(folder: str | Path) -> list[Path]:
@@ -101,14 +103,6 @@ def _allow_heic(path: Path) -> None:
         advice = "HEIC needs pillow-heif: pip install 'patchproof[heic]', or save the photo as JPEG"
         raise _unreadable(advice) from None
     pillow_heif.register_heif_opener()
-
-
-def _focal_35mm(image) -> float | None:
-    try:
-        value = float(image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
-    except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
-        return None
-    return value if math.isfinite(value) and value > 0 else None  # 0 means unknown in EXIF
 
 
 def _in_srgb(image):

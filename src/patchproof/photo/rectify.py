@@ -6,8 +6,8 @@ homography and its covariance. Blur and sharpening make all markers of a photogr
 no noise, so where there are three or more, what their corners lie too far out on average is taken off first. The
 uncertainty is the 95 % point of the *largest* of the design's corner errors, drawn from that covariance. Few corners
 say little of their own noise, so what is made of it is wider (Student's t); a single marker fits any noise exactly, and
-gets a wide guess. Left out on purpose: lens terms. A lens that bends shows as residual, and residual widens the
-uncertainty.
+gets a wide guess. Paper that is no plane, motion and lenses turn, stretch and shear whole markers, which noise does no
+more than it twists them: what exceeds the twist is no noise, and the design's corners miss several times as much.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 4.2 (reprojection error), 5.2 (covariance).
 """
@@ -19,25 +19,34 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import fdtri, stdtrit
 
-from patchproof.geometry import apply_homography, fit_homography, normalized, plane_pose, rect_corners, view_angles
+from patchproof.geometry import apply_homography, fit_homography, normalized, rect_corners
 from patchproof.photo.cannot import CannotJudge
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)
 CORNER_NOISE_PX = 0.045
 UNSEEN_NOISE_PX = 0.2  # of one marker, whose residual is 0 whatever its noise: more than sharp photographs have
+# What corners of the design miss where markers, beyond noise, miss 1: 2 to 4.5 on wavy, wobbly and folded paper
+_BEND_GROWS = 3.0
+_LEAST_CORNERS = 3  # of a marker's four that agree where it does
 _LARGEST_PIXELS = 3000  # of one side of a finely sampled patch before it is averaged down
 
 
 @dataclass(frozen=True)
 class PageFit:
-    """`px_from_mm` 3×3, the 8×8 covariance of its first entries, what the corners that agree miss, and their ids."""
+    """`px_from_mm` 3×3, the 8×8 covariance of its first entries, what the corners that agree miss, and their ids.
+
+    `bend_mm` is the part of the residual that is no noise of the corners, `odd_mm` what the worst of the markers misses
+    that do not agree.
+    """
 
     px_from_mm: np.ndarray
     covariance: np.ndarray
     residual_mm: float
     inlier_ids: tuple[int, ...]
+    bend_mm: float = 0.0
+    odd_mm: float = 0.0
 
 
 def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]) -> PageFit:
@@ -57,8 +66,10 @@ def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.n
         if len(ids) < 3 or (again == keep).all():
             break
         keep = again
-    inlier_ids = tuple(i for i, agreeing in zip(ids, keep.reshape(-1, 4).sum(1), strict=True) if agreeing >= 2)
-    return _with_figures(homography, mm[keep], px[keep], inlier_ids)
+    inlier_ids = tuple(
+        i for i, agreeing in zip(ids, keep.reshape(-1, 4).sum(1), strict=True) if agreeing >= _LEAST_CORNERS
+    )
+    return _with_figures(homography, mm, px, keep, inlier_ids)
 
 
 def common_corners(
@@ -92,24 +103,6 @@ def covariance_of(jacobian: np.ndarray, noise_px: float, rcond: float = 1e-15) -
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     inverse = np.linalg.pinv(jacobian / scale, rcond=rcond)
     return noise_px**2 * (inverse @ inverse.T) / np.outer(scale, scale)
-
-
-def view_uncertainty(fit: PageFit, matrix_px: np.ndarray, point_mm) -> tuple[float, float]:
-    """(azimuth_deg, distance_mm) 95 % uncertainties of the camera as a page point sees it.
-
-    A small or far sheet looks almost the same from either side of its normal: the azimuth's sign goes first. The
-    spread is that of the pose one standard deviation off along each axis of the homography's covariance.
-    """
-
-    def view_of(entries: np.ndarray) -> np.ndarray:
-        homography = np.append(entries, 1.0).reshape(3, 3)
-        return np.array(view_angles(plane_pose(homography, matrix_px), point_mm))[[0, 2]]
-
-    entries = fit.px_from_mm.ravel()[:8]
-    apart = np.array([view_of(entries + axis) - view_of(entries - axis) for axis in root_of(fit.covariance).T]) / 2
-    apart[:, 0] = (apart[:, 0] + 90) % 180 - 90  # half of an angle's difference
-    azimuth, distance = 1.96 * np.linalg.norm(apart, axis=0)
-    return float(azimuth), float(distance)
 
 
 def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: float) -> np.ndarray:
@@ -211,14 +204,46 @@ def _mm_from_px(homography, mm) -> np.ndarray:
     return np.linalg.inv((homography[:2, :2] - px[:, :, None] * homography[2, :2]) / w[:, None, None])
 
 
-def _with_figures(homography, mm, px, ids) -> PageFit:
-    residual = px - apply_homography(homography, mm)
-    freedom, noise = residual.size - (9 if len(ids) > 2 else 8), UNSEEN_NOISE_PX
+def _with_figures(homography, mm, px, keep, ids) -> PageFit:
+    every = px - apply_homography(homography, mm)
+    residual, noise, bend = every[keep], UNSEEN_NOISE_PX, 0.0
+    freedom = residual.size - (9 if len(ids) > 2 else 8)
     if freedom > 0:
-        student = stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
-        noise = max(CORNER_NOISE_PX, float(np.sqrt((residual**2).sum() / freedom) * student))
-    covariance = covariance_of(_jacobian(homography, mm), noise)
-    return PageFit(homography, covariance, rms_length_mm(_mm_from_px(homography, mm), residual), ids)
+        whole = every.reshape(-1, 4, 2)[keep.reshape(-1, 4).all(1)]
+        noise, bend = noise_and_bend(residual, whole, freedom)
+    covariance = covariance_of(_jacobian(homography, mm[keep]), noise)
+    length = rms_length_mm(_mm_from_px(homography, mm[keep]), residual)
+    odd = keep.reshape(-1, 4).sum(1) < _LEAST_CORNERS
+    misses = [
+        rms_length_mm(_mm_from_px(homography, at), off)
+        for at, off in zip(mm.reshape(-1, 4, 2)[odd], every.reshape(-1, 4, 2)[odd], strict=True)
+    ]
+    return PageFit(homography, covariance, length, ids, bend_mm(bend, residual, length), max(misses, default=0.0))
+
+
+def noise_and_bend(
+    residual: np.ndarray, markers: np.ndarray, freedom: int, floor_px: float = CORNER_NOISE_PX
+) -> tuple[float, float]:
+    """(px per coordinate to state uncertainties from, the part of px that is no noise) of residuals N×2 and M×4×2.
+
+    The alternating sum of a marker's corners, its twist, is what smooth shifts leave alone and noise does not; without
+    three whole markers to read it from, all that exceeds sharp corners' noise counts as no noise.
+    """
+    square = float((residual**2).sum()) / freedom
+    noise = max(floor_px, np.sqrt(square) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975))
+    if len(residual) < 12:  # of two markers a homography leaves little but noise
+        return float(noise), 0.0
+    chance = floor_px**2
+    if len(markers) > 2:
+        twist = np.einsum("mki,k->mi", markers, [0.5, -0.5, 0.5, -0.5])
+        chance = fdtri(freedom, twist.size, 0.9) * max(chance, float(np.mean(twist**2)))
+    bend = max(0.0, square - chance)
+    return float(np.sqrt(noise**2 + _BEND_GROWS**2 * bend)), float(np.sqrt(bend))
+
+
+def bend_mm(bend_px: float, residual_px: np.ndarray, residual_mm: float) -> float:
+    """The part in px per coordinate of a residual N×2 as a length, as the residual's own is `residual_mm`."""
+    return residual_mm * bend_px / max(float(np.sqrt(np.mean(residual_px**2))), 1e-9)
 
 
 def rms_length_mm(mm_from_px: np.ndarray, residual_px: np.ndarray) -> float:

@@ -1,0 +1,57 @@
+"""The focal length that a file's EXIF data states, and whether it is still this picture's.
+
+In: an open Pillow image. Out: the focal length in pixels, its spread, whether it was thrown away. EXIF gives the length
+on film of 36×24 mm, by the diagonal: of a picture that was cropped or zoomed digitally, neither that nor the principal
+point in the middle is true. So none is taken where EXIF has another size than the picture, a digital zoom, or where the
+picture has a shape that no sensor has. What an editor saved, and 16:9, which cameras cut from 4:3 or 3:2, is believed
+less. A crop that keeps the shape and mends EXIF leaves no trace here; the sheet's perspective may still contradict it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+
+_DIAGONAL_35MM = 43.2666  # mm, of the 36×24 mm frame that FocalLengthIn35mmFilm refers to
+EXIF_SPREAD = 0.03  # of its logarithm: whole millimeters of 26 (0.011), and lenses that are not quite what is written
+LOOSE_SPREAD = 0.1
+_SENSOR_SHAPES, _CUT_SHAPES = (4 / 3, 3 / 2), (16 / 9,)
+_SAME_SHAPE = 0.01
+_EDITORS = re.compile(
+    r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I
+)
+_EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
+
+
+def focal_of(image) -> tuple[float | None, float, bool]:
+    """(focal length in pixels or None, standard deviation of its logarithm, whether EXIF has one that was dropped)."""
+    try:
+        exif = image.getexif()
+        details = exif.get_ifd(_EXIF_IFD)
+    except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
+        return None, EXIF_SPREAD, False
+    focal_35mm, zoom = _number(details.get(_FOCAL_35MM)), _number(details.get(_ZOOM))
+    if focal_35mm is None:  # 0 means unknown in EXIF
+        return None, EXIF_SPREAD, False
+    stated = [side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None]
+    long, short = max(image.size), min(image.size)
+    resized = len(stated) == 2 and sorted(stated) != [short, long]
+    if resized or (zoom is not None and zoom > 1.01) or not _has_shape(long, short, _SENSOR_SHAPES + _CUT_SHAPES):
+        return None, EXIF_SPREAD, True
+    edited = bool(_EDITORS.search(str(exif.get(_SOFTWARE, ""))))
+    loose = edited or not _has_shape(long, short, _SENSOR_SHAPES)
+    return focal_35mm / _DIAGONAL_35MM * math.hypot(long, short), LOOSE_SPREAD if loose else EXIF_SPREAD, False
+
+
+def _has_shape(long: int, short: int, shapes: tuple[float, ...]) -> bool:
+    """Within a percent, and a pixel of small pictures."""
+    return any(abs(long - shape * short) <= max(_SAME_SHAPE * long, 1 + shape) for shape in shapes)
+
+
+def _number(value) -> float | None:
+    """A positive finite number, else None."""
+    try:
+        number = float(value or 0)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None

@@ -1,0 +1,142 @@
+"""Where the camera stood, as a point of the sheet has it, and how sure that is: of flat paper and of rolled.
+
+In: a homography or a `Shape` with its covariance, a pinhole matrix whose focal length is known to `focal_spread` of its
+logarithm (one standard deviation). Out: `Stance`, and whether a flat sheet's own perspective agrees with the matrix.
+A small or far sheet looks almost the same from either side of its normal: the azimuth's sign goes first. Spreads are
+those of the figures one standard deviation off along each axis of the parameters' covariance; tilt, which is never
+negative, is drawn.
+
+A page seen with a right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and |r1| = |r2|. Another focal length breaks
+both as sin² of the tilt, another principal point (a picture cropped aside) likewise, so frontal views tell nothing.
+
+Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.geometry import plane_pose, scaled_about, view_angles
+from patchproof.photo.ratio import cosine, gradient, log_ratio
+from patchproof.photo.rectify import PageFit, root_of
+from patchproof.photo.shapes import Project, Shape
+
+_PRINT_STRETCH = 0.015  # of |r1| = |r2|: what printers do to proportions
+_PAPER = 0.003  # of both, of angles in radians and of lengths: paper that is not quite flat or round, lenses
+_TOO_FAR = 13.8  # χ² of two degrees of freedom, 99.9 %
+_TOO_FAR_SIGMAS = 3.3
+_WEAK = 0.15  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
+
+
+@dataclass(frozen=True)
+class Stance:
+    """Azimuth and distance, each with its 95 % uncertainty, and whether perspective agrees with the focal length: None
+    where it tells too little.
+    """
+
+    azimuth_deg: float
+    azimuth_uncertainty_deg: float
+    distance_mm: float
+    distance_uncertainty_mm: float
+    agrees: bool | None
+
+
+def flat_stance(fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm) -> Stance:
+    """Of flat paper seen by that camera."""
+    entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
+    root = np.zeros((9, 9))
+    root[:8, :8], root[8, 8] = root_of(fit.covariance), focal_spread
+
+    def figures(values: np.ndarray) -> np.ndarray:
+        homography = np.append(values[:8], 1.0).reshape(3, 3)
+        return np.array(view_angles(plane_pose(homography, _longer(matrix_px, values[8])), point_mm))[[0, 2]]
+
+    return _stance(figures, entries, root, _agreement(fit, matrix_px, focal_spread))
+
+
+def bent_stance(shape: Shape, matrix_px: np.ndarray, focal_spread: float, point_mm) -> Stance:
+    """Of paper that a cylinder or a lens explains, by the tangent plane at the point."""
+    if shape.unit is not None:
+        scale = np.append(shape.unit, 1.0)
+        homography = np.append(shape.parameters[:8], 1.0) * scale
+        covariance = shape.covariance[:8, :8] * np.outer(shape.unit, shape.unit)
+        return flat_stance(PageFit(homography.reshape(3, 3), covariance, 0.0, ()), matrix_px, focal_spread, point_mm)
+    tangent = shape.tangent
+    assert tangent is not None  # a shape is one or the other
+
+    def figures(values: np.ndarray) -> np.ndarray:
+        return np.array(view_angles(tangent(values, point_mm), (0, 0)))[[0, 2]]
+
+    off, spread = shape.parameters[6], float(np.sqrt(shape.covariance[6, 6]))
+    told = spread < 0.7 * focal_spread
+    agrees = abs(off) <= _TOO_FAR_SIGMAS * focal_spread if told or abs(off) > focal_spread else None
+    return _stance(figures, shape.parameters, root_of_scaled(shape.covariance), agrees)
+
+
+def scale_and_tilt(px: Project, parameters: np.ndarray, point_mm) -> tuple[float, float]:
+    """(px_per_mm, tilt_deg) of a page point, as `geometry.local_scale` has them, for `px(parameters, mm)`."""
+    stretch = _stretch(px, parameters, point_mm)
+    return float(np.sqrt(abs(np.linalg.det(stretch)))), float(_tilt_deg(stretch[None])[0])
+
+
+def tilt_uncertainty_deg(px: Project, parameters: np.ndarray, covariance: np.ndarray, point_mm) -> float:
+    """95 % of that tilt."""
+    root, here = root_of_scaled(covariance), _stretch(px, parameters, point_mm)
+    sides = [[_stretch(px, parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
+    by_axis = (np.array(sides[0]) - np.array(sides[1])) / 2
+    rng = np.random.default_rng(0)  # fixed: same photo, same bytes
+    moved = here + np.einsum("nk,kij->nij", rng.standard_normal((1000, len(by_axis))), by_axis)
+    paper = np.eye(2) + _PAPER * rng.standard_normal((1000, 2, 2))
+    off = _tilt_deg(moved @ paper) - _tilt_deg(here[None])
+    return float(np.percentile(np.abs(off), 95))
+
+
+def _stretch(px: Project, parameters: np.ndarray, point_mm) -> np.ndarray:
+    """2×2 derivative of pixels by page millimeters, over a tenth of one."""
+    step = 0.05 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    right, left, below, above = px(parameters, np.asarray(point_mm, float) + step)
+    return np.stack([right - left, below - above], 1) / 0.1
+
+
+def root_of_scaled(covariance: np.ndarray) -> np.ndarray:
+    """`root_of`, for parameters of different units."""
+    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    return spread[:, None] * root_of(covariance / np.outer(spread, spread))
+
+
+def _stance(figures, parameters, root, agrees) -> Stance:
+    apart = np.array([figures(parameters + axis) - figures(parameters - axis) for axis in root.T]) / 2
+    apart[:, 0] = (apart[:, 0] + 90) % 180 - 90  # half of an angle's difference
+    azimuth, distance = figures(parameters)
+    spread = 1.96 * np.hypot(np.linalg.norm(apart, axis=0), [np.degrees(_PAPER), _PAPER * distance])
+    return Stance(float(azimuth), float(spread[0]), float(distance), float(spread[1]), agrees)
+
+
+def _longer(matrix_px: np.ndarray, log_focal: float) -> np.ndarray:
+    return matrix_px @ scaled_about([0.0, 0.0], float(np.exp(log_focal)))
+
+
+def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> bool | None:
+    """Whether r1 and r2 are as long and at right angles as their uncertainty allows; None where they tell nothing."""
+    entries = fit.px_from_mm.ravel()[:8]
+
+    def both(log_focal: float) -> np.ndarray:
+        back = np.linalg.inv(_longer(matrix_px, log_focal))
+        return np.array([cosine(entries, back), log_ratio(entries, back)])
+
+    back = np.linalg.inv(matrix_px)
+    by_entries = np.stack([gradient(f, entries, back) for f in (cosine, log_ratio)])
+    own = by_entries @ fit.covariance @ by_entries.T + np.diag([_PAPER**2, _PRINT_STRETCH**2 + _PAPER**2])
+    by_focal = (both(0.01) - both(-0.01)) / 0.02
+    off = both(0.0)
+    if off @ np.linalg.solve(own + focal_spread**2 * np.outer(by_focal, by_focal), off) > _TOO_FAR:
+        return False
+    return True if by_focal @ np.linalg.solve(own, by_focal) > 1 / _WEAK**2 else None
+
+
+def _tilt_deg(stretch: np.ndarray) -> np.ndarray:
+    """Of derivatives N×2×2."""
+    small = np.linalg.svd(stretch, compute_uv=False)
+    return np.degrees(np.arccos(np.clip(small[:, 1] / small[:, 0], 0, 1)))

@@ -1,0 +1,455 @@
+"""Photographs of a sheet that is bent, folded, wobbly, blurred, covered, cropped: a kind, a seed, and the exact truth.
+
+In: the name of a kind in `KINDS`, a seed. Out: a `Degraded`: a JPEG file with its EXIF data, where page points lie in
+it, and where the camera stood. Nothing of the tool's own models of paper is used: a sheet is a function from page
+millimeters to points in space (arc lengths integrated numerically, so that paper does not stretch), and a picture is
+made by throwing 64 samples per square millimeter of the page into it, nearest to the camera first.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+
+from patchproof.channel.printer import load_printer
+from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
+from patchproof.geometry import look_at, view_angles
+from patchproof.sheets.manifest import Manifest, design_sha256, png_base64
+from patchproof.sheets.piece import lay_out_piece, marker_image
+from test_photo_synthetic import noisy_design, some_design
+
+SIDE_MM, MARKER_MM, PAGE_PER_MM = 140.0, 14.0, 8
+SIZE = (1200, 900)
+FOCAL_35MM = 36
+FOCAL = FOCAL_35MM / 43.2666 * float(np.hypot(*SIZE))
+CENTER = np.array([SIDE_MM, SIDE_MM]) / 2
+
+Place = Callable[[np.ndarray], np.ndarray]
+"""Page millimeters N×2 from the sheet's middle to points N×3 in space; z points into the paper, (0, 0) becomes 0."""
+
+
+@dataclass(frozen=True)
+class Degraded:
+    """A file and its truth: `px` of page points; azimuth, elevation, distance and tilt as the sheet's middle has them.
+
+    Tilt is that of the sheet without its wobble.
+    """
+
+    jpeg: bytes
+    px: Callable[[np.ndarray], np.ndarray]
+    azimuth_deg: float
+    tilt_deg: float
+    distance_mm: float
+
+
+@dataclass
+class Draw:
+    """What one photograph is taken of and under; kinds change it."""
+
+    rng: np.random.Generator
+    place: Place
+    camera_from_page: np.ndarray
+    bends: bool = False  # whether the piece has markers in the middle of its sides, too
+    design: str = "noisy"
+    blur_px: float = 0.6
+    motion_px: float = 0.0
+    noise: float = 0.004
+    light: float = 0.8
+    jpeg: int = 90
+    lens: float = 0.0  # radial term at the picture's corner
+    wobble_px: float = 0.0
+    on_light: list[Callable[[np.ndarray], np.ndarray]] = field(default_factory=list)  # linear light, before blur
+    crop: tuple[int, int, int, int] | None = None  # x, y, width, height of what is left
+    zoom: float = 1.0  # digital: the middle, enlarged
+    exif: dict[int, object] = field(default_factory=dict)
+    twin: np.ndarray | None = None  # where the camera is, as a second print of the sheet has it
+
+
+@cache
+def sheet(bends: bool, design: str) -> tuple[Surface, Promised, np.ndarray]:
+    """The surface, how it was promised to look, and the printed page's linear light at `PAGE_PER_MM`."""
+    piece = lay_out_piece((SIDE_MM, SIDE_MM), MARKER_MM, "TESTSHEET0", "design", bends)
+    codes = {
+        "noisy": lambda: (noisy_design() * 255).astype(np.uint8),
+        "smooth": some_design,
+        "plain": lambda: np.full((140, 140, 3), 150, np.uint8),
+    }[design]()
+    markers = [dict(dictionary="DICT_5X5_1000", id=m.id, corners_mm=m.corners_mm, page=1) for m in piece.markers]
+    whole = (0.0, 0.0, SIDE_MM, SIDE_MM)
+    manifest = Manifest.model_validate(
+        dict(
+            version=2,
+            sheet_id="TESTSHEET0",
+            kind="design",
+            page_mm=(SIDE_MM, SIDE_MM),
+            design=dict(
+                sha256=design_sha256(codes), rect_mm=whole, size_px=codes.shape[1::-1], page=1, png=png_base64(codes)
+            ),
+            markers=markers,
+            chart=(),
+            cut_mm=whole,
+            ruler_mm=(100.0, 100.0),
+            tiles=(),
+            promise=None,
+            settings={"printer": {"profile": "coated"}},
+        )
+    )
+    surface = surface_of(manifest)
+    promised = promised_of(manifest, surface, load_printer("coated"))
+    size = round(SIDE_MM * PAGE_PER_MM)
+    image, reserved = marker_image(piece, (size, size))
+    page = np.where(
+        reserved[..., None], image, cv2.resize(codes / 255.0, (size, size), interpolation=cv2.INTER_NEAREST)
+    )
+    with torch.inference_mode():  # another printer than the promise has
+        page = load_printer("uncoated").apply(torch.tensor(page.transpose(2, 0, 1)[None], dtype=torch.float32))
+    return surface, promised, linear_from_srgb(page[0].numpy().transpose(1, 2, 0).astype(float)).reshape(-1, 3)
+
+
+def flat(points: np.ndarray) -> np.ndarray:
+    """Flat paper."""
+    return np.column_stack([points, np.zeros(len(points))])
+
+
+def bent(slope: Callable[[np.ndarray], np.ndarray], direction_rad: float) -> Place:
+    """Paper whose slope in radians depends on the way along one direction; slope 0 at its middle keeps the middle's."""
+    ways = np.linspace(-120, 120, 4801)
+    angle, step = slope(ways), ways[1] - ways[0]
+    across, depth = (np.cumsum(f(angle)) * step for f in (np.cos, np.sin))
+    across, depth = (np.interp(ways, ways + step / 2, v) - np.interp(0, ways + step / 2, v) for v in (across, depth))
+    turn = np.array([[np.cos(direction_rad), -np.sin(direction_rad)], [np.sin(direction_rad), np.cos(direction_rad)]])
+
+    def place(points: np.ndarray) -> np.ndarray:
+        along, rulings = (points @ turn).T
+        xy = np.column_stack([np.interp(along, ways, across), rulings]) @ turn.T
+        return np.column_stack([xy, np.interp(along, ways, depth)])
+
+    return place
+
+
+def rolled(radius_mm: float, direction_rad: float) -> Place:
+    """Round a cylinder, towards the camera where the radius is positive."""
+    return bent(lambda way: way / radius_mm, direction_rad)
+
+
+def folded(angle_deg: float, at_mm: float, direction_rad: float) -> Place:
+    """Folded along a line at that distance from the middle."""
+    return bent(lambda way: np.radians(angle_deg) * (way * np.sign(at_mm) > abs(at_mm)), direction_rad)
+
+
+def cone(bend: float, change: float, direction_rad: float) -> Place:
+    """More bent at one end than at the other."""
+    turn = np.array([[np.cos(direction_rad), -np.sin(direction_rad)], [np.sin(direction_rad), np.cos(direction_rad)]])
+
+    def place(points: np.ndarray) -> np.ndarray:
+        x, y = (points @ turn).T / 70
+        k = bend * (1 + change * y)
+        angle = k * x
+        across, depth = x * np.sinc(angle / np.pi), x * np.sinc(angle / 2 / np.pi) * np.sin(angle / 2)
+        return np.column_stack([70 * np.column_stack([across, y]) @ turn.T, 70 * depth])
+
+    return place
+
+
+def camera(azimuth_deg, elevation_deg, distance_mm, roll_deg=0.0, aside_mm=(0.0, 0.0)) -> np.ndarray:
+    """`camera_from_page` with the page's origin at the sheet's middle."""
+    az, el = np.radians([azimuth_deg, elevation_deg])
+    eye = distance_mm * np.array([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)])
+    return look_at(eye, [*aside_mm, 0], roll_deg) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def fresh(rng: np.random.Generator) -> Draw:
+    """A flat sheet under usual conditions."""
+    aside = rng.uniform(-40, 40, 2)
+    where = camera(rng.uniform(-45, 45), rng.uniform(-20, 25), rng.uniform(380, 620), rng.uniform(-15, 15), aside)
+    design = str(rng.choice(["noisy", "noisy", "smooth", "plain"]))
+    return Draw(rng, flat, where, design=design, blur_px=rng.uniform(0.4, 0.9))
+
+
+def _changed(**changes) -> Callable[[Draw], Draw]:
+    return lambda d: replace(d, **{k: v(d.rng) if callable(v) else v for k, v in changes.items()})
+
+
+def _bent_by(make: Callable[[np.random.Generator], Place], bends=None) -> Callable[[Draw], Draw]:
+    return lambda d: replace(d, place=make(d.rng), bends=bool(d.rng.random() < 0.5) if bends is None else bends)
+
+
+def _axis(rng) -> float:
+    """Along x or y, half of the time somewhere between."""
+    return float(rng.choice([0.0, np.pi / 2, rng.uniform(0, np.pi), rng.uniform(0, np.pi)]))
+
+
+def _sign(rng) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def _roll(low: float, high: float, sign=None, bends=None):
+    def make(rng):
+        radius = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        return rolled((sign or _sign(rng)) * radius, float(rng.choice([0.0, np.pi / 2])))
+
+    def change(d: Draw) -> Draw:
+        rng = d.rng
+        where = camera(_sign(rng) * rng.uniform(0, 50), rng.uniform(-10, 10), rng.uniform(380, 620), rng.uniform(-5, 5))
+        return replace(_bent_by(make, bends)(d), camera_from_page=where)
+
+    return change
+
+
+def _fold(angle: float):
+    return _bent_by(lambda rng: folded(_sign(rng) * angle, rng.uniform(2, 45) * _sign(rng), _axis(rng)))
+
+
+def _wave(rng):
+    length, height, start = rng.uniform(60, 160), rng.uniform(1.5, 5), rng.uniform(0, 2 * np.pi)
+    steep = 2 * np.pi * height / length
+    return bent(lambda way: np.arctan(steep * np.sin(2 * np.pi * way / length + start)), _axis(rng))
+
+
+def _ear(rng):
+    angle, reach = np.radians(rng.uniform(30, 80)), rng.uniform(55, 75)
+    return bent(lambda way: angle * (way > reach), np.pi / 4)
+
+
+def _shade(d: Draw) -> Draw:
+    """Half of the picture in shadow, with an edge of a few pixels through its middle."""
+    rng = d.rng
+    angle, depth, soft = rng.uniform(0, np.pi), rng.uniform(0.2, 0.6), rng.uniform(0.5, 8)
+
+    def shade(light):
+        y, x = np.mgrid[: light.shape[0], : light.shape[1]] - np.array(light.shape[:2])[:, None, None] / 2
+        side = (x * np.cos(angle) + y * np.sin(angle)) / soft
+        return light * (depth + (1 - depth) / (1 + np.exp(-np.clip(side, -50, 50))))[..., None]
+
+    return replace(d, on_light=[shade])
+
+
+def _glare(d: Draw) -> Draw:
+    """A lamp's reflection somewhere on the sheet."""
+    at, wide, bright = d.rng.uniform(-150, 150, 2), d.rng.uniform(15, 60), d.rng.uniform(0.5, 2.0)
+
+    def glare(light):
+        y, x = np.mgrid[: light.shape[0], : light.shape[1]] - np.array(light.shape[:2])[:, None, None] / 2
+        return light + bright * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 2 / wide**2)[..., None]
+
+    return replace(d, on_light=[glare])
+
+
+def _moire(d: Draw) -> Draw:
+    """Stripes of a screen."""
+    period, angle, depth = d.rng.uniform(2.2, 12), d.rng.uniform(0, np.pi), d.rng.uniform(0.05, 0.25)
+
+    def stripes(light):
+        y, x = np.mgrid[: light.shape[0], : light.shape[1]]
+        wave = np.sin(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / period)
+        return light * (1 + depth * wave)[..., None]
+
+    return replace(d, on_light=[stripes])
+
+
+def _cover(d: Draw) -> Draw:
+    """A card or thumb over a part of the sheet, somewhere near it."""
+    at, size, angle = d.rng.uniform(-170, 170, 2), d.rng.uniform(40, 170, 2), d.rng.uniform(0, 180)
+    color = d.rng.uniform(0.03, 0.8, 3)
+
+    def cover(light):
+        quad = cv2.boxPoints((tuple(float(v) for v in at + np.array(light.shape[1::-1]) / 2), tuple(size), angle))
+        light = light.copy()
+        cv2.fillConvexPoly(light, quad.round().astype(np.int32), tuple(float(v) for v in color))
+        return light
+
+    return replace(d, on_light=[cover])
+
+
+def _cropped(d: Draw, shape: str, tells: bool) -> Draw:
+    """A part of the picture that still holds the sheet, in its own or another shape; `tells`: EXIF has the old size."""
+    size = {"odd": (700, 655), "same": (720, 540), "middle": (720, 540)}[shape]
+    free = np.array(SIZE) - size
+    x, y = free // 2 if shape == "middle" else d.rng.choice([0.15, 0.85], 2) * free
+    az = float(d.rng.uniform(-45, 45))  # the sheet in what is left
+    matrix = np.array([x + size[0] / 2 - SIZE[0] / 2, y + size[1] / 2 - SIZE[1] / 2]) / FOCAL
+    where = camera(az, d.rng.uniform(-20, 25), d.rng.uniform(380, 560))
+    turn = look_at([0, 0, 0], [matrix[0], matrix[1], 1.0], 0, (0, -1, 0))  # the camera turns away from the sheet
+    exif = {0xA002: SIZE[0], 0xA003: SIZE[1]} if tells else {0xA002: size[0], 0xA003: size[1]}
+    return replace(d, crop=(int(x), int(y), *size), camera_from_page=turn.T @ where, exif=exif)
+
+
+def _twin(d: Draw) -> Draw:
+    """Two prints of one sheet side by side."""
+    az, el, far = d.rng.uniform(-25, 25), d.rng.uniform(-15, 15), d.rng.uniform(520, 700)
+    apart = d.rng.uniform(75, 85)
+    return replace(
+        d,
+        camera_from_page=camera(az, el, far, 0, (apart, 0)),
+        twin=camera(az + d.rng.uniform(-5, 5), el, far + d.rng.uniform(-20, 150), 0, (-apart, 0)),
+    )
+
+
+MILD = ("plain", "defocus_1", "noise_mild", "jpeg_60", "motion_2", "shadow", "far", "lens_mild", "roll_300_1000_bends")
+KINDS: dict[str, Callable[[Draw], Draw]] = {
+    "plain": lambda d: d,
+    "plain_8_markers": _changed(bends=True),
+    "noise_mild": _changed(noise=0.01),
+    "noise": _changed(noise=0.04),
+    "jpeg_60": _changed(jpeg=60),
+    "jpeg_20": _changed(jpeg=20),
+    "dark": _changed(light=0.03, noise=0.006),
+    "defocus_1": _changed(blur_px=1.2),
+    "defocus_2": _changed(blur_px=2.2),
+    "defocus_4": _changed(blur_px=4.0),
+    "motion_2": _changed(motion_px=2.0),
+    "motion_4": _changed(motion_px=4.0),
+    "motion_8": _changed(motion_px=8.0),
+    "motion_12": _changed(motion_px=12.0),
+    "far": _changed(camera_from_page=lambda rng: camera(rng.uniform(-45, 45), 5, rng.uniform(900, 1300))),
+    "oblique": _changed(camera_from_page=lambda rng: camera(_sign(rng) * rng.uniform(50, 70), 5, 500)),
+    "lens_mild": _changed(lens=lambda rng: rng.uniform(-0.01, 0.01)),
+    "lens": _changed(lens=lambda rng: _sign(rng) * rng.uniform(0.02, 0.08)),
+    "fold_10": _fold(10),
+    "fold_30": _fold(30),
+    "fold_60": _fold(60),
+    "dog_ear": _bent_by(_ear),
+    "wobble_1": _changed(wobble_px=1.0),
+    "wobble_4": _changed(wobble_px=4.0),
+    "wobble_12": _changed(wobble_px=12.0),
+    "waves": _bent_by(_wave),
+    "cone": _bent_by(lambda rng: cone(_sign(rng) * rng.uniform(0.1, 0.6), rng.uniform(0.3, 0.9), _axis(rng))),
+    "roll_60_100_bends": _roll(60, 100, bends=True),
+    "roll_100_300_bends": _roll(100, 300, bends=True),
+    "roll_300_1000_bends": _roll(300, 1000, bends=True),
+    "roll_60_100": _roll(60, 100, bends=False),
+    "roll_100_300": _roll(100, 300, bends=False),
+    "roll_300_1000": _roll(300, 1000, bends=False),
+    "roll_any_axis": _bent_by(lambda rng: rolled(_sign(rng) * rng.uniform(100, 400), _axis(rng)), True),
+    "shadow": _shade,
+    "glare": _glare,
+    "moire": _moire,
+    "covered": _cover,
+    "two_prints": _twin,
+    "crop_told": partial(_cropped, shape="odd", tells=True),
+    "crop_odd": partial(_cropped, shape="odd", tells=False),
+    "crop_aside": partial(_cropped, shape="same", tells=False),
+    "crop_middle_told": partial(_cropped, shape="middle", tells=True),
+    "zoom_told": lambda d: replace(
+        d, zoom=2.0, exif={0xA404: 2.0}, camera_from_page=camera(d.rng.uniform(-45, 45), 5, 900)
+    ),
+}
+
+
+def take(kind: str, seed: int) -> tuple[Degraded, Surface, Promised]:
+    """One photograph of that kind, and what it is measured against."""
+    number = list(KINDS).index(kind)
+    draw = KINDS[kind](fresh(np.random.default_rng([seed, number])))
+    surface, promised, page = sheet(draw.bends, draw.design)
+    wobble = _wobble(draw)
+
+    def px(mm: np.ndarray, camera_from_page=draw.camera_from_page) -> np.ndarray:
+        return _projected(draw, draw.place(np.asarray(mm, float) - CENTER), camera_from_page, wobble)[0]
+
+    light = _background(draw)
+    for where in [draw.camera_from_page] + ([] if draw.twin is None else [draw.twin]):
+        light = _laid_on(light, page, *_projected(draw, draw.place(_samples() - CENTER), where, wobble))
+    for change in draw.on_light:
+        light = change(light)
+    codes = _exposed(light, draw)
+    around = 0.01 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    right, left, below, above = _projected(draw, draw.place(around), draw.camera_from_page, np.zeros_like)[0]
+    large, small = np.linalg.svd(np.stack([right - left, below - above], 1), compute_uv=False)
+    azimuth, _, distance = view_angles(draw.camera_from_page, (0, 0))
+    tilt = float(np.degrees(np.arccos(small / large)))
+    return Degraded(_file(codes, draw), px, azimuth, tilt, distance), surface, promised
+
+
+@cache
+def _samples() -> np.ndarray:
+    size = round(SIDE_MM * PAGE_PER_MM)
+    rows, columns = np.mgrid[:size, :size]
+    return (np.column_stack([columns.ravel(), rows.ravel()]) + 0.5) / PAGE_PER_MM
+
+
+def _projected(draw: Draw, points: np.ndarray, camera_from_page, wobble) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels N×2 of the file and depths N."""
+    seen = points @ camera_from_page[:3, :3].T + camera_from_page[:3, 3]
+    off = FOCAL * draw.zoom * seen[:, :2] / seen[:, 2:]
+    off = off * (1 + draw.lens * (off**2).sum(1, keepdims=True) / (np.hypot(*SIZE) / 2) ** 2)
+    shift = np.zeros(2) if draw.crop is None else np.array(draw.crop[:2])
+    px = off + np.array(SIZE) / 2 - shift
+    return px + wobble(px), seen[:, 2]
+
+
+def _wobble(draw: Draw) -> Callable[[np.ndarray], np.ndarray]:
+    """A smooth random displacement of pixels whose standard deviation is 0.5 of its amplitude."""
+    waves = 2 * np.pi / draw.rng.uniform(150, 500, (6, 1)) * _directions(draw.rng.uniform(0, 2 * np.pi, 6))
+    phases, ways = draw.rng.uniform(0, 2 * np.pi, 6), _directions(draw.rng.uniform(0, 2 * np.pi, 6))
+    if not draw.wobble_px:
+        return np.zeros_like
+    return lambda px: draw.wobble_px / np.sqrt(6) * np.sin(px @ waves.T + phases) @ ways
+
+
+def _directions(angles: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def _background(draw: Draw) -> np.ndarray:
+    """A wall with a few soft patches of its own."""
+    coarse = draw.rng.uniform(0.1, 0.35, (6, 8, 3)).astype(np.float32)
+    size = SIZE if draw.crop is None else draw.crop[2:]
+    return cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
+
+
+def _laid_on(light, page, px, depth) -> np.ndarray:
+    """The page's samples thrown into the picture's light, each into the four pixels about it, hidden ones left out."""
+    height, width = light.shape[:2]
+    inside = ((px > 1) & (px < [width - 1, height - 1])).all(1)
+    px, depth, page = px[inside], depth[inside], page[inside]
+    cell = (px[:, 1] // 4).astype(int) * (width // 4 + 1) + (px[:, 0] // 4).astype(int)
+    nearest = np.full((height // 4 + 1) * (width // 4 + 1), np.inf)
+    np.minimum.at(nearest, cell, depth)
+    shown = depth < nearest[cell] + 12.0  # mm: what a steep part gains over four pixels
+    px, page = px[shown] - 0.5, page[shown]
+    low = np.floor(px).astype(int)
+    share = px - low
+    total = np.zeros((height * width, 4))
+    for dx in (0, 1):
+        for dy in (0, 1):
+            weight = np.abs(1 - dx - share[:, 0]) * np.abs(1 - dy - share[:, 1])
+            index = (low[:, 1] + dy) * width + low[:, 0] + dx
+            total[:, 3] += np.bincount(index, weight, height * width)
+            for c in range(3):
+                total[:, c] += np.bincount(index, weight * page[:, c], height * width)
+    total = total.reshape(height, width, 4).astype(np.float32)
+    dense = np.maximum(cv2.dilate(total[..., 3], np.ones((5, 5))), 1e-3)
+    cover = np.clip(total[..., 3:] / dense[..., None] / 0.7, 0, 1)
+    color = total[..., :3] / np.maximum(total[..., 3:], 1e-6)
+    return light * (1 - cover) + color * cover
+
+
+def _exposed(light: np.ndarray, draw: Draw) -> np.ndarray:
+    """uint8 sRGB: blurred, moved, noisy."""
+    linear = cv2.GaussianBlur(light * np.float32(draw.light), (0, 0), draw.blur_px)
+    if draw.motion_px:
+        way = _directions(draw.rng.uniform(0, np.pi, 1))[0] * draw.motion_px
+        steps = np.linspace(-0.5, 0.5, max(5, round(3 * draw.motion_px)))
+        moved = (np.array([[1, 0, s * way[0]], [0, 1, s * way[1]]]) for s in steps)
+        size = linear.shape[1::-1]
+        linear = sum(cv2.warpAffine(linear, m, size, borderMode=cv2.BORDER_REPLICATE) for m in moved) / len(steps)
+    linear = linear + draw.rng.normal(0, draw.noise, linear.shape) * np.sqrt(np.maximum(linear, 0.02))
+    return np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+def _file(codes: np.ndarray, draw: Draw) -> bytes:
+    exif, buffer = Image.Exif(), io.BytesIO()
+    details = exif.get_ifd(0x8769)
+    details |= {0xA405: FOCAL_35MM, **draw.exif}
+    for key, value in details.items():
+        exif.get_ifd(0x8769)[key] = value
+    Image.fromarray(codes).save(buffer, "JPEG", quality=draw.jpeg, exif=exif)
+    return buffer.getvalue()

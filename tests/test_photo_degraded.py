@@ -1,0 +1,124 @@
+"""What is called measured is right: photographs degraded in forty ways, against the truth they were made from.
+
+Run as a program it takes as many photographs as wanted and prints a table by kind:
+`python tests/test_photo_degraded.py --photos 1000 [--first 0] [--kinds fold_30 waves]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from degraded_photos import KINDS, SIDE_MM, take
+from patchproof.evidence import measure as measuring
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.placed import Placed, place
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.results import PhotoEntry
+from patchproof.geometry import rect_corners
+from patchproof.photo.read import read_photo
+
+CORNERS = rect_corners((0.0, 0.0, SIDE_MM, SIDE_MM))
+USUAL = ("plain", "plain_8_markers", "noise_mild", "jpeg_60", "defocus_1", "motion_2", "shadow", "lens_mild")
+ROLLED = ("roll_60_100_bends", "roll_100_300_bends", "roll_300_1000_bends", "roll_100_300", "roll_any_axis")
+UNEXPLAINED = ("fold_30", "fold_60", "wobble_4", "wobble_12", "two_prints")
+RISKY = ("noise", "dark", "jpeg_20", "oblique", "lens", "motion_8", "fold_10", "dog_ear", "wobble_1", "waves", "cone")
+OTHERS = ("roll_60_100", "glare", "moire", "covered")
+CROPPED = ("crop_told", "crop_odd", "crop_aside", "crop_middle_told", "zoom_told")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """An entry, and by figure how far it is off with the 95 % uncertainty that was stated of it."""
+
+    entry: PhotoEntry
+    off: dict[str, tuple[float, float]]
+
+    @property
+    def measured(self) -> bool:
+        """Whether its status says so."""
+        return self.entry.status == "measured"
+
+    def wrong(self) -> dict[str, tuple[float, float]]:
+        """Figures of a measured photograph beyond three times what was stated."""
+        return {name: pair for name, pair in self.off.items() if self.measured and pair[0] > 3 * pair[1]}
+
+
+def outcome(kind: str, seed: int, folder) -> Outcome:
+    """One photograph, taken and measured as `verify` does."""
+    truth, surface, promised = take(kind, seed)
+    (folder / "a.jpg").write_bytes(truth.jpeg)
+    with patch.object(measuring, "place", wraps=place) as placing:
+        returned: list[Placed | None] = []
+        placing.side_effect = lambda *args: returned.append(place(*args)) or returned[-1]
+        view = view_of(read_photo(folder / "a.jpg"), None)
+        entry = measuring.measure(view, "a.jpg", surface, promised, promised_ranges(())).entry
+    geometry, pose, off = entry.geometry, entry.pose, {}
+    if geometry is not None and returned[-1] is not None:
+        off["corners"] = _corner_error_mm(returned[-1], truth.px(CORNERS)), geometry.corner_uncertainty_mm
+        off["tilt"] = abs(geometry.tilt_deg - truth.tilt_deg), geometry.tilt_uncertainty_deg
+    if pose is not None and pose.azimuth_deg is not None:
+        off["azimuth"] = abs(pose.azimuth_deg - truth.azimuth_deg), pose.azimuth_uncertainty_deg
+    if pose is not None and pose.distance_mm is not None:
+        off["distance"] = abs(pose.distance_mm - truth.distance_mm), pose.distance_uncertainty_mm
+    return Outcome(entry, off)
+
+
+def _corner_error_mm(placed: Placed, true_px: np.ndarray) -> float:
+    """The farthest that the model's page points at the true pixels lie from the design's corners."""
+    mm, steps = CORNERS.copy(), 0.05 * np.eye(2)
+
+    def px(points: np.ndarray) -> np.ndarray:
+        return placed.px(placed.parameters, points)
+
+    for _ in range(10):
+        by_mm = np.stack([(px(mm + step) - px(mm - step)) / 0.1 for step in steps], -1)
+        mm = mm + np.clip(np.linalg.solve(by_mm, (true_px - px(mm))[..., None])[..., 0], -20, 20)
+    return float(np.linalg.norm(mm - CORNERS, axis=1).max())
+
+
+@pytest.mark.parametrize("kind", [*USUAL, *ROLLED, *UNEXPLAINED, *RISKY, *OTHERS, *CROPPED])
+def test_what_is_called_measured_is_right(kind, tmp_path):
+    result = outcome(kind, 0, tmp_path)
+    assert not result.wrong()
+    if kind in USUAL + ROLLED:
+        assert result.measured and result.entry.pose is not None and result.entry.pose.azimuth_deg is not None
+    if kind in UNEXPLAINED:
+        assert not result.measured and result.entry.code in {"curled", "too_few_markers", "several_sheets"}
+    if kind in CROPPED:
+        assert result.measured and result.entry.pose is None
+        expected = "contradicted" if kind == "crop_aside" else "cropped"
+        assert result.entry.geometry is not None and result.entry.geometry.focal == expected
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--photos", type=int, default=len(KINDS))
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS))
+    asked = parser.parse_args()
+    results: dict[str, list[Outcome]] = defaultdict(list)
+    with TemporaryDirectory() as folder:
+        for number in range(asked.photos):
+            seed, kind = divmod(number, len(asked.kinds))
+            results[asked.kinds[kind]].append(outcome(asked.kinds[kind], asked.first + seed, Path(folder)))
+    print(f"{'kind':20s}  n measured; within 1x, within 3x of: corners, azimuth, distance, tilt; codes of the others")
+    for kind, all_of in [*results.items(), ("all", [one for many in results.values() for one in many])]:
+        taken = [one for one in all_of if one.measured]
+        shares = []
+        for name in ("corners", "azimuth", "distance", "tilt"):
+            pairs = [one.off[name] for one in taken if name in one.off]
+            shares.append(f"{sum(a <= b for a, b in pairs)}, {sum(a <= 3 * b for a, b in pairs)} of {len(pairs)}")
+        codes = Counter(one.entry.code for one in all_of if not one.measured)
+        print(f"{kind:20s} {len(all_of):3d} {len(taken):3d}; {'; '.join(shares)}; {dict(codes)}")
+
+
+if __name__ == "__main__":
+    main()
