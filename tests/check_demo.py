@@ -17,7 +17,7 @@ def check(folder: Path) -> list[str]:
     summary = json.loads((folder / "report" / "report.json").read_text())["summary"]
     promise = manifest["promise"]
     best = max(claim["rate"] for claim in promise["controls"].values())
-    photos = len(list((folder / "photos").glob("*.jpg")))
+    photos = len(list((folder / "photos").rglob("*.jpg")))
     for ok, sentence in (
         (photos >= 40, f"{photos} photographs, expected 40 or more"),
         (summary["judged"] == photos, f"{summary['judged']} of {photos} photographs judged, expected all"),
