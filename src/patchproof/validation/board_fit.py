@@ -33,7 +33,7 @@ from patchproof.validation.known_boards import Pose, Printed, moved, paper_share
 _BLURS = (0.0, *(SMALLEST_BLUR_PX * 1.05 ** np.arange(50)).tolist())
 _COARSE = 5  # steps between those that are tried first
 _ROUNDS = 4  # of shift, then light and blur; a fifth moves nothing by 0.01 px
-_MOST_PIXELS, _LEAST_PIXELS = 20_000, 500
+_MOST_PIXELS, _LEAST_PIXELS = 10_000, 500
 _MOST_CLIPPED = 0.5  # share of the board at full white
 _LARGEST_MISS = 0.3  # of paper's light; what a shift cannot explain, such as a hand, pulls no harder
 _FLAT, _FLAT_PX = 0.995, 7  # paper's share all over a square of pixels that count as flat white
