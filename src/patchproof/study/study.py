@@ -43,6 +43,7 @@ STUDIES: dict[str, str] = {
     "patch3d": "patchproof.experiments.patch3d",
     "peers": "patchproof.bench.peers",
     "promises": "patchproof.validation.promises",
+    "real": "patchproof.validation.real",
     "robust": "patchproof.experiments.robust",
     "stress": "patchproof.experiments.stress",
     "transfer": "patchproof.experiments.transfer",
