@@ -24,7 +24,8 @@ from patchproof.photo.rectify import fit_page, part_around
 from patchproof.strict import NotNegative, Strict
 
 LEAST_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
-# Of a module: how far corners may lie off the plane, root mean square. 25 photographs of flat boards miss by 0.02 to 0.17.
+# Of a module: how far corners may lie off the plane, root mean square. In 25 photographs of flat boards they were off
+# by 0.02 to 0.17.
 LARGEST_MISFIT = 0.2
 _FINE = 8  # samples along each side of a pixel
 _QUIET = 1 / 8  # of a loose marker's side: the paper around it that has to be white for it to be found
