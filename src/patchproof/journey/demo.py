@@ -17,7 +17,7 @@ from patchproof.printing.sheet import sheet_of
 from patchproof.report.summary import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint
 
-PHOTOS, SESSIONS = 40, 8
+PHOTOS, SESSIONS = 48, 12
 OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
 
 SCENE = """\
