@@ -1,9 +1,8 @@
 """Photographs of a sheet that is bent, folded, wobbly, blurred, covered, cropped: a kind, a seed, and the exact truth.
 
 In: the name of a kind in `KINDS`, a seed. Out: a `Degraded`: a JPEG file with its EXIF data, where page points lie in
-it, and where the camera stood. Nothing of the tool's own models of paper is used: a sheet is a function from page
-millimeters to points in space (arc lengths integrated numerically, so that paper does not stretch), and a picture is
-made by throwing 64 samples per square millimeter of the page into it, nearest to the camera first.
+it, and where the camera stood. The sheet is one of `bent_paper`; a picture is made by throwing 64 samples per square
+millimeter of the page into it, those nearest to the camera.
 """
 
 from __future__ import annotations
@@ -15,25 +14,16 @@ from functools import cache, partial
 
 import cv2
 import numpy as np
-import torch
 from PIL import Image
 
-from patchproof.channel.printer import load_printer
-from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
+from bent_paper import CENTER, PAGE_PER_MM, SIDE_MM, Place, bent, camera, cone, flat, folded, rolled, sheet
+from patchproof.color import srgb_from_linear
+from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import look_at, view_angles
-from patchproof.sheets.manifest import Manifest, design_sha256, png_base64
-from patchproof.sheets.piece import lay_out_piece, marker_image
-from test_photo_synthetic import noisy_design, some_design
 
-SIDE_MM, MARKER_MM, PAGE_PER_MM = 140.0, 14.0, 8
 SIZE = (1200, 900)
 FOCAL_35MM = 36
 FOCAL = FOCAL_35MM / 43.2666 * float(np.hypot(*SIZE))
-CENTER = np.array([SIDE_MM, SIDE_MM]) / 2
-
-Place = Callable[[np.ndarray], np.ndarray]
-"""Page millimeters N×2 from the sheet's middle to points N×3 in space; z points into the paper, (0, 0) becomes 0."""
 
 
 @dataclass(frozen=True)
@@ -71,99 +61,6 @@ class Draw:
     zoom: float = 1.0  # digital: the middle, enlarged
     exif: dict[int, object] = field(default_factory=dict)
     twin: np.ndarray | None = None  # where the camera is, as a second print of the sheet has it
-
-
-@cache
-def sheet(bends: bool, design: str) -> tuple[Surface, Promised, np.ndarray]:
-    """The surface, how it was promised to look, and the printed page's linear light at `PAGE_PER_MM`."""
-    piece = lay_out_piece((SIDE_MM, SIDE_MM), MARKER_MM, "TESTSHEET0", "design", bends)
-    codes = {
-        "noisy": lambda: (noisy_design() * 255).astype(np.uint8),
-        "smooth": some_design,
-        "plain": lambda: np.full((140, 140, 3), 150, np.uint8),
-    }[design]()
-    markers = [dict(dictionary="DICT_5X5_1000", id=m.id, corners_mm=m.corners_mm, page=1) for m in piece.markers]
-    whole = (0.0, 0.0, SIDE_MM, SIDE_MM)
-    manifest = Manifest.model_validate(
-        dict(
-            version=2,
-            sheet_id="TESTSHEET0",
-            kind="design",
-            page_mm=(SIDE_MM, SIDE_MM),
-            design=dict(
-                sha256=design_sha256(codes), rect_mm=whole, size_px=codes.shape[1::-1], page=1, png=png_base64(codes)
-            ),
-            markers=markers,
-            chart=(),
-            cut_mm=whole,
-            ruler_mm=(100.0, 100.0),
-            tiles=(),
-            promise=None,
-            settings={"printer": {"profile": "coated"}},
-        )
-    )
-    surface = surface_of(manifest)
-    promised = promised_of(manifest, surface, load_printer("coated"))
-    size = round(SIDE_MM * PAGE_PER_MM)
-    image, reserved = marker_image(piece, (size, size))
-    page = np.where(
-        reserved[..., None], image, cv2.resize(codes / 255.0, (size, size), interpolation=cv2.INTER_NEAREST)
-    )
-    with torch.inference_mode():  # another printer than the promise has
-        page = load_printer("uncoated").apply(torch.tensor(page.transpose(2, 0, 1)[None], dtype=torch.float32))
-    return surface, promised, linear_from_srgb(page[0].numpy().transpose(1, 2, 0).astype(float)).reshape(-1, 3)
-
-
-def flat(points: np.ndarray) -> np.ndarray:
-    """Flat paper."""
-    return np.column_stack([points, np.zeros(len(points))])
-
-
-def bent(slope: Callable[[np.ndarray], np.ndarray], direction_rad: float) -> Place:
-    """Paper whose slope in radians depends on the way along one direction; slope 0 at its middle keeps the middle's."""
-    ways = np.linspace(-120, 120, 4801)
-    angle, step = slope(ways), ways[1] - ways[0]
-    across, depth = (np.cumsum(f(angle)) * step for f in (np.cos, np.sin))
-    across, depth = (np.interp(ways, ways + step / 2, v) - np.interp(0, ways + step / 2, v) for v in (across, depth))
-    turn = np.array([[np.cos(direction_rad), -np.sin(direction_rad)], [np.sin(direction_rad), np.cos(direction_rad)]])
-
-    def place(points: np.ndarray) -> np.ndarray:
-        along, rulings = (points @ turn).T
-        xy = np.column_stack([np.interp(along, ways, across), rulings]) @ turn.T
-        return np.column_stack([xy, np.interp(along, ways, depth)])
-
-    return place
-
-
-def rolled(radius_mm: float, direction_rad: float) -> Place:
-    """Round a cylinder, towards the camera where the radius is positive."""
-    return bent(lambda way: way / radius_mm, direction_rad)
-
-
-def folded(angle_deg: float, at_mm: float, direction_rad: float) -> Place:
-    """Folded along a line at that distance from the middle."""
-    return bent(lambda way: np.radians(angle_deg) * (way * np.sign(at_mm) > abs(at_mm)), direction_rad)
-
-
-def cone(bend: float, change: float, direction_rad: float) -> Place:
-    """More bent at one end than at the other."""
-    turn = np.array([[np.cos(direction_rad), -np.sin(direction_rad)], [np.sin(direction_rad), np.cos(direction_rad)]])
-
-    def place(points: np.ndarray) -> np.ndarray:
-        x, y = (points @ turn).T / 70
-        k = bend * (1 + change * y)
-        angle = k * x
-        across, depth = x * np.sinc(angle / np.pi), x * np.sinc(angle / 2 / np.pi) * np.sin(angle / 2)
-        return np.column_stack([70 * np.column_stack([across, y]) @ turn.T, 70 * depth])
-
-    return place
-
-
-def camera(azimuth_deg, elevation_deg, distance_mm, roll_deg=0.0, aside_mm=(0.0, 0.0)) -> np.ndarray:
-    """`camera_from_page` with the page's origin at the sheet's middle."""
-    az, el = np.radians([azimuth_deg, elevation_deg])
-    eye = distance_mm * np.array([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)])
-    return look_at(eye, [*aside_mm, 0], roll_deg) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def fresh(rng: np.random.Generator) -> Draw:

@@ -16,7 +16,8 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from degraded_photos import KINDS, SIDE_MM, take
+from bent_paper import SIDE_MM
+from degraded_photos import KINDS, take
 from patchproof.evidence import measure as measuring
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.placed import Placed, place
