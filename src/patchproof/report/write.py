@@ -30,7 +30,6 @@ _EFFECTS = {
     "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
     "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
 }
-MOST_SESSIONS = 12  # with a bar of their own
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
 
@@ -100,10 +99,6 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
     rows, judged = [], summary["judged"]
     if summary["rate"] is not None:
         rows.append(("These photographs", summary["rate"], summary["interval"], "seen"))
-        sessions = [session for session in summary["sessions"] if session["judged"]]
-        for session in sessions[:MOST_SESSIONS] if len(sessions) > 1 else ():
-            name = f"Session {session['name'] or '(no folder)'}: {session['recognized']} of {session['judged']}"
-            rows.append((name, session["recognized"] / session["judged"], None, "seen"))
     if promise:
         rows.append(("Promised", promise["rate"], promise["interval"], "promised"))
     if summary["matched_rate"] is not None:
