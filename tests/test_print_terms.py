@@ -116,5 +116,5 @@ def test_a_print_scale_range_reaches_the_promise_and_the_truth(tmp_path):
     """Homographies are those of the print as large as it is, so px_per_mm of the sheet's own millimeters shrink."""
     scene = scene_with(tmp_path, printer__scale=[0.5, 0.5])
     usual = scene_with(tmp_path)
-    half, full = (area(outline(s, s.draw("promise", 3), (300, 300))) for s in (scene, usual))
+    half, full = (area(outline(s, s.draw("evaluate", 3), (300, 300))) for s in (scene, usual))
     np.testing.assert_allclose(half / full, 0.25, rtol=0.05)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from patchproof.optimizer import loop, run
+from patchproof.optimizer.promise import PER_SESSION
 from patchproof.sessions import spread_of
 from patchproof.study.study import Cell, Result, run_study
 from patchproof.validation import promises
@@ -60,7 +61,7 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     finished = run_study("promises", tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
     (one,) = finished.results
-    assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == 6
+    assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == PER_SESSION
     judged = [judged for _, judged in one.answers["sessions"]]
     assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])
     assert (tmp_path / "out" / "promises_calibration.png").is_file()

@@ -63,7 +63,9 @@ def reprint(
             take = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
         each, done = -(-n // sessions), 0
         conditions = sheet.scene.draw("reprint", n, seed, per_session=each)
-        conditions = replace(conditions, print=conditions.print[[0] * n])  # one print, wherever it is photographed
+        scale = conditions.pose.printed_scale[[0] * n]  # one print, wherever it is photographed
+        pose = replace(conditions.pose, printed_scale=scale)
+        conditions = replace(conditions, print=conditions.print[[0] * n], pose=pose)
         views = [conditions[i : i + 1] for i in range(n)]
         names = [f"photo_{i + 1:04d}.jpg" for i in range(n)]
         if sessions > 1:
