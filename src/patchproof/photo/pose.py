@@ -25,9 +25,9 @@ from patchproof.photo.shapes import Project, Shape
 
 _PRINT_STRETCH = 0.015  # of |r1| = |r2|: what printers do to proportions
 _PAPER = 0.003  # of both, of angles in radians and of lengths: paper that is not quite flat or round, lenses
-_TOO_FAR = 13.8  # χ² of two degrees of freedom, 99.9 %
-_TOO_FAR_SIGMAS = 3.3
-_WEAK = 0.15  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
+_TOO_FAR = 9.2  # χ² of two degrees of freedom, 99 %
+_TOO_FAR_SIGMAS = 2.6
+_WEAK = 0.1  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
 
 
 @dataclass(frozen=True)
