@@ -133,7 +133,9 @@ def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> bool
     off = both(0.0)
     if off @ np.linalg.solve(own + focal_spread**2 * np.outer(by_focal, by_focal), off) > _TOO_FAR:
         return False
-    return True if by_focal @ np.linalg.solve(own, by_focal) > 1 / _WEAK**2 else None
+    # a principal point aside turns r1 and r2, too, and by chance back: what confirms must outweigh more than paper
+    firm = own + _PRINT_STRETCH**2 * np.eye(2)
+    return True if by_focal @ np.linalg.solve(firm, by_focal) > 1 / _WEAK**2 else None
 
 
 def _tilt_deg(stretch: np.ndarray) -> np.ndarray:
