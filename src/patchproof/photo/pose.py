@@ -25,9 +25,9 @@ from patchproof.photo.shapes import Project, Shape
 
 _PRINT_STRETCH = 0.015  # of |r1| = |r2|: what printers do to proportions
 _PAPER = 0.003  # of both, of angles in radians and of lengths: paper that is not quite flat or round, lenses
-_TOO_FAR = 13.8  # χ² of two degrees of freedom, 99.9 %
-_TOO_FAR_SIGMAS = 3.3
-_WEAK = 0.15  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
+_TOO_FAR = 9.2  # χ² of two degrees of freedom, 99 %
+_TOO_FAR_SIGMAS = 2.6
+_WEAK = 0.1  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,9 @@ def _agreement(fit: PageFit, matrix_px: np.ndarray, focal_spread: float) -> bool
     off = both(0.0)
     if off @ np.linalg.solve(own + focal_spread**2 * np.outer(by_focal, by_focal), off) > _TOO_FAR:
         return False
-    return True if by_focal @ np.linalg.solve(own, by_focal) > 1 / _WEAK**2 else None
+    # a principal point aside turns r1 and r2, too, and by chance back: what confirms must outweigh more than paper
+    firm = own + _PRINT_STRETCH**2 * np.eye(2)
+    return True if by_focal @ np.linalg.solve(firm, by_focal) > 1 / _WEAK**2 else None
 
 
 def _tilt_deg(stretch: np.ndarray) -> np.ndarray:
