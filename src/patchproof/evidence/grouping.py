@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from patchproof.photo.read import SUFFIXES, pictures_in, readable_formats
-from patchproof.strict import Refused
+from patchproof.photo.read import list_photos, pictures_in, readable_formats
 
 PAUSE_MINUTES = 30.0
 _EXIF_IFD, _TAKEN, _MODEL = 0x8769, 0x9003, 0x0110
@@ -42,20 +41,14 @@ def group(folder: str | Path, without: Path | None = None) -> Grouping:
     """The photographs in a folder (or the one at a path) by session; refused where there are none. The folder `without`
     is left out: it has those of controls.
     """
-    folder = Path(folder)
-    if folder.is_file():
-        return Grouping((folder,), (0,), ("",), GUESS)
-    if not folder.is_dir():
-        raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
-    left_out = None if without is None else without.resolve()
-    inside = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    parts = {"": pictures_in(folder)} | {p.name: pictures_in(p) for p in inside if p.resolve() != left_out}
-    parts = {name: paths for name, paths in parts.items() if paths}
+    folder, left_out = Path(folder), None if without is None else without.resolve()
+    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    inside = [p for p in inside if p.is_dir() and not p.name.startswith(".") and p.resolve() != left_out]
+    parts = {p.name: paths for p in inside if (paths := pictures_in(p))}
     if not parts:
-        expected = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}"
-        raise Refused(expected, "none", "copy the photographs there")
-    if set(parts) == {""}:
-        return _by_time(parts[""])
+        return _by_time(list_photos(folder))
+    if loose := pictures_in(folder):
+        parts = {"": loose} | parts
     pairs = [(path, number) for number, paths in enumerate(parts.values()) for path in paths]
     return Grouping(tuple(p for p, _ in pairs), tuple(n for _, n in pairs), tuple(parts), FOLDERS)
 
