@@ -84,6 +84,53 @@ def test_design_corners_are_where_the_truth_says(journey, report):
     assert np.median(errors) < 0.5 and max(errors) < 1.5
 
 
+@pytest.fixture(scope="module")
+def again(journey, tmp_path_factory):
+    """The report of the same photographs with the run at hand, beside a gray control's under the same conditions."""
+    folder = tmp_path_factory.mktemp("again")
+    pdf, run, sheet = journey / "sheet.pdf", journey / "run", journey / "sheet.json"
+    gray = folder / "gray"
+    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--control", "gray", "--out", gray) == 0
+    with_run = ("--run", run, "--controls", gray, "--out", folder / "report")
+    assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
+    return json.loads((folder / "report" / "report.json").read_text())
+
+
+def test_forecasts_at_measured_views_are_what_photographs_show(report, again):
+    chances = np.array([photo["forecast"] for photo in again["photos"]])
+    seen = np.array([photo["predictions"]["builtin"]["recognized"] for photo in again["photos"]])
+    assert ((chances > 0) & (chances < 1)).all() and (np.abs(chances - seen) > 0.5).sum() <= 1
+    summary = again["summary"]["forecast"]
+    assert summary["photos"] == PHOTOS and summary["recognized"] == seen.sum()
+    assert summary["interval"][0] <= summary["recognized"] <= summary["interval"][1]
+    assert summary["brier"] == pytest.approx(np.mean((chances - seen) ** 2))
+    assert all(photo["forecast"] is None for photo in report["photos"]) and report["summary"]["forecast"] is None
+
+
+def test_an_effect_estimated_from_photographs_is_that_of_the_photographed_control(report, again):
+    """One photograph of the control at most is judged otherwise than its estimate."""
+    (photographed,) = again["controls"]
+    estimated = {control["name"]: control for control in again["summary"]["estimated"]["controls"]}
+    assert set(estimated) == {"mean", "gray", "noise"} and again["summary"]["estimated"]["agree"] >= 0.8
+    gray = estimated["gray"]
+    assert abs(gray["rate"] - photographed["recognized"] / photographed["n"]) <= 1 / PHOTOS
+    assert gray["difference_interval"][0] <= photographed["difference"] <= gray["difference_interval"][1]
+    assert report["summary"]["estimated"] == again["summary"]["estimated"]
+
+
+def test_another_runs_forecasts_are_refused(journey, tmp_path, capsys):
+    scene = (journey / "scene.toml").read_text().replace("width_mm = 90", "width_mm = 91")
+    (tmp_path / "scene.toml").write_text(scene.replace("steps = 10", "steps = 1"), encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_module, "PROMISE_VIEWS", 8)
+        assert command("optimize", tmp_path / "scene.toml", "--out", tmp_path / "run") == 0
+    capsys.readouterr()
+    sheet, run = journey / "sheet.json", tmp_path / "run"
+    assert command("verify", journey / "photos", "--sheet", sheet, "--run", run, "--out", tmp_path / "report") == 1
+    said = capsys.readouterr().err
+    assert "Expected the run of sheet" in said and not (tmp_path / "report").exists()
+
+
 def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
     """The conditions of these very photographs, rendered as for a promise: at most one in eight is judged otherwise."""
     from patchproof.optimizer.problem import set_problem

@@ -230,7 +230,12 @@ def verify(
     ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
     require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
-    ledger: Annotated[int, typer.Option(min=0, help="Photographs in the gap ledger at most; 0 for none.")] = 24,
+    ledger: Annotated[
+        int, typer.Option(min=0, help="Photographs in gap ledger and estimated effect at most; 0 for none.")
+    ] = 24,
+    run: Annotated[
+        Path | None, typer.Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
+    ] = None,
     jobs: Jobs = 1,
     cluster: Cluster = None,
     resume: Resume = False,
@@ -253,6 +258,7 @@ def verify(
             ruler_mm=None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm"),
             ledger_photos=ledger,
             camera=camera,
+            run=run,
             jobs=jobs,
             cluster=cluster,
             resume=resume,

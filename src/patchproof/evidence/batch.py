@@ -147,9 +147,9 @@ def _rejected(item: Item, remark: Remark) -> MeasuredPhoto:
 
 
 def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Shot | None:
-    """What the ledger needs of a photograph, which is read again for it: only few are, and none then waits.
+    """What it takes to put other pieces into a photograph, which is read again for it: only few are, and none waits.
 
-    None where the ledger cannot work with it: it does not count, or its sheet is not flat or not to be believed.
+    None where that cannot be done: it does not count, or its sheet is not flat or not to be believed.
     """
     path, measured = item
     entry, geometry, light = measured.entry, measured.entry.geometry, measured.light
@@ -157,8 +157,8 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     try:
-        srgb = view_of(read_photo(path), task.camera).srgb
-        px_from_mm = np.array(geometry.homography_px_from_mm)
-        return shot_of(entry.file, srgb, px_from_mm, geometry.blur_px, light, task.surface, size_px)
+        view = view_of(read_photo(path), task.camera)
+        px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px
+        return shot_of(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
     except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
         return None  # read before, so this is a file that went away: the ledger does without

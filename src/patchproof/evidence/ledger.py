@@ -31,8 +31,7 @@ import numpy as np
 from patchproof.claims import LEAST_CLUSTERS, resampled_means
 from patchproof.color import linear_from_srgb
 from patchproof.evidence.classify import Judges
-from patchproof.evidence.print_fit import fit_print
-from patchproof.evidence.reproject import Reference, Shot, Switches, design_fit, light_fit, squares_with
+from patchproof.evidence.reproject import Reference, Shot, Switches, print_and_lights, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture, with_markers
 from patchproof.photo.rectify import reduced
@@ -68,15 +67,12 @@ def ledger_of(
     claims = [(c.contrast, c.blur_px) for c in conditions if c.contrast is not None and c.blur_px is not None]
     if not claims:
         return None
-    undo = [light_fit(shot, promised) for shot in shots]
-    relative = [fit.apply(shot.cells) for fit, shot in zip(undo, shots, strict=True)]
-    inks = [fit.apply(shot.light.ink) for fit, shot in zip(undo, shots, strict=True)]
-    printed = fit_print(relative, promised.design, np.median(inks, axis=0), promised.ink)
+    printed, undo, print_lights = print_and_lights(shots, promised)
     looks = _looks(manifest.design.pixels(), surface, promised, printed)
     camera = manifest.settings.get("camera", {})
     values = []
-    for shot, fit, reference in zip(shots, undo, _references(claims, shots, camera, promised), strict=True):
-        print_light = fit if printed is not None else design_fit(shot, promised)
+    references = _references(claims, shots, camera, promised)
+    for shot, fit, print_light, reference in zip(shots, undo, print_lights, references, strict=True):
         squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
         values.append(_confidences(squares, judges))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)

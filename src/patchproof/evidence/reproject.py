@@ -12,7 +12,7 @@ and uneven light, which the ledger counts as not explained.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -21,6 +21,7 @@ import numpy as np
 from patchproof.color import LUMINANCE, srgb_from_linear
 from patchproof.evidence.appearance import cells_fit
 from patchproof.evidence.classify import square_of
+from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.colorfit import ColorFit, inverse, white_black
@@ -28,6 +29,7 @@ from patchproof.photo.detect import LIGHT
 from patchproof.photo.pattern_light import pattern_light
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
 from patchproof.photo.rectify import part_around, rectify
+from patchproof.sheets.manifest import Rect
 
 Switches = tuple[bool, ...]  # which effects are on
 FINER = 3  # times the network's input size
@@ -45,7 +47,7 @@ class Shot:
     """One photograph: `square` uint8 W×W×3, millimeters to its pixels, blur in its pixels, noise in linear light.
 
     `cells` h×w×3 are the design's linear light as photographed, NaN where clipped; `scale` is W over the photograph's
-    shorter side.
+    shorter side; `matrix_px` is the camera's for the square, None where its focal length is not known.
     """
 
     file: str
@@ -56,6 +58,7 @@ class Shot:
     noise: float
     cells: np.ndarray
     scale: float
+    matrix_px: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -75,8 +78,9 @@ def shot_of(
     light: FrameLight,
     surface: Surface,
     size_px: int,
+    matrix_px: np.ndarray | None = None,
 ) -> Shot | None:
-    """What the ledger keeps of an uint8 photograph for a network of that input size.
+    """What is kept of an uint8 photograph to put other pieces into it, for a network of that input size.
 
     None where the markers do not lie where the homography says: few blurred corners can turn it far away.
     """
@@ -92,9 +96,9 @@ def shot_of(
         if unmixed.agreement < _LEAST_AGREEMENT:
             return None
         light, blur_px = replace(light, paper=unmixed.paper, ink=unmixed.ink), unmixed.blur_px
-    square, to_square = np.ascontiguousarray(square), to_square @ px_from_mm
-    cells = _cells(square, to_square, surface)
-    return Shot(file, square, to_square, light, blur_px * scale, noise_of(square), cells, scale)
+    square, matrix = np.ascontiguousarray(square), None if matrix_px is None else to_square @ matrix_px
+    cells = _cells(square, to_square @ px_from_mm, surface)
+    return Shot(file, square, to_square @ px_from_mm, light, blur_px * scale, noise_of(square), cells, scale, matrix)
 
 
 def _cells(square: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> np.ndarray:
@@ -131,6 +135,19 @@ def light_fit(shot: Shot, promised: Promised) -> ColorFit:
     return white_black(paper, veil + (paper - veil) * promised.ink, promised.ink)
 
 
+def print_and_lights(
+    shots: Sequence[Shot], promised: Promised
+) -> tuple[Callable[[np.ndarray], np.ndarray] | None, list[ColorFit], list[ColorFit]]:
+    """What one print in several photographs makes of promised light, the light alone of each, and its print and light:
+    together where the design's colors are too few or too alike to tell the print (None).
+    """
+    lights = [light_fit(shot, promised) for shot in shots]
+    relative = [fit.apply(shot.cells) for fit, shot in zip(lights, shots, strict=True)]
+    inks = [fit.apply(shot.light.ink) for fit, shot in zip(lights, shots, strict=True)]
+    printed = fit_print(relative, promised.design, np.median(inks, axis=0), promised.ink)
+    return printed, lights, lights if printed is not None else [design_fit(shot, promised) for shot in shots]
+
+
 def design_fit(shot: Shot, promised: Promised) -> ColorFit:
     """Print, light and camera together, from the design's own coarse colors; paper and ink where these do not do."""
     height, width = shot.cells.shape[:2]
@@ -144,7 +161,7 @@ def design_fit(shot: Shot, promised: Promised) -> ColorFit:
 def squares_with(
     shot: Shot,
     looks: Mapping[Switches, np.ndarray],
-    rect_mm: tuple[float, float, float, float],
+    rect_mm: Rect,
     undo: ColorFit,
     print_light: ColorFit,
     reference: Reference,
@@ -154,33 +171,59 @@ def squares_with(
     `looks` are the media-relative linear light of the piece at `rect_mm` by switches of their own. `undo` takes
     photographed light to media-relative; the inverse of `print_light` is what the photograph's light makes of a look.
     """
-    corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
-    box = part_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)  # and what blur carries over
+    box = _box(shot, rect_mm)
     photo = LIGHT[shot.square]
     around = {}
     for blur, picture in ((True, photo), (False, deblurred(photo, shot.blur_px, reference.blur_px, shot.noise))):
         around[True, blur] = picture
         around[False, blur] = np.clip(reference.white * undo.apply(picture), 0, 1).astype(np.float32)
     coded = {key: srgb_from_linear(picture) for key, picture in around.items()}
-    grain = np.random.default_rng(0).standard_normal(photo[box].shape, np.float32)
     lit = {True: inverse(print_light.matrix), False: np.column_stack([np.eye(3) * reference.white, np.zeros(3)])}
     out = {}
     for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
         for blur, sigma in ((True, shot.blur_px), (False, reference.blur_px)):
             layer = _blurred(sharp, sigma)
-            share = layer[..., 3:]
             for light, matrix in lit.items():
-                color = layer[..., :3] @ matrix[:, :3].T + share * matrix[:, 3]
-                mixed = color + (1 - share) * around[light, blur][box]
-                # what the photograph's noise is at the reference's light, and the other way round
-                level = float(np.clip(np.mean(mixed), 0, 1))
-                noise = shot.noise if blur else reference.noise * np.sqrt(level + _READ_SHARE_SQUARE)
-                mixed = mixed + share * noise * grain
+                behind = around[light, blur][box]
+                noise = None if blur else reference.noise
                 picture = coded[light, blur].copy()
-                picture[box] = srgb_from_linear(np.clip(mixed, 0, 1))
+                picture[box] = srgb_from_linear(_covered(layer, matrix, behind, shot.noise, noise))
                 out[(*switches, light, blur)] = picture
     return out
+
+
+def square_with(
+    shot: Shot, look: np.ndarray, rect_mm: tuple[float, float, float, float], light: ColorFit
+) -> np.ndarray:
+    """The float32 sRGB square W×W×3 with a piece of this look (as in `squares_with`) under the photograph's own light
+    and blur, which the inverse of `light` and `shot` know.
+    """
+    box, photo = _box(shot, rect_mm), LIGHT[shot.square]
+    layer = _blurred(_layer(look, shot.px_from_mm, rect_mm, box), shot.blur_px)
+    picture = srgb_from_linear(photo)
+    picture[box] = srgb_from_linear(_covered(layer, inverse(light.matrix), photo[box], shot.noise))
+    return picture
+
+
+def _box(shot: Shot, rect_mm: Rect) -> tuple[slice, slice]:
+    """The part of the square that a piece there reaches, with what blur carries over."""
+    corners_px = apply_homography(shot.px_from_mm, rect_corners(rect_mm))
+    return part_around(corners_px, 3 + int(4 * max(shot.blur_px, 2.0)), shot.square.shape)
+
+
+def _covered(
+    layer: np.ndarray, matrix: np.ndarray, behind: np.ndarray, noise: float, at_white: float | None = None
+) -> np.ndarray:
+    """Light of `behind` covered by a layer in light that `matrix` 3×4 makes of its own; noise is the photograph's, or
+    a camera's whose noise at white is `at_white`.
+    """
+    share = layer[..., 3:]
+    mixed = layer[..., :3] @ matrix[:, :3].T + share * matrix[:, 3] + (1 - share) * behind
+    if at_white is not None:  # what it is at this light
+        noise = at_white * np.sqrt(float(np.clip(np.mean(mixed), 0, 1)) + _READ_SHARE_SQUARE)
+    grain = np.random.default_rng(0).standard_normal(behind.shape, np.float32)
+    return np.clip(mixed + share * noise * grain, 0, 1)
 
 
 def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) -> np.ndarray:

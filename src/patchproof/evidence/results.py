@@ -96,7 +96,7 @@ KEYS = """
     file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
     scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
     distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
-    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm
+    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm forecast
     predictions""".split()
 
 
@@ -116,6 +116,7 @@ class PhotoEntry(Strict):
     scale: Scale | None = None
     color: Color | None = None
     remark: Remark | None = None
+    forecast: Finite | None = None  # the chance of being recognized, by rendering the run's scene at its measured view
     predictions: dict[str, Prediction] = Field(default_factory=dict)
 
     @property
@@ -170,6 +171,38 @@ class Ledger(Strict):
     photos: int
 
 
+class EstimatedControl(Strict):
+    """A control put into photographs of the patch: its rate there, and the patch's own minus that, with 95 %."""
+
+    name: str
+    rate: Finite
+    difference: Finite
+    difference_interval: tuple[Finite, Finite]
+
+
+class Estimated(Strict):
+    """The effect as estimated from so many photographs. Where the design itself was put back, a share `agree` of them
+    kept its answer; too few of them leave no controls.
+    """
+
+    photos: int
+    agree: Finite
+    controls: tuple[EstimatedControl, ...] = ()
+
+
+class Forecast(Strict):
+    """What was to be expected of so many photographs at their own measured views, and what they showed: counts, and
+    Brier scores of the chances and of the promised rate in their place.
+    """
+
+    photos: int
+    expected: Finite
+    interval: tuple[int, int]
+    recognized: int
+    brier: Finite
+    brier_promise: Finite
+
+
 class SessionCount(Strict):
     """One session's judged photographs, and how many of them were recognized."""
 
@@ -198,6 +231,8 @@ class Summary(Strict):
     models: dict[str, ModelRate] = Field(default_factory=dict)
     sessions: tuple[SessionCount, ...] = ()
     sessions_known_from: str = ""
+    estimated: Estimated | None = None
+    forecast: Forecast | None = None
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,11 +19,14 @@ import numpy as np
 from patchproof.claims import wilson
 from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
 from patchproof.evidence.classify import Judges, judges_of
+from patchproof.evidence.estimated import estimate_effect
+from patchproof.evidence.forecast import forecast_of
 from patchproof.evidence.grouping import Grouping, group
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.ranges import matched_rate
+from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
@@ -42,6 +46,7 @@ def gather_evidence(
     cluster: str | None = None,
     journal: Path | None = None,
     resume: bool = False,
+    forecast: Callable[[Shot], float | None] | None = None,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
@@ -49,7 +54,8 @@ def gather_evidence(
     sessions (see `grouping`).
 
     Photographs are measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is
-    finished; with `resume`, what it has of an earlier run is not done again. `on_pictures` gets the pictures of each
+    finished; with `resume`, what it has of an earlier run is not done again. `forecast` gives a photograph's chance of
+    being recognized without looking at its piece. `on_pictures` gets the pictures of each
     photograph that is (of the first `batch.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where
     it was measured); `progress` is called with (done, all).
     """
@@ -62,21 +68,38 @@ def gather_evidence(
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with kept as open_journal, open_workers(jobs, cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
-        own, ledger = results[: len(paths)], None
+        own, ledger, estimated = results[: len(paths)], None, None
         if judges and task.promised:
             most, name = min(len(paths), options.ledger_photos), judges.primary.name
             chosen = [number * len(paths) // most for number in range(most)]  # evenly spread
             again = partial(shot_again, task, judges.primary.input_px)
             shots = workers.map(again, [(paths[number], results[number]) for number in chosen])
             shots = [shot for shot in shots if shot is not None]
-            judged = (photo.entry for photo in own if photo.entry.predictions)
-            confidence = {entry.file: entry.predictions[name].target_confidence for entry in judged}
+            judged = {photo.entry.file: photo.entry.predictions[name] for photo in own if photo.entry.predictions}
+            confidence = {file: prediction.target_confidence for file, prediction in judged.items()}
             ledger = ledger_of(shots, manifest, task.surface, task.promised, judges, confidence)
+            recognized = {file: prediction.recognized for file, prediction in judged.items()}
+            estimated = estimate_effect(shots, manifest, task.surface, options.printer, judges, recognized)
+            if forecast is not None:
+                own = [_forecast(again, forecast, path, photo) for path, photo in zip(paths, own, strict=True)]
     controls: dict[str, list[PhotoEntry]] = {}
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
             controls.setdefault(item.control, []).append(result.entry)
-    return _report(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
+    report = _report(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
+    return report.changed(summary=report.summary.changed(estimated=estimated))
+
+
+def _forecast(
+    again: Callable[[tuple[Path, MeasuredPhoto]], Shot | None],
+    forecast: Callable[[Shot], float | None],
+    path: Path,
+    photo: MeasuredPhoto,
+) -> MeasuredPhoto:
+    """The photograph with its forecast, where it can have one."""
+    shot = again((path, photo)) if photo.entry.predictions else None
+    chance = None if shot is None else forecast(shot)
+    return replace(photo, entry=photo.entry.changed(forecast=chance))
 
 
 def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
@@ -108,7 +131,7 @@ def _report(
     """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
-    compared, rates, rate, interval, sessions = [], {}, _rate({}), None, ()
+    compared, rates, rate, interval, sessions, forecast = [], {}, _rate({}), None, (), None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
@@ -123,6 +146,10 @@ def _report(
             interval = spread.least_rate(*counts, TAIL), spread.most_rate(*counts, TAIL)
         measured = (entry for entry in counted if entry.status == "measured")
         matched = matched_rate(measured, promise.conditions, side_px)
+        expected = [entry for entry in counted if entry.forecast is not None and entry.file in recognized]
+        if expected:
+            chances = [entry.forecast for entry in expected if entry.forecast is not None]
+            forecast = forecast_of(chances, [recognized[entry.file] for entry in expected], promise.rate)
         compared = [compare(recognized, name, _recognized(shown, primary), goal) for name, shown in controls.items()]
     summary = Summary(
         photos=len(entries),
@@ -140,6 +167,7 @@ def _report(
         culprit=ledger and ledger.culprit,
         reason=verdict.reason,
         models=rates,
+        forecast=forecast,
     )
     if ruler_mm is not None:
         x, y = (measured / nominal for measured, nominal in zip(ruler_mm, manifest.ruler_mm, strict=True))

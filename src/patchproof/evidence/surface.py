@@ -109,6 +109,11 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
 
 def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:
     """How design and ink should look; None on pages without a design."""
+    return None if manifest.design is None else look_of(manifest.design.pixels(), surface, printer)
+
+
+def look_of(pixels: np.ndarray, surface: Surface, printer: Printer) -> Promised:
+    """How a design of uint8 pixels H×W×3 in this one's place should look, and its ink."""
     import torch
 
     def printed(srgb: np.ndarray) -> np.ndarray:
@@ -116,9 +121,7 @@ def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promi
         with torch.inference_mode():
             return linear_from_srgb(printer.apply(tensor)[0].numpy().transpose(1, 2, 0).astype(float))
 
-    if manifest.design is None:
-        return None
-    design, ink = printed(manifest.design.pixels() / 255.0).astype(np.float32), printed(np.zeros((1, 1, 3)))[0, 0]
+    design, ink = printed(pixels / 255.0).astype(np.float32), printed(np.zeros((1, 1, 3)))[0, 0]
     return Promised(reduced(with_markers(design, surface, ink), DESIGN_PX), ink)
 
 

@@ -20,10 +20,12 @@ from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
+from patchproof.optimizer.run import Run, load_run
 from patchproof.output import check_folder
 from patchproof.report.images import save_pictures, stem_of
 from patchproof.report.results import versions_of
 from patchproof.report.write import write_report
+from patchproof.reprints.retake import retaker
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.strict import Refused
 
@@ -43,6 +45,7 @@ def verify_photos(
     ruler_mm: tuple[float, float] | None = None,
     ledger_photos: int = LEDGER_PHOTOS,
     camera: str | None = None,
+    run: str | Path | Run | None = None,
     jobs: int = 1,
     cluster: str | None = None,
     resume: bool = False,
@@ -52,12 +55,14 @@ def verify_photos(
     """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
 
     `models` are names, or classifiers in memory; `camera` is a camera file's name or path. Model and printer names are
-    looked up from the manifest's folder, then as the scene's were. `resume` goes on from what an earlier run finished,
+    looked up from the manifest's folder, then as the scene's were. With the `run` that the sheet was made from, each
+    photograph gets a forecast of its own. `resume` goes on from what an earlier run finished,
     whole or killed: only photographs that are new, or differ, are measured.
     """
     out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
     _check_out(out, resume, overwrite)
     networks = [load_classifier(network, base) for network in _networks(manifest, models)]
+    forecast = None if run is None else retaker(run if isinstance(run, Run) else load_run(run), manifest)
     options = Options(
         models=networks,
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
@@ -75,6 +80,7 @@ def verify_photos(
         cluster=cluster,
         journal=out / _JOURNAL,
         resume=resume,
+        forecast=forecast,
         on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
         progress=on_photo,
     )

@@ -50,11 +50,31 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.prediction_interval is not None:
         k_low, k_high = summary.prediction_interval
         lines.append(f"promised: {k_low} to {k_high} of {summary.judged}")
+    if summary.forecast is not None:
+        forecast = summary.forecast
+        low, high = forecast.interval
+        lines.append(
+            f"expected at the measured views: {forecast.expected:.1f} of {forecast.photos} [{low}, {high}], "
+            f"recognized {forecast.recognized}"
+        )
+    if summary.estimated is not None:
+        lines += estimated_lines(summary.estimated)
     if summary.culprit is not None:
         share = summary.ledger[summary.culprit].share
         lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
     codes = Counter(photo.code for photo in report.photos if photo.code)
     return lines + [f"  {code}: {count}" for code, count in sorted(codes.items())]
+
+
+def estimated_lines(estimated: Any) -> list[str]:
+    """The effect as estimated from the photographs themselves, by control."""
+    if not estimated.controls:
+        return [
+            f"effect not estimated: {estimated.agree:.0%} of {estimated.photos} photographs say of the design put "
+            "back into them what they say themselves"
+        ]
+    head = f"estimated by putting controls into {estimated.photos} photographs ({estimated.agree:.0%} agree):"
+    return [head, *_control_lines({control.name: control.model_dump() for control in estimated.controls})]
 
 
 def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:

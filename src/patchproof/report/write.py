@@ -29,6 +29,7 @@ _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
     "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
     "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
+    "estimated": "There were no control photographs. What they would have shown was estimated from these.",
 }
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
@@ -75,7 +76,7 @@ def render(
         primary=primary,
         headline=headline,
         plain=plain.format("more recognition" if deceived else "less"),
-        effect=_EFFECTS[summary["effect"]],
+        effect=_EFFECTS["estimated" if _is_estimated(summary) else summary["effect"]],
         bars=_bars(summary, promise, report["controls"]),
         controls=report["controls"],
         ledger=ledger,
@@ -94,6 +95,11 @@ def render(
     )
 
 
+def _is_estimated(summary: Mapping) -> bool:
+    estimated = summary["estimated"]
+    return summary["effect"] == "not_tested" and estimated is not None and bool(estimated["controls"])
+
+
 def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]) -> list[dict]:
     """Rows of the chart of rates: name, rate, interval, and which side of the evidence they belong to."""
     rows, judged = [], summary["judged"]
@@ -106,6 +112,11 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
     if summary["prediction_interval"] and judged:
         allowed = [count / judged for count in summary["prediction_interval"]]
         rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))
+    if summary["forecast"]:
+        forecast = summary["forecast"]
+        n = forecast["photos"]
+        allowed = [count / n for count in forecast["interval"]]
+        rows.append((f"Expected of {n} at their views", forecast["expected"] / n, allowed, "promised"))
     for c in controls:
         if c["n"]:
             rows.append((f"Control: {c['name']}", c["recognized"] / c["n"], c["interval"], "control"))

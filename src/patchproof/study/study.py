@@ -36,6 +36,7 @@ STUDIES: dict[str, str] = {
     "deceive": "patchproof.experiments.deceive",
     "detection": "patchproof.validation.detection",
     "envelope": "patchproof.validation.envelope.sweeps",
+    "forecasts": "patchproof.validation.forecasts",
     "harden": "patchproof.harden.folder",
     "layouts": "patchproof.validation.layouts",
     "ledger": "patchproof.validation.ledger_trials",

@@ -44,6 +44,8 @@ from patchproof.study.study import Cell, Result, Study
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from patchproof.optimizer.run import Run
+
 
 _LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
 
@@ -75,22 +77,11 @@ def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise and count of one combination."""
     from patchproof.journey.verify import verify_photos
-    from patchproof.optimizer.run import optimize_scene
-    from patchproof.printing.sheet import sheet_of
-    from patchproof.reprints.hung_sheet import Hanging
-    from patchproof.reprints.reprint import reprint
 
-    scene = scene_of(base, cell.values)
-    scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        # one control is enough for a page, and all of them would take most of a promise's time
-        made = optimize_scene(scene, folder / "run", controls=("bare",))
-        sheet_of(made, folder / "sheet.pdf")
-        pdf, photos = folder / "sheet.pdf", folder / "photos"
-        n, how = settings.sessions * settings.photos, Hanging(path_traced=settings.path_traced)
-        # cells that shared a seed's draws would be one case
-        reprint(pdf, made, n, photos, how, sessions=settings.sessions, seed=zlib.crc32(cell.name.encode()))
+        made = printed_run(base, cell, folder)
+        photos = take_photos(settings, cell, made, folder)
         report = verify_photos(photos, folder / "sheet.json", folder / "report")
     promise, summary = made.promise, report.summary
     return {
@@ -99,6 +90,34 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
         "sessions": [(session.recognized, session.judged) for session in summary.sessions],
         "verdict": summary.verdict,
     }
+
+
+def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
+    """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
+    from patchproof.optimizer.run import optimize_scene
+    from patchproof.printing.sheet import sheet_of
+
+    scene = scene_of(base, cell.values)
+    scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
+    # one control is enough for a page, and all of them would take most of a promise's time
+    made = optimize_scene(scene, folder / "run", controls=("bare",))
+    sheet_of(made, folder / "sheet.pdf")
+    return made
+
+
+def take_photos(settings: PromisesSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
+    """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
+    conditions.
+    """
+    from patchproof.reprints.hung_sheet import Hanging
+    from patchproof.reprints.reprint import reprint
+
+    out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
+    how = Hanging(path_traced=settings.path_traced, control=control)
+    # cells that shared a seed's draws would be one case
+    seed = zlib.crc32(cell.name.encode())
+    reprint(folder / "sheet.pdf", made, n, out, how, sessions=settings.sessions, seed=seed)
+    return out
 
 
 def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
