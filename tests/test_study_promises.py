@@ -45,7 +45,8 @@ def test_shares_and_biases_by_hand():
     assert many.rows[0][3] == pytest.approx(19 / 40, abs=0.01)
 
 
-def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
+def small_study(study, tmp_path, monkeypatch):
+    """A finished study of that name: one cell, two sessions of five photographs by our own renderer."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
     data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [480, 360]}}
@@ -58,8 +59,13 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
     names = 'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\n'
     (tmp_path / "study.toml").write_text(names + "sessions = 2\nphotos = 5\npath_traced = false\n")
-    finished = run_study("promises", tmp_path / "study.toml", tmp_path / "out")
+    finished = run_study(study, tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
+    return finished
+
+
+def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
+    finished = small_study("promises", tmp_path, monkeypatch)
     (one,) = finished.results
     assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == PER_SESSION
     judged = [judged for _, judged in one.answers["sessions"]]

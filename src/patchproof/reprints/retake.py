@@ -14,6 +14,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -97,10 +98,12 @@ def retake(problem: Problem, scene: PatchScene, shown: Shown, shot: Shot, manife
     tint = paper / paper[1]
     light = linear_from_srgb(shot.square / 255.0) / tint  # as it is before the white balance, which tints all again
     behind = Surroundings(pictures=(), srgb=photo_codes_of(srgb_from_linear(light.clip(0, 1))))
-    own = {field.name: getattr(scene, field.name) for field in fields(scene)} | {"backgrounds": behind}
+    own: dict[str, Any] = {field.name: getattr(scene, field.name) for field in fields(scene)}
+    own["backgrounds"] = behind
     retaken = Retaken(**own, pose=pose, unit_matrix=np.diag([1 / side, 1 / side, 1.0]) @ shot.matrix_px)
     conditions = _conditions(scene, shot, float(paper[1]), tint)
-    views = see(replace(problem.stage, scene=retaken), shown, conditions, (problem.figure_px,) * 2)
+    size_px = problem.figure_px, problem.figure_px
+    views = see(replace(problem.stage, scene=retaken), shown, conditions, size_px)
     with torch.no_grad():
         return expose(views, shown)
 

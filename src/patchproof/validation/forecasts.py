@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from patchproof.claims import mean, rate
+from patchproof.claims import mean, rate, wilson
 from patchproof.evidence.forecast import forecast_of
 from patchproof.report.tables import Drawing, Table
 from patchproof.sessions import in_sessions, spread_of
@@ -171,9 +171,10 @@ def figures(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Dra
         number = np.clip(np.digitize(chances, edges) - 1, 0, len(edges) - 2)
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
         for i in sorted(set(number.tolist())):
-            own = rate([bool(hit) for hit in hits[number == i]])
-            span = [[own.value - own.low], [own.high - own.value]]
-            axes.errorbar([chances[number == i].mean()], [own.value], span, fmt="o", color="tab:blue")
+            own = hits[number == i]
+            low, high = wilson(int(own.sum()), len(own))
+            span = [[own.mean() - low], [high - own.mean()]]
+            axes.errorbar([chances[number == i].mean()], [own.mean()], span, fmt="o", color="tab:blue")
         axes.set(xlabel="chance of the forecast", ylabel="share recognized", xlim=(0, 1), ylim=(0, 1))
 
     about = f"{len(pairs)} photographs in five groups; bars: 95 %, as if all were independent"
