@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import test_photo_synthetic
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
@@ -25,6 +26,7 @@ from test_photo_synthetic import (
     photograph,
     view,
 )
+from test_verify_run import measured
 
 SIZE = (1200, 900)
 MATRIX = intrinsics(40.0, SIZE)
@@ -143,3 +145,16 @@ def test_the_designs_own_pixels_say_where_it_lies():
     shown = np.isfinite(register(photo, true, DESIGN_MM, design, 2.5, 0.7).shift_mm[:, 0])
     left = register(photo, true, DESIGN_MM, design, 2.5, 0.7).middle_mm[:, 0] < CENTER[0] - 15
     assert not shown[left].any() and shown[~left].sum() > 8
+
+
+@pytest.mark.parametrize("radius_mm", [1e5, 400, 200])
+def test_an_uncut_page_is_not_counted_however_it_curls(radius_mm, monkeypatch):
+    """Of flat paper its markers fit the piece's plane, of rolled paper they only lie near where it has them."""
+    manifest = make_manifest()
+    whole = page_raster(manifest, only_piece=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(test_photo_synthetic, "CUT_MM", (0.0, 0.0, *test_photo_synthetic.PAGE_MM))
+        photo = curled_photograph(whole, pose(), MATRIX, 1 / radius_mm)
+    assert not measured(photo).counted
+    piece = curled_photograph(page_raster(manifest, only_piece=True), pose(), MATRIX, 1 / radius_mm)
+    assert measured(piece).counted

@@ -16,7 +16,7 @@ import numpy as np
 
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import View
-from patchproof.evidence.placed import MOST_SHIFT, geometry_of, place, pose_of
+from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, place, pose_of
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
 from patchproof.evidence.surface import Promised, Surface
@@ -38,6 +38,7 @@ MOST_RESIDUAL = 0.01  # of the design's shorter side: flat sheets stay below 0.3
 # lens has no business to leave any: of folds by 10° that a cylinder explains best, it is 0.0008.
 MOST_BEND, MOST_BEND_UNROLLED = 0.002, 0.0004
 MOST_ODD = 0.004  # of a marker that does not agree: a shadow's edge moves one by 0.2 %, folded corners by 1 % and more
+_CURLED_OFF = 0.1  # of the piece's diagonal: how far off its place curling takes a marker of the page
 _LEAST_AGREEING = 3  # markers: each has a slope of its own, so that three do not fit a plane where paper is bent
 MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
@@ -89,7 +90,7 @@ def measure(
     pose, focal = pose_of(view, placed, surface)
     geometry = geometry.changed(focal=focal)
     entry = partial(entry, geometry=geometry, pose=pose)
-    page_check = _is_uncut(fit, detected, surface)
+    page_check = _is_uncut(placed, detected, surface)
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
     trouble = _trouble(geometry, fit, detected, surface, corners)
@@ -153,9 +154,17 @@ def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
     return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 
-def _is_uncut(fit: PageFit, detected: MarkersInView, surface: Surface) -> bool:
-    pages = set(fit.inlier_ids) & surface.page_ids
-    return bool(pages) or not (detected.markers.keys() & surface.piece_ids)
+def _is_uncut(placed: Placed, detected: MarkersInView, surface: Surface) -> bool:
+    """Whether markers of the page are about where an uncut one has them; it may be curled beyond the piece."""
+    if set(placed.fit.inlier_ids) & surface.page_ids or not detected.markers.keys() & surface.piece_ids:
+        return True
+    x, y, w, h = surface.piece_mm
+    side_px = np.linalg.norm(np.diff(placed.px(placed.parameters, np.array([[x, y], [x + w, y + h]])), axis=0))
+    off_px = [
+        np.linalg.norm(detected.markers[i].corners_px - placed.px(placed.parameters, surface.corners_mm[i]), axis=1)
+        for i in sorted(detected.markers.keys() & surface.page_ids)
+    ]
+    return any(off.max() < _CURLED_OFF * side_px for off in off_px)
 
 
 def _trouble(
