@@ -69,7 +69,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
         assert all(option in listed for option in arguments if option.startswith("--")), line
 
 
-@pytest.mark.parametrize(("name", "count"), [("promises", 2 * 2), ("ablation", 4 * (1 + 16))])
+@pytest.mark.parametrize(("name", "count"), [("promises", 6 * 2), ("ablation", 4 * (1 + 16))])
 def test_the_studies_that_are_quoted_can_be_run_again(name, count):
     study = import_module(f"patchproof.validation.{name}").STUDY
     folder = README.parent / ".readme" / name
