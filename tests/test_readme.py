@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from patchproof.claims import student_mean
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
 from test_imports import GROUND, MAY_IMPORT
@@ -184,6 +185,24 @@ def test_figures_of_layouts_are_the_stored_ones():
         line for line in NOTEBOOK.read_text(encoding="utf-8").splitlines() if "letter box, MobileNet v1 0.25" in line
     )
     assert f"| {rates['framed, step 0.05']:.0f} | {rates['whole']:.0f} |" in row
+
+
+def test_figures_of_all_pairs_are_the_stored_ones():
+    gains: dict[str, dict[str, list[float]]] = {}
+    for row in rows_of("layouts/layouts_cells.csv") + rows_of("layouts/pieces_cells.csv"):
+        gains.setdefault(row["scene"], {}).setdefault(row["layout"], []).append(float(row["gain"]))
+    by_layout = [
+        np.array([np.mean(pair[layout]) for pair in gains.values()]) for layout in ("whole", "framed, step 0.05")
+    ]
+    told = []
+    for values in (*by_layout, by_layout[0] - by_layout[1]):
+        over = student_mean((100 * values).tolist())
+        told.append((over.value, f"[{over.low:.1f}, {over.high:.1f}]"))
+    (whole, of_whole), (framed, of_framed), (more, of_more) = told
+    assert len(gains) == 10
+    assert f"gain {whole:.1f} points {of_whole} in place of {framed:.1f} {of_framed}" in words(NOTEBOOK)
+    assert f"{more:.1f} more {of_more}" in words(NOTEBOOK)
+    assert f"In ten pairs of object and network designs gain {whole:.1f} points {of_whole}" in words(README)
 
 
 def test_figures_of_the_ablation_are_the_stored_ones():
