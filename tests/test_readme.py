@@ -90,6 +90,9 @@ def test_python(tmp_path, monkeypatch, capsys):
     assert names["report"].summary.photos == 6
 
 
+_SEEN = "in places of the evaluate split"
+
+
 def words(path: Path) -> str:
     """A page in one line."""
     return " ".join(path.read_text(encoding="utf-8").split())
@@ -185,6 +188,29 @@ def test_figures_of_layouts_are_the_stored_ones():
         line for line in NOTEBOOK.read_text(encoding="utf-8").splitlines() if "letter box, MobileNet v1 0.25" in line
     )
     assert f"| {rates['framed, step 0.05']:.0f} | {rates['whole']:.0f} |" in row
+
+
+def test_figures_of_forecasts_and_effects_are_the_stored_ones():
+    photos, effects = (rows_of(f"forecasts/forecasts_{name}.csv")[-1] for name in ("forecasts", "effects"))
+    page = words(NOTEBOOK)
+    scores = f"{float(photos['Brier']):.3f} | {float(photos['Brier of the promise']):.3f}"
+    assert f"| Brier score, {photos['photographs']} photographs | {scores} |" in page
+    held = [float(photos[name]) * int(photos[f"{name}_n"]) for name in ("counts held", "the promise's counts held")]
+    assert f"95 % interval | {held[0]:.0f} of 30 | {held[1]:.0f} of 30 |" in page
+    widths = [100 * float(photos[name]) for name in ("width", "the promise's width")]
+    assert "| {:.0f} % | {:.0f} % |".format(*widths) in page
+    assert f"The calibration slope is {float(photos['calibration slope']):.2f} " in page
+    off = (100 * float(effects[f"estimated minus photographed{end}"]) for end in ("", "_low", "_high"))
+    assert "by {:.1f} points [{:.1f}, {:.1f}] of".format(*off) in page
+    assert f"of an effect of {100 * float(effects['photographed effect']):.0f};" in page
+    assert float(effects["interval held"]) == 1 and int(effects["interval held_n"]) == 30
+
+
+def test_rates_in_new_places_are_the_stored_ones():
+    rows = rows_of("promises/places.csv")
+    within = [row["within"] == "True" for row in rows]
+    assert [float(row["low"]) <= float(row[_SEEN]) <= float(row["high"]) for row in rows] == within
+    assert f"interval in {sum(within)} of {len(rows)}," in words(NOTEBOOK)
 
 
 def test_figures_of_all_pairs_are_the_stored_ones():
