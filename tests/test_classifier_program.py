@@ -240,12 +240,12 @@ def test_pickles_by_name_or_in_disguise_are_refused(hostile):
 @pytest.mark.parametrize(
     ("card", "sentence"),
     [
-        (None, "Expected the JSON file .*hostile.json, got none: write"),
+        (None, r"Expected a JSON file, got no file at .*hostile\.json: write"),
         ("{", "that cannot be read"),
         ("[]", "input_px"),
         ('{"input_px": "16", "labels": ["a", "b"]}', "input_px.*'16'"),
         ('{"input_px": 16, "labels": ["a"]}', "labels, a list of two or more names"),
-        ('{"input_px": 16, "labels": "names.json"}', "names.json, got none: lay the list of labels there"),
+        ('{"input_px": 16, "labels": "names.json"}', r"no file at .*names\.json: lay the list of labels there"),
         ('{"input_px": 16, "labels": ["a", "b", "c"]}', "3 logits for each picture.*\\(3, 4\\)"),
         ('{"input_px": 12, "labels": ["a", "b", "c", "d"]}', "takes N×3×S×S pictures"),
     ],

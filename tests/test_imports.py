@@ -12,7 +12,19 @@ import pytest
 import patchproof
 
 ROOT = Path(patchproof.__file__).parent
-GROUND = {"version", "strict", "settings", "goal", "claims", "sessions", "color", "geometry", "output", "workers"}
+GROUND = {
+    "version",
+    "strict",
+    "settings",
+    "goal",
+    "claims",
+    "sessions",
+    "color",
+    "geometry",
+    "input",
+    "output",
+    "workers",
+}
 # From the ground up: a room may import from the rows above its own, as far as they are named here.
 WORLD = GROUND | {"sheets", "photo", "channel", "mesh", "scene", "render", "classifier"}
 EVIDENCE = GROUND | {"sheets", "photo", "channel", "classifier", "evidence", "report"}
@@ -21,6 +33,7 @@ STUDIES = COMMANDS | {"journey", "plan", "study"}
 MAY_IMPORT = {
     **{module: set() for module in GROUND},
     "settings": {"strict", "goal"},
+    "input": {"strict"},
     "output": {"strict"},
     "sessions": {"claims"},
     "workers": {"strict"},

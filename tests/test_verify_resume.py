@@ -20,7 +20,7 @@ from patchproof.evidence import batch, measure, placed
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options, task_of
-from patchproof.journey.verify import verify_photos
+from patchproof.journey.verify import _networks, verify_photos
 from patchproof.photo.read import read_photo
 from patchproof.sheets.manifest import dump_manifest
 from patchproof.strict import Refused
@@ -197,3 +197,49 @@ def test_a_folder_of_somebody_else_is_not_resumed(folder, sheet, tmp_path):
     with pytest.raises(Refused, match=r"thesis\.txt"):
         verify_photos(folder, sheet, tmp_path, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_names_of_any_length_and_bytes_are_reported(folder, sheet, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in (b"\xff" * 9, b"x" * 245):
+        (photos / os.fsdecode(name + b".jpg")).write_bytes((folder / "b0.jpg").read_bytes())
+    report = verify_photos(photos, sheet, tmp_path / "report")
+    assert sorted(p.file for p in report.photos) == ["\\udcff" * 9 + ".jpg", "x" * 245 + ".jpg"]
+    assert {p.code for p in report.photos} == {None} and len(list((tmp_path / "report" / "pictures").iterdir())) >= 4
+
+
+def test_lines_of_the_journal_that_are_not_its_own_are_done_again(tmp_path, folder):
+    options, manifest = Options([NET], identity_printer(), ledger_photos=0), make_manifest(promise())
+    photo, journal = folder / "b0.jpg", tmp_path / "photos.jsonl"
+    first = gather_evidence(photo, manifest, options, journal=journal)
+    line = json.loads(journal.read_text())
+    entry = line["result"]["entry"]
+    others = [
+        line | {"result": {}},
+        line | {"result": line["result"] | {"counted": "perhaps"}},
+        line | {"result": line["result"] | {"light": {"paper": [1, 2], "ink": 3}}},
+        line | {"result": line["result"] | {"entry": entry | {"tilt_deg": "steep"}}},
+        line | {"result": line["result"] | {"entry": entry | {"file": "c.jpg"}}},
+        line | {"result": line["result"] | {"entry": entry | {"predictions": {"other": entry["predictions"]["net"]}}}},
+        {"key": line["key"], "file": ["b0.jpg"], "sha256": 1, "result": {}},
+        [line],
+    ]
+    for other in others:
+        journal.write_text(json.dumps(other) + "\n")
+        assert gather_evidence(photo, manifest, options, journal=journal, resume=True) == first
+    journal.write_text("[" * 100_000 + "\n\x00\n" + json.dumps(line))
+    assert gather_evidence(photo, manifest, options, journal=journal, resume=True) == first
+
+
+def test_a_sheet_does_not_choose_code_that_is_run():
+    said = promise()
+    said["models"][0]["name"] = "module:theirs.network"
+    manifest = make_manifest(said)
+    with pytest.raises(
+        Refused, match=r"got module:theirs\.network: name it yourself .*--models module:theirs\.network"
+    ):
+        _networks(manifest, None)
+    with pytest.raises(Refused, match="no code"):
+        _networks(manifest, ["builtin"])
+    assert _networks(manifest, ["module:theirs.network"]) == ("module:theirs.network",)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import signal
 from concurrent.futures import Future
 
 import pytest
@@ -43,6 +44,8 @@ def test_other_processes_do_as_this_one_on_one_thread_and_die_at_the_cost_of_a_r
     with open_workers(2) as workers:
         assert workers.map(toy.double, range(9)) == [2 * i for i in range(9)]
         assert workers.map(toy.threads, range(3)) == [1, 1, 1]
+        if hasattr(signal, "setitimer"):  # a photograph's limit, which the processes that measure them keep
+            assert workers.map(toy.given_up, [0.05, 3.0]) == [0.05, "too_costly"]
         with pytest.raises(Refused, match=r"^Expected a, got 7: c\.$"):
             workers.map(toy.refuse, [7])
         assert workers.map(toy.double_or_die, [(tmp_path, i) for i in range(8)]) == [2 * i for i in range(8)]

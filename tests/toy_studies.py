@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 
 from patchproof.claims import rate
+from patchproof.photo import limits
+from patchproof.photo.cannot import CannotJudge
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict
 from patchproof.study.study import Cell, Study
@@ -83,3 +85,20 @@ def double_unless_three(number):
     if number == 3:
         os.kill(os.getpid(), signal.SIGKILL)
     return 2 * number
+
+
+def spin(seconds):
+    """Keep the processor busy for that long."""
+    begin = time.process_time()
+    while time.process_time() - begin < seconds:
+        pass
+    return seconds
+
+
+def given_up(seconds):
+    """What a limit of 0.2 s makes of that, in whichever process this is."""
+    limits.SECONDS = 0.2
+    try:
+        return limits.limited(spin, seconds)
+    except CannotJudge as cannot:
+        return cannot.code

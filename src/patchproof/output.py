@@ -38,9 +38,10 @@ def new_folder(out: str | Path, own: tuple[str, ...], overwrite: bool = False) -
 
 def check_folder(out: Path, own: tuple[str, ...], overwrite: bool = False) -> None:
     """Refuse a folder with files in it unless they may be overwritten and are all this command's own."""
-    if out.exists() and not out.is_dir():
+    if os.path.isfile(out):
         raise Refused("a folder to write to", f"the file {out}", "choose another --out")
-    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    names = sorted(path.name for path in out.iterdir()) if os.path.isdir(out) else []
+    names = [name for name in names if not fnmatch(name, ".*.part")]  # what a killed command did not get to name
     if names and not overwrite:
         got = f"{out} with {len(names)} files"
         raise Refused("an empty or new folder", got, "choose another --out or add --overwrite")
@@ -52,7 +53,7 @@ def check_folder(out: Path, own: tuple[str, ...], overwrite: bool = False) -> No
 
 def check_file(path: Path, overwrite: bool = False) -> None:
     """Refuse a file that exists unless it may be overwritten."""
-    if path.exists() and not overwrite:
+    if os.path.exists(path) and not overwrite:
         raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
 
 

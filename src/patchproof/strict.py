@@ -27,8 +27,10 @@ class Refused(ValueError):
     """What the tool will not do, in one sentence that says expected, got, do."""
 
     def __init__(self, expected: str, got: str, do: str):
-        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
         self._parts = expected, got, do
+        # what stands in a hostile file may be of any length
+        expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
+        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
 
     def __reduce__(self):
         # exceptions are rebuilt from their message when they come back from another process; this one has three parts
@@ -97,11 +99,11 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     else:
         import tomli as tomllib
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # of a path that no system takes, 300 letters or a NUL, this is false, too
         raise Refused("a TOML file", f"no file at {path}", "check the path")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
 
 

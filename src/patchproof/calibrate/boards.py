@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 
 from patchproof.color import photo_codes_of
+from patchproof.input import readable_formats
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import detector_settings, luminance, printed_markers
-from patchproof.photo.read import list_photos, read_photo, readable_formats
+from patchproof.photo.read import list_photos, read_photo
 from patchproof.sheets.board import Board
 from patchproof.sheets.piece import DICTIONARY
 from patchproof.strict import Refused
@@ -120,7 +121,7 @@ def _tags(path: Path) -> tuple[int, str]:
             exif = image.getexif()
             words = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
             return int(exif.get(_ORIENTATION, 1)), " ".join(word for word in words if word)
-    except (OSError, ValueError, SyntaxError, TypeError):  # the picture has been read; its labels are a bonus
+    except Exception:  # the picture has been read; its labels are a bonus
         return 1, ""
 
 

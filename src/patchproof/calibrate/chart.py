@@ -26,6 +26,7 @@ from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, differe
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_from_table, vary
 from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.input import is_file, is_folder
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import pictures_in, read_photo
 from patchproof.sheets.manifest import Manifest
@@ -105,13 +106,13 @@ def calibrate_chart(
 
 def prints_of(paths: Sequence[Path]) -> list[list[Path]]:
     """Photographs by print: each folder holds those of one print; single files are all of one."""
-    singles, prints = [path for path in paths if not path.is_dir()], []
-    for folder in (path for path in paths if path.is_dir()):
+    singles, prints = [path for path in paths if not is_folder(path)], []
+    for folder in (path for path in paths if is_folder(path)):
         prints.append(pictures_in(folder))
         if not prints[-1]:
             raise Refused("a folder with photographs of one print", f"none in {folder}", "name the photographs")
     for path in singles:
-        if not path.is_file():
+        if not is_file(path):
             raise Refused("a photograph of the chart", f"no file at {path}", "check the path")
     return ([singles] if singles else []) + prints
 

@@ -21,6 +21,7 @@ import torch
 
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table
 from patchproof.color import ciede2000, codes_of, lab_from_srgb
+from patchproof.input import is_file
 from patchproof.strict import Refused
 
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
@@ -63,7 +64,7 @@ def bake(profile_path: Path, name: str, licence: str, source: str, perceptual: b
 
 def _profile_bytes(path: Path) -> bytes:
     """The file, refused where it is missing, too large, or shorter than its own header says."""
-    if not path.is_file():
+    if not is_file(path):
         raise Refused("an ICC profile", f"no file at {path}", "check the path")
     if path.stat().st_size > MAX_BYTES:
         got = f"{path.stat().st_size / 2**20:.0f} MB in {path.name}"

@@ -14,7 +14,6 @@ Source: Brown, Close-Range Camera Calibration, 1971; OpenCV's documentation of c
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from patchproof.input import is_file, read_json
 from patchproof.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
 
 if TYPE_CHECKING:
@@ -77,11 +77,7 @@ class Frame:
 def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
     """A shipped camera by name, or a JSON file relative to `base`; refused where it cannot have taken `photo_px`."""
     path = _path(name_or_file, base)
-    try:
-        data = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise Refused("a camera file (JSON)", f"{path} that cannot be read", "calibrate again") from error
-    camera = validated(Camera, data, str(path))
+    camera = validated(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
     check_camera(camera, str(path))
     width, height = camera.image_px
     if photo_px is not None and abs(photo_px[0] * height / (photo_px[1] * width) - 1) > ASPECT_TOLERANCE:
@@ -217,7 +213,7 @@ def _path(name_or_file: str, base: Path | None) -> Path:
     path = Path(name_or_file)
     if path.suffix.lower() == ".json" or len(path.parts) > 1:
         path = (base or Path()) / path
-        if not path.is_file():
+        if not is_file(path):
             raise Refused("a camera file (JSON)", f"no file at {path}", "check the path")
         return path
     known = sorted(file.stem for file in shipped("calibration", "cameras").glob("*.json"))

@@ -11,8 +11,8 @@ Left out on purpose: halftone dots (below what a camera resolves beyond 0.2 mm p
 from __future__ import annotations
 
 import json
+import math
 import zipfile
-import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,7 @@ from pydantic import Field
 from torch import Tensor
 
 from patchproof.color import lab_from_srgb
+from patchproof.input import is_file, read_json
 from patchproof.strict import Finite, Refused, Strict, nearest, shipped, validated
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
@@ -154,28 +155,33 @@ def save_printer(printer: Printer, folder: Path) -> Path:
 
 
 def _read(path: Path) -> Printer:
-    tables, text = path.with_suffix(".npz"), path.with_suffix(".json")
+    tables, text, expected = path.with_suffix(".npz"), path.with_suffix(".json"), "a printer as NAME.npz with NAME.json"
     for file in (tables, text):
-        if not file.is_file():
-            raise Refused("a printer as NAME.npz with NAME.json beside it", f"no file at {file}", "check the path")
+        if not is_file(file):
+            raise Refused(f"{expected} beside it", f"no file at {file}", "check the path")
+    head = validated(_Head, read_json(text, expected, "calibrate again"), str(text))
     try:
-        head = validated(_Head, json.loads(text.read_text("utf-8")), str(text))
         with zipfile.ZipFile(tables) as archive:
-            if sum(item.file_size for item in archive.infolist()) > 2**22:  # the tables take 0.3 MB
-                raise ValueError("larger than a printer can be")
-        with np.load(tables, allow_pickle=False) as arrays:
-            lut, gamut = arrays["lut"], arrays["gamut"]
-        shapes = lut.shape == (SIZE, SIZE, SIZE, 3) and gamut.shape == (SIZE, SIZE, SIZE)
-        if not shapes or lut.dtype not in (np.uint8, np.uint16) or gamut.dtype != np.uint8:
-            raise ValueError(f"tables {lut.shape} {lut.dtype} and {gamut.shape} {gamut.dtype}")
-    except Refused:
-        raise
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        reason = str(error).strip().rstrip(".")[:100]
+            lut = _array(archive, "lut", (SIZE, SIZE, SIZE, 3), (np.uint8, np.uint16))
+            gamut = _array(archive, "gamut", (SIZE, SIZE, SIZE), (np.uint8,))
+    except Exception as error:  # zip, deflate, LZMA and NumPy's header: each fails in its own way
+        reason = " ".join(str(error).split()).rstrip(".")[:100]
         raise Refused("a printer's tables", f"{path} that cannot be read ({reason})", "calibrate again") from error
     lut_srgb = torch.tensor(lut / np.iinfo(lut.dtype).max, dtype=torch.float32)
     distances = torch.tensor(gamut / GAMUT_STEPS, dtype=torch.float32)
     return Printer(head.name, head.method, lut_srgb, distances, head.paper, head.provenance)
+
+
+def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kinds: tuple[type, ...]) -> np.ndarray:
+    """An array of an .npz: no more is unpacked than its shape and type say, and these have to be the ones wanted."""
+    with archive.open(f"{name}.npy") as member:
+        if np.lib.format.read_magic(member) != (1, 0):
+            raise ValueError(f"{name} in another format")
+        stored, by_columns, kind = np.lib.format.read_array_header_1_0(member)
+        if stored != shape or by_columns or kind not in kinds:
+            raise ValueError(f"the table {name} {stored} {kind}")
+        content = member.read(math.prod(shape) * kind.itemsize + 1)
+    return np.frombuffer(content, kind).reshape(shape)  # other lengths do not fit it
 
 
 def _bordered(table: Tensor) -> Tensor:

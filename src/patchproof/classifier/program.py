@@ -14,7 +14,6 @@ dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)), "NAME.pt2")`.
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 
 import torch
@@ -23,6 +22,7 @@ from patchproof.classifier.archive import Unwanted, read_archive
 from patchproof.classifier.batches import InBatches
 from patchproof.classifier.description import read_program
 from patchproof.classifier.network import Classifier
+from patchproof.input import is_file, read_json
 from patchproof.strict import Refused
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
@@ -33,7 +33,7 @@ def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
     if path.suffix != ".pt2":
         do = "save it with torch.export.save as NAME.pt2, with NAME.json beside it"
         raise Refused("a torch.export program, file:NAME.pt2", f"{path}", do)
-    if not path.is_file():
+    if not is_file(path):
         raise Refused("a torch.export program", f"no file at {path}", "check the path")
     if path.stat().st_size > MAX_BYTES:
         got = f"{path}, which is larger"
@@ -47,24 +47,16 @@ def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
 def _card(path: Path) -> tuple[int, tuple[str, ...]]:
     """Input size and labels."""
     do = 'write {"input_px": 224, "labels": ["...", ...]} into it, or the name of a JSON list beside it as labels'
-    card = _read_json(path, do)
+    card = read_json(path, "a JSON file", do, do)
     input_px, labels = (card.get("input_px"), card.get("labels")) if isinstance(card, dict) else (None, None)
     if isinstance(labels, str):
-        labels = _read_json(path.with_name(Path(labels).name), "lay the list of labels there")
+        lay = "lay the list of labels there"
+        labels = read_json(path.with_name(Path(labels).name), "a JSON file", lay, lay)
     if type(input_px) is not int or not 8 <= input_px <= 4096:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
     if not isinstance(labels, list) or len(labels) < 2 or not all(isinstance(label, str) for label in labels):
         raise Refused("labels, a list of two or more names", f"other labels in {path}", do)
     return input_px, tuple(labels)
-
-
-def _read_json(path: Path, do: str):
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise Refused(f"the JSON file {path}", "none", do) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise Refused("a JSON file", f"{path} that cannot be read ({error})", do) from error
 
 
 def _network(stored: bytes, path: Path) -> InBatches:

@@ -12,11 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, ValidationError
 
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.classify import Judges, squares_of
@@ -29,14 +30,19 @@ from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.limits import limited
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.read import read_photo
+from patchproof.strict import Finite, Share, Strict
 from patchproof.workers import WorkerDied, Workers, result_of
 
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
+
+# linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
+Light = Annotated[Finite, Field(ge=-4, le=4)]
 
 
 @dataclass(frozen=True)
@@ -69,8 +75,9 @@ def measure_all(
     photos: dict[int, MeasuredPhoto] = {}
     for number, item in enumerate(items):
         kept = journal.find(item.name, item.path) if journal is not None else None
-        if kept is not None and (kept["pictures"] or not item.with_pictures):
-            photos[number] = _parsed(kept)
+        finished = None if kept is None else _parsed(kept, item, judges)
+        if finished is not None:
+            photos[number] = finished
     todo = [number for number in range(len(items)) if number not in photos]
     step(len(photos), len(items))
     for at, future in workers.completed(partial(_measured, task), [items[number] for number in todo]):
@@ -84,45 +91,77 @@ def measure_all(
         entry = measured.entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.file, measured.pictures)
-        kept = _serialized(replace(measured, entry=entry))
+        kept = _serialized(replace(measured, entry=entry), item.with_pictures)
         if journal is not None:
-            journal.add(item.name, sha256, kept | {"pictures": item.with_pictures})
-        photos[number] = _parsed(kept)  # as a later run will find it: what is kept and new must not differ
+            journal.add(item.name, sha256, kept)
+        photos[number] = _Kept.model_validate(kept).photo  # as a later run will find it: both must not differ
         step(len(photos), len(items))
     return [photos[number] for number in range(len(items))]
 
 
-def _serialized(measured: MeasuredPhoto) -> dict[str, Any]:
+class _Light(Strict):
+    paper: tuple[Light, Light, Light]
+    ink: tuple[Light, Light, Light]
+    contrast: Finite
+    clipped: Share
+
+
+class _Kept(Strict):
+    """A photograph's result in the journal."""
+
+    entry: PhotoEntry
+    counted: bool
+    light: _Light | None
+    pictures: bool
+
+    @property
+    def photo(self) -> MeasuredPhoto:
+        light = self.light
+        if light is not None:
+            light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
+        return MeasuredPhoto(self.entry, self.counted, light=light)
+
+
+def _serialized(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
-    return {"entry": measured.entry.model_dump(mode="json"), "counted": measured.counted, "light": light}
+    entry = measured.entry.model_dump(mode="json")
+    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures}
 
 
-def _parsed(kept: Mapping[str, Any]) -> MeasuredPhoto:
-    light = kept["light"]
-    if light is not None:
-        light = FrameLight(**light | {"paper": np.array(light["paper"]), "ink": np.array(light["ink"])})
-    return MeasuredPhoto(PhotoEntry.model_validate(kept["entry"]), kept["counted"], light=light)
+def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> MeasuredPhoto | None:
+    """What the journal has of the photograph; None where it is of another, or not what this run needs."""
+    try:
+        result = _Kept.model_validate(kept)
+    except ValidationError:
+        return None
+    entry, names = result.entry, {model.name for model in judges.models} if judges else set()
+    whole = entry.file == item.file and set(entry.predictions) in (set(), names)
+    return result.photo if whole and (result.pictures or not item.with_pictures) else None
 
 
 def _measured(task: Task, item: Item) -> MeasuredPhoto:
     try:
-        photo = read_photo(item.path)
-        squares = squares_of(photo.srgb, task.sizes_px)
-        if item.control is not None:
-            return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
-        view = view_of(photo, task.camera)
-        measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi)
-        if not item.with_pictures:
-            return replace(measured, pictures={}, squares=squares)
-        geometry = measured.entry.geometry
-        small = _thumbnail(view.srgb, geometry and geometry.homography_px_from_mm, task.surface)
-        return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
+        return limited(_measure, task, item)
     except CannotJudge as cannot:
         return _rejected(item, Remark.of(cannot))
     except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
         # no photograph is known that does this; one that does must not cost the others
         advice = f"it could not be measured ({type(error).__name__}): leave it out, or take it again"
         return _rejected(item, Remark(code="unreadable", advice=advice))
+
+
+def _measure(task: Task, item: Item) -> MeasuredPhoto:
+    photo = read_photo(item.path)
+    squares = squares_of(photo.srgb, task.sizes_px)
+    if item.control is not None:
+        return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
+    view = view_of(photo, task.camera)
+    measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi)
+    if not item.with_pictures:
+        return replace(measured, pictures={}, squares=squares)
+    geometry = measured.entry.geometry
+    small = _thumbnail(view.srgb, geometry and geometry.homography_px_from_mm, task.surface)
+    return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
@@ -156,9 +195,13 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
     believed = measured.counted and usable(entry.status, entry.code)
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
-    try:
+    px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px
+
+    def shot() -> Shot | None:
         view = view_of(read_photo(path), task.camera)
-        px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px
         return shot_of(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
+
+    try:
+        return limited(shot)
     except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
         return None  # read before, so this is a file that went away: the ledger does without

@@ -68,10 +68,14 @@ def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarra
 
     from patchproof.classifier import center_square
 
-    square, _ = square_of(srgb)  # before it becomes float, which takes 4 times the memory
-    photo = torch.from_numpy(np.ascontiguousarray(square.transpose(2, 0, 1))).float().div_(255)[None]
+    square, _ = square_of(srgb)
+    planes = {size: [] for size in sizes_px}
     with torch.inference_mode():
-        return {size: center_square(photo, size)[0].numpy() for size in sizes_px}
+        for channel in range(3):  # one by one, since as float each takes 4 times the memory
+            light = torch.from_numpy(np.ascontiguousarray(square[..., channel])).float().div_(255)[None, None]
+            for size, own in planes.items():
+                own.append(center_square(light, size)[0, 0])
+        return {size: torch.stack(own).numpy() for size, own in planes.items()}
 
 
 def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from patchproof.photo.read import list_photos, pictures_in, readable_formats
+from patchproof.input import is_folder, readable_formats
+from patchproof.photo.limits import limited
+from patchproof.photo.read import list_photos, pictures_in, printable
 
 PAUSE_MINUTES = 30.0
 _EXIF_IFD, _TAKEN, _MODEL = 0x8769, 0x9003, 0x0110
@@ -31,7 +33,8 @@ class Grouping:
     def file(self, number: int) -> str:
         """A photograph's name in reports: its file's, after that of its folder where folders are sessions."""
         folder, path = self.names[self.session[number]], self.paths[number]
-        return f"{folder}/{path.name}" if path.parent.name == folder and self.known_from == FOLDERS else path.name
+        name, parent = printable(path.name), printable(path.parent.name)
+        return f"{folder}/{name}" if parent == folder and self.known_from == FOLDERS else name
 
 
 FOLDERS, TIMES, GUESS = "folders", "cameras and times", "nothing said so: taken as one"
@@ -42,9 +45,9 @@ def group(folder: str | Path, without: Path | None = None) -> Grouping:
     is left out: it has those of controls.
     """
     folder, left_out = Path(folder), None if without is None else without.resolve()
-    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    inside = sorted(folder.iterdir()) if is_folder(folder) else []
     inside = [p for p in inside if p.is_dir() and not p.name.startswith(".") and p.resolve() != left_out]
-    parts = {p.name: paths for p in inside if (paths := pictures_in(p))}
+    parts = {printable(p.name): paths for p in inside if (paths := pictures_in(p))}
     if not parts:
         return _by_time(list_photos(folder))
     if loose := pictures_in(folder):
@@ -70,15 +73,19 @@ def _by_time(paths: Sequence[Path]) -> Grouping:
 
 def _taken(path: Path) -> tuple[datetime, str] | None:
     """When a photograph was taken and by which camera, as its file says; None where it does not."""
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path, formats=readable_formats()) as image:
-                exif = image.getexif()
-                when, camera = exif.get_ifd(_EXIF_IFD).get(_TAKEN), exif.get(_MODEL)
-        words = " ".join(str(camera or "").split())[:40]
-        return datetime.strptime(str(when).strip("\0 "), "%Y:%m:%d %H:%M:%S"), words
+        when, camera = limited(_labels, path)
+        return datetime.strptime(when.strip("\0 "), "%Y:%m:%d %H:%M:%S"), " ".join(camera.split())[:40]
     except Exception:  # a file that cannot be read is a photograph that will be rejected, and says no time
         return None
+
+
+def _labels(path: Path) -> tuple[str, str]:
+    """EXIF's time and camera."""
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Image.open(path, formats=readable_formats()) as image:
+            exif = image.getexif()
+            return str(exif.get_ifd(_EXIF_IFD).get(_TAKEN)), str(exif.get(_MODEL) or "")

@@ -2,8 +2,8 @@
 
 In: a file of JSON lines and a key that stands for everything a result depends on besides the photograph itself. Out:
 what an earlier run made of a photograph of the same name and the same bytes under the same key. Lines of other keys
-and a last line that was cut short do not count, so a photograph, network, sheet or option that changed since is looked
-at anew.
+and lines that are broken or were cut short do not count, so a photograph, network, sheet or option that changed since
+is looked at anew. What a result has to be is its reader's business.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
+from patchproof.input import LARGEST_JSON
 from patchproof.output import make_folder, write_whole
+from patchproof.photo.limits import MOST_BYTES
+from patchproof.strict import Strict, validated
 from patchproof.version import __version__
 
 if TYPE_CHECKING:
@@ -27,21 +30,27 @@ if TYPE_CHECKING:
     from patchproof.sheets.manifest import Manifest
 
 
+class _Line(Strict):
+    file: str
+    sha256: str | None
+    key: str
+    result: dict[str, Any]
+
+
 class Journal:
     """An open file of finished photographs; opening it drops what does not count, or all of it unless `resume`."""
 
     def __init__(self, path: Path, key: str, resume: bool):
         make_folder(path.parent)
-        lines = [line for line in _lines(path) if line["key"] == key] if resume else []
-        self._key, self._kept = key, {line["file"]: line for line in lines}
-        text = "".join(json.dumps(line) + "\n" for line in self._kept.values())
-        write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+        lines = [line for line in _lines(path) if line.key == key] if resume else []
+        self._key, self._kept = key, {line.file: line for line in lines}
+        write_whole(path, "".join(json.dumps(line.model_dump()) + "\n" for line in self._kept.values()))
         self._file: TextIO = open(path, "a", encoding="utf-8")
 
     def find(self, name: str, photo: Path) -> Any:
         """The result of the photograph under that name; None where there is none, or its bytes have changed."""
         line = self._kept.get(name)
-        return line["result"] if line is not None and line["sha256"] == file_sha256(photo) else None
+        return line.result if line is not None and line.sha256 == file_sha256(photo) else None
 
     def add(self, name: str, sha256: str | None, result: Any) -> None:
         """Keep JSON values for the photograph of those bytes."""
@@ -71,9 +80,11 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
 
 def file_sha256(path: Path) -> str | None:
-    """SHA-256 of a file's bytes; None where it cannot be read."""
+    """SHA-256 of a file's bytes; None where it cannot be read, or is too large to be read as a photograph."""
     digest = hashlib.sha256()
     try:
+        if path.stat().st_size > MOST_BYTES:
+            return None
         with open(path, "rb") as file:
             while block := file.read(1 << 20):
                 digest.update(block)
@@ -89,11 +100,9 @@ def _printer_sha256(printer: Printer) -> str:
     return digest.hexdigest()
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
+def _lines(path: Path) -> Iterator[_Line]:
     """The lines that are whole, and of this layout; none where there is no file."""
-    with suppress(FileNotFoundError):
-        for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            with suppress(ValueError):  # cut short by a kill
-                line = json.loads(text)
-                if isinstance(line, dict) and {"file", "sha256", "key", "result"} <= line.keys():
-                    yield line
+    with suppress(FileNotFoundError), open(path, encoding="utf-8", errors="replace") as file:
+        while text := file.readline(LARGEST_JSON):  # a part of a longer one is none
+            with suppress(ValueError, RecursionError):  # cut short by a kill; what is not JSON, or another's
+                yield validated(_Line, json.loads(text), str(path))

@@ -30,7 +30,8 @@ from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
-from patchproof.photo.read import pictures_in
+from patchproof.input import is_folder
+from patchproof.photo.read import pictures_in, printable
 from patchproof.sessions import TAIL
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
@@ -64,7 +65,7 @@ def gather_evidence(
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
     items = [Item(path, grouping.file(i), with_pictures=i < WITH_PICTURES) for i, path in enumerate(paths)]
-    items += [Item(path, path.name, control) for control, files in control_paths.items() for path in files]
+    items += [Item(path, printable(path.name), control) for control, files in control_paths.items() for path in files]
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with kept as open_journal, open_workers(jobs, cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
@@ -107,12 +108,12 @@ def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
     if folder is None:
         return {}
     folder = Path(folder)
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
     if own := pictures_in(folder):
-        return {folder.name: own}
-    inside = {p.name: pictures_in(p) for p in sorted(folder.iterdir()) if p.is_dir() and not p.name.startswith(".")}
-    inside = {name: files for name, files in inside.items() if files}
+        return {printable(folder.name): own}
+    folders = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    inside = {printable(p.name): files for p in folders if (files := pictures_in(p))}
     if not inside:
         raise Refused(f"control photographs in {folder}", "none", "copy them there, one control per folder")
     return inside

@@ -20,6 +20,7 @@ from patchproof.photo.label import Label, label_of
 from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest, Rect
 from patchproof.sheets.piece import MODULES, Piece, marker_at, marker_image, marker_rect
+from patchproof.strict import Refused
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer
@@ -67,10 +68,16 @@ class Promised:
 
 
 def surface_of(manifest: Manifest) -> Surface:
-    """The surface of the design's page; without a design, of the first page with markers, measured over the cut."""
+    """The surface of the design's page; without a design, of the first page with markers, measured over the cut.
+    Refused where the design's page has none, or is none of the tiles.
+    """
+    pages = {tile.page for tile in manifest.tiles} or set(_corners_by_page(manifest))
+    page = manifest.design.page if manifest.design else min(pages)
+    if page not in pages:
+        got = f"page {page} of a sheet with {', '.join(map(str, sorted(pages)))}"
+        raise Refused("a design on a page with markers, or on a tile", got, "make the sheet again")
     if manifest.tiles:
         return _assembled(manifest)
-    page = manifest.design.page if manifest.design else min(m.page for m in manifest.markers)
     corners = _corners_by_page(manifest)[page]
     piece = frozenset(i for i, c in corners.items() if _inside(manifest.cut_mm, c))
     return _surface(manifest, corners, piece, _design_rect(manifest))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from patchproof.input import is_file, readable_formats
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene.image_scene import label_rows
@@ -25,9 +26,9 @@ _HEADS = {"file", "filename", "file_name", "image", "name"}
 def labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
     """(file, its PNG's name, label) of every line; two files of one stem keep their suffixes in the PNG's name."""
     rows = label_rows(table)
-    if rows and rows[0][0].casefold() in _HEADS and not (folder / rows[0][0]).is_file():
+    if rows and rows[0][0].casefold() in _HEADS and not is_file(folder / rows[0][0]):
         rows = rows[1:]
-    missing = [file for file, _ in rows if not (folder / file).is_file()]
+    missing = [file for file, _ in rows if not is_file(folder / file)]
     if missing or not rows:
         got = f"{len(missing)} missing ({missing[0]})" if missing else "none"
         raise Refused(f"the images that {table.name} names in {folder}", got, "copy them there, or mend the table")
@@ -46,7 +47,7 @@ def in_blocks(folder: Path, rows) -> Iterator[list]:
     block, pixels = [], 0
     for row in rows:
         try:
-            with Image.open(folder / row[0]) as image:
+            with Image.open(folder / row[0], formats=readable_formats()) as image:
                 size = image.width * image.height
         except Exception:  # what is no image is reported when it is read
             size = 0

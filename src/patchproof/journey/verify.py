@@ -20,6 +20,7 @@ from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
+from patchproof.input import is_file
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import check_folder
 from patchproof.report.images import save_pictures, stem_of
@@ -30,7 +31,7 @@ from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.strict import Refused
 
 _JOURNAL = "photos.jsonl"
-OWN = ("report.json", "report.csv", "report.html", "pictures", _JOURNAL, ".*.part")
+OWN = ("report.json", "report.csv", "report.html", "pictures", _JOURNAL)
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 
 
@@ -54,10 +55,11 @@ def verify_photos(
 ) -> Report:
     """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
 
-    `models` are names, or classifiers in memory; `camera` is a camera file's name or path. Model and printer names are
-    looked up from the manifest's folder, then as the scene's were. With the `run` that the sheet was made from, each
-    photograph gets a forecast of its own. `resume` goes on from what an earlier run finished,
-    whole or killed: only photographs that are new, or differ, are measured.
+    `models` are names, or classifiers in memory; a network of the sheet that is code (`module:`) is run only where it
+    is one of them. `camera` is a camera file's name or path. Model and printer names are looked up from the manifest's
+    folder, then as the scene's were. With the `run` that the sheet was made from, each photograph gets a forecast of
+    its own. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are new, or
+    differ, are measured.
     """
     out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
     _check_out(out, resume, overwrite)
@@ -102,11 +104,11 @@ def verify_photos(
 
 def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
     """Refuse a folder with files in it, unless they are ours and to be gone on from, or replaced."""
-    begun = (out / _JOURNAL).is_file()
+    begun = is_file(out / _JOURNAL)
     if resume:
         check_folder(out, OWN if begun else (), overwrite=begun)
         return
-    if begun and not overwrite and not (out / "report.json").is_file():
+    if begun and not overwrite and not is_file(out / "report.json"):
         raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
     check_folder(out, OWN, overwrite)
 
@@ -127,4 +129,9 @@ def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> 
             raise Refused("a sheet that promises something", got, "name --models")
         return tuple(given.values())
     promised = tuple(model.name for model in manifest.promise.models)
-    return tuple(given.get(name, name) for name in dict.fromkeys((promised[0], *(given or promised))))
+    names = dict.fromkeys((promised[0], *(given or promised)))
+    code = next((name for name in names if name.startswith("module:") and name not in given), None)
+    if code is not None:
+        do = f"name it yourself if that code is yours (--models {code})"
+        raise Refused("a sheet whose networks are no code, which would be run", f"{code}", do)
+    return tuple(given.get(name, name) for name in names)

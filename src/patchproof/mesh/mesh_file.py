@@ -13,10 +13,8 @@ normals that the file does not have; they keep silent about missing files and in
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import urllib.parse
 import warnings as python_warnings
 from pathlib import Path
 from typing import Any
@@ -24,84 +22,80 @@ from typing import Any
 import numpy as np
 
 from patchproof.color import linear_from_srgb
+from patchproof.input import FORMATS as PICTURES
+from patchproof.input import LARGEST_PX, is_file
+from patchproof.mesh.assets import MOST_BYTES, Assets
 from patchproof.mesh.mesh import Material, Part, normal_transform, topology_warnings
 from patchproof.strict import Refused
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
+MOST_FACES = 20_000_000  # a scan of a building has fewer
 GRAY_LINEAR = (0.21404114, 0.21404114, 0.21404114)  # sRGB 0.5: what an object without color is taken to be
 WHITE = (1.0, 1.0, 1.0)
 
 
 def read_parts(path: Path, world_from_file: np.ndarray) -> tuple[list[Part], list[str]]:
     """Every placed piece of geometry with faces, vertices and normals turned by `world_from_file` 3×3, and warnings."""
-    if not path.is_file():
+    if not is_file(path):
         raise Refused("a mesh file", f"no file at {path}", "check the path")
     if path.suffix.lower() not in FORMATS:
         raise Refused(f"a mesh file ({', '.join(FORMATS)})", path.name, "export the mesh in one of these formats")
     reader = _Reader(path)
-    parts = [
-        reader.part(raw, recipe, world_from_file @ world[:3])
-        for world, raw, recipe in reader.placed()
-        if np.size(raw.get("faces", ())) and np.size(raw["vertices"])
-    ]
-    if not parts:
-        raise Refused("a mesh with faces", f"none in {path.name}", "export the object as triangles")
-    return parts, [*dict.fromkeys(reader.warnings), *topology_warnings(parts)]
-
-
-class _Assets:
-    """Files that a mesh names, looked up beside it; remembers the missing and broken ones. trimesh's `resolver`."""
-
-    def __init__(self, mesh: Path):
-        self.folder, self.file_name = mesh.parent, mesh.name
-        self.missing, self.broken = [], []
-
-    def get(self, name: str) -> bytes:
-        name = str(name).strip()
-        if name.startswith("-"):  # map_Kd takes options before the name
-            name = name.split()[-1]
-        for spelled in (name, name.replace("\\", "/"), urllib.parse.unquote(name)):
-            if (self.folder / spelled).is_file():
-                data = (self.folder / spelled).read_bytes()
-                if not spelled.lower().endswith((".mtl", ".bin")) and not _is_image(data):
-                    self.broken.append(name)
-                return data
-        self.missing.append(name)
-        raise FileNotFoundError(name)
-
-    __getitem__ = get
+    try:
+        reader.load()
+        parts = reader.parts(world_from_file)
+        if not parts:
+            raise Refused("a mesh with faces", f"none in {path.name}", "export the object as triangles")
+        return parts, [*dict.fromkeys(reader.warnings), *topology_warnings(parts)]
+    except Refused:
+        raise
+    except Exception as error:  # the parsers raise whatever they stumble over, and so do odd arrays and graphs
+        reader.refuse_missing()
+        got = f"{path.name} that cannot be read ({f'{type(error).__name__}: {error}'[:120]})"
+        raise Refused(f"a mesh as {path.suffix[1:].upper()}", got, "export it again") from error
 
 
 class _Reader:
     """One file while it is read: what trimesh found in it, materials already made, and the warnings so far."""
 
     def __init__(self, path: Path):
-        from trimesh.exchange.load import mesh_loaders
-
-        self.path, self.assets, self.warnings = path, _Assets(path), []
+        self.path, self.assets, self.warnings = path, Assets(path), []
         self.kind = path.suffix.lower()[1:]
         self.is_gltf = self.kind in {"glb", "gltf"}
         self.textures: dict[int, np.ndarray] = {}
         self.materials: dict[tuple, Material] = {}
-        try:
-            self.header = _gltf_header(path) if self.is_gltf else {}
-            if self.kind == "obj":
-                _check_obj(path)
-            with open(path, "rb") as file, python_warnings.catch_warnings():
-                python_warnings.simplefilter("ignore")  # about numpy's parsers, not about the mesh
-                self.loaded: dict[str, Any] = mesh_loaders[self.kind](file, file_type=self.kind, resolver=self.assets)
-        except Refused:
-            raise
-        except Exception as error:  # the parsers raise whatever they stumble over
-            self._refuse_missing()
-            got = f"{path.name} that cannot be read ({f'{type(error).__name__}: {error}'[:120]})"
-            raise Refused(f"a mesh as {self.kind.upper()}", got, "export it again") from error
-        self._refuse_missing()
+        self.header: dict[str, Any] = {}
+        self.loaded: dict[str, Any] = {}
+
+    def load(self) -> None:
+        """Let trimesh parse the file, and refuse what the file names but is not there."""
+        from trimesh.exchange.load import mesh_loaders
+
+        if self.is_gltf:
+            self.header = _gltf_header(self.path)
+        if self.kind == "obj":
+            _check_obj(self.path)
+        with open(self.path, "rb") as file, python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")  # about numpy's parsers, not about the mesh
+            self.loaded = mesh_loaders[self.kind](file, file_type=self.kind, resolver=self.assets)
+        self.refuse_missing()
         used = set(self.header.get("extensionsUsed", ())) | set(self.header.get("extensionsRequired", ()))
         for name in sorted(used & {"KHR_texture_transform", "KHR_draco_mesh_compression", "EXT_meshopt_compression"}):
             self.warnings.append(f"the glTF extension {name} is not read; textures or shapes may be wrong")
         if any(m.get("alphaMode", "OPAQUE") != "OPAQUE" for m in self.header.get("materials", ())):
             self.warnings.append("transparent materials are drawn opaque")
+
+    def parts(self, world_from_file: np.ndarray) -> list[Part]:
+        """All that has faces, each as often as it is placed."""
+        placed = [(world, raw, recipe) for world, raw, recipe in self.placed() if np.size(raw.get("faces", ()))]
+        if sum(len(raw["faces"]) for _, raw, _ in placed) > MOST_FACES:
+            got = f"more in {self.path.name}, some of them placed many times"
+            raise Refused(f"a mesh of at most {MOST_FACES // 10**6} million faces", got, "export a coarser one")
+        return [
+            self.part(raw, recipe, world_from_file @ world[:3])
+            for world, raw, recipe in placed
+            if np.size(raw["vertices"])
+        ]
 
     def placed(self) -> list[tuple[np.ndarray, dict, dict]]:
         """(world_from_part 4×4, trimesh's arrays, the glTF primitive) of each placed geometry."""
@@ -148,7 +142,8 @@ class _Reader:
         own = np.arange(len(corners)).reshape(-1, 3)
         return Part(placed[corners], own, material, uv, normals, np.repeat(colors, 3, axis=0))
 
-    def _refuse_missing(self):
+    def refuse_missing(self) -> None:
+        """Refuse a missing or broken texture; a missing MTL is warned about."""
         for name in dict.fromkeys(self.assets.missing):
             if not name.lower().endswith(".mtl"):
                 do = f"put it into {self.path.parent}"
@@ -241,6 +236,8 @@ class _Reader:
         """An image as uint8 H×W×3; 16 bits are cut to 8, alpha is dropped."""
         if id(image) not in self.textures:
             try:
+                if image.format not in PICTURES or image.width * image.height > LARGEST_PX:
+                    raise ValueError(f"{image.format} of {image.width} × {image.height} pixels")
                 if image.mode.startswith("I"):  # Pillow would clip 16 bits at 255 instead of scaling them
                     pixels = np.repeat((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
                 else:
@@ -250,17 +247,6 @@ class _Reader:
                 raise Refused(f"a texture of {self.path.name} that can be read", got, "export it again") from error
             self.textures[id(image)] = pixels
         return self.textures[id(image)]
-
-
-def _is_image(data: bytes) -> bool:
-    """Whether Pillow knows the format and finds it in order, as far as that can be told without decoding."""
-    from PIL import Image
-
-    try:
-        Image.open(io.BytesIO(data)).verify()
-    except Exception:  # Pillow's readers raise whatever they stumble over
-        return False
-    return True
 
 
 def _gltf_header(path: Path) -> dict:
@@ -273,6 +259,11 @@ def _gltf_header(path: Path) -> dict:
     header = json.loads(text)
     if not isinstance(header, dict):
         raise ValueError("its JSON is no object")
+    # trimesh takes memory for both before it looks into the file
+    copied = sum(abs(view["byteLength"]) for view in header.get("bufferViews", ()))
+    made_up = sum(abs(accessor["count"]) for accessor in header.get("accessors", ()) if "bufferView" not in accessor)
+    if copied > MOST_BYTES or made_up > MOST_FACES:
+        raise ValueError(f"it asks for {copied} bytes and {made_up} zeros")
     return header
 
 

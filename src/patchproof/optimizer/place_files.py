@@ -7,7 +7,6 @@ worst), those that were drafted with their rank, and the chosen piece's outline 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from patchproof import geometry
 from patchproof.channel.effects import Light, Pose
 from patchproof.color import photo_codes_of, srgb_from_linear
+from patchproof.input import is_file, read_json
 from patchproof.optimizer.places import Candidate, Place
 from patchproof.output import write_whole
 from patchproof.render.raster import rasterize
@@ -50,14 +50,10 @@ def save_place(place: Place, scene: PatchScene, folder: Path) -> None:
 def read_place(folder: Path, scene: OpenScene | None = None) -> Place | None:
     """The place that a search left in a run's folder; None without one, refused where it is not of that `scene`."""
     path = folder / _RECORD
-    if not path.is_file():
+    if not is_file(path):
         return None
-    try:
-        place = validated(Place, json.loads(path.read_text(encoding="utf-8")), str(path))
-    except (OSError, ValueError) as error:
-        raise Refused(
-            "the record of a search", f"{path} that cannot be read", "start anew in another folder"
-        ) from error
+    record = read_json(path, "the record of a search", "start anew in another folder")
+    place = validated(Place, record, str(path))
     if scene is not None and place.sheet_id != scene.sheet_id:
         do = "resume with the same scene file and seed, or start anew in another folder"
         raise Refused("the place of this scene and seed", f"one of another in {folder}", do)

@@ -16,14 +16,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from PIL import Image
+from pydantic import BaseModel, Field
 
 from patchproof.classifier.network import Classifier
 from patchproof.color import codes_of
+from patchproof.input import is_file, read_json
+from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.patch import DESIGN_FILE
@@ -38,14 +41,15 @@ from patchproof.scene.patch_scene import OpenScene
 from patchproof.scene.scene import Scene, build_scene, load_scene, needs_patch, needs_texture
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
-from patchproof.strict import Refused, validated
+from patchproof.strict import Positive, Refused, validated
 from patchproof.version import __version__
 
-_CHECKPOINT, _LOG, _RUN, _VIEWS = ("checkpoint.safetensors", "steps.jsonl", "run.json", "views.png")
+_LOG, _RUN, _VIEWS = ("steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
-OWN = (_CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
+OWN = (CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
 
+NotNegativeInt = Annotated[int, Field(ge=0)]
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
 
@@ -98,7 +102,7 @@ def optimize_scene(
     make_folder(out)
     if place is not None:
         save_place(place, needs_patch(scene), out)
-    state = _resumed(out, problem) if resume else start(problem)
+    state = resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
     problem.subject.save(design, out)
     promise = _promise(problem, design, controls, on_promise)
@@ -112,34 +116,50 @@ def optimize_scene(
 def load_run(folder: str | Path) -> Run:
     """A finished run; refused where it is none, or not finished."""
     folder = Path(folder)
-    if not (folder / _RUN).is_file():
-        begun = (folder / _CHECKPOINT).is_file()
+    if not is_file(folder / _RUN):
+        begun = is_file(folder / CHECKPOINT)
         do = "finish it with --resume" if begun else "name the folder that optimize wrote"
         raise Refused("a finished run", f"{'an unfinished one' if begun else 'none'} at {folder}", do)
+    details = read_json(folder / _RUN, "a finished run", "optimize again")
+    record = validated(_Record, details, str(folder / _RUN))
+    settings, promise = record.settings, record.promise
+    _refuse_framed(settings, record.placement, folder)
     try:
-        details = json.loads((folder / _RUN).read_text(encoding="utf-8"))
-        settings = validated(SceneSettings, details["settings"], str(folder / _RUN))
-        promise = validated(Promise, details["promise"], str(folder / _RUN))
-        _refuse_framed(settings, details["placement"], folder)
-        base, seed = folder / details["scene_folder"], details["seed"]
-        glb = (folder / _GIVEN).read_bytes() if (folder / _GIVEN).is_file() else None
-        scene = build_scene(settings, base.resolve(), seed, details["sheet_id"], glb)
+        base = (folder / record.scene_folder).resolve()
+        glb = (folder / _GIVEN).read_bytes() if is_file(folder / _GIVEN) else None
+        scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
         design = _design(scene, folder)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        if isinstance(error, Refused):
-            raise
+    except Refused:
+        raise
+    except (OSError, ValueError, RuntimeError) as error:
         raise Refused("a finished run", f"{folder} that cannot be read ({error})", "optimize again") from error
     return Run(folder, scene, design, promise, details)
 
 
-def _refuse_framed(settings: SceneSettings, placement: dict[str, Any] | None, folder: Path) -> None:
+class _Placement(BaseModel):
+    piece_mm: tuple[Positive, Positive] | None = None
+
+
+class _Record(BaseModel):
+    """What is read of run.json."""
+
+    settings: SceneSettings
+    promise: Promise
+    placement: _Placement | None
+    scene_folder: str
+    seed: NotNegativeInt
+    sheet_id: str
+    printer: dict[str, Any]
+
+
+def _refuse_framed(settings: SceneSettings, placement: _Placement | None, folder: Path) -> None:
     """Refuse a run from when a patch's size was that of the design inside a frame of markers."""
-    width_mm = settings.patch.width_mm
-    if placement is not None and width_mm is not None and abs(placement["piece_mm"][0] - width_mm) > 0.01:
+    width_mm, piece_mm = settings.patch.width_mm, placement and placement.piece_mm
+    if piece_mm is not None and width_mm is not None and abs(piece_mm[0] - width_mm) > 0.01:
         raise Refused(
             "a run whose design fills its piece",
             f"one from before in {folder}, with a frame round its {width_mm:g} mm",
-            f"verify its sheets, but optimize again, with the whole piece's width_mm = {placement['piece_mm'][0]:.4g}",
+            f"verify its sheets, but optimize again, with the whole piece's width_mm = {piece_mm[0]:.4g}",
         )
 
 
@@ -167,12 +187,12 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             state = step.state
             log.write(json.dumps(_log_line(step)) + "\n")
             log.flush()
-            if step.select_loss is not None:
-                write_whole(out / _CHECKPOINT, lambda path, state=state: _save(state, problem, path))
             if state.number == total and step.pictures is not None:
                 write_whole(
                     out / _VIEWS, lambda path, pictures=step.pictures: _contact_sheet(pictures).save(path, "PNG")
                 )
+            if step.select_loss is not None:  # after the views, which a run that goes on from the last step lacks
+                save_checkpoint(state, problem, out)
             largest = max(step.gradient, largest or 0.0)
             on_step(step, total)
     _doubt(float((state.best - start(problem).design).abs().max()), largest)
@@ -216,50 +236,10 @@ def _log_line(step: Step) -> dict[str, Any]:
     return line
 
 
-def _save(state: State, problem: Problem, path: Path) -> None:
-    from safetensors.torch import save_file
-
-    tensors = {"design": state.design, "best": state.best}
-    tensors |= {f"mean{level}": one for level, one in enumerate(state.mean)}
-    tensors |= {f"square{level}": one for level, one in enumerate(state.square)}
-    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
-    # the loss as text keeps every bit; the sheet id tells whose checkpoint this is
-    note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
-    # one key: safetensors writes several in an order of its own
-    save_file(tensors, path, metadata={"state": json.dumps(note)})
-
-
-def _resumed(out: Path, problem: Problem) -> State:
-    """The checkpoint's state, or the start where there is none; refused where it belongs to another scene or seed."""
-    path = out / _CHECKPOINT
-    if not path.is_file():
-        return start(problem)
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt", device=str(problem.device)) as file:
-            note = json.loads((file.metadata() or {})["state"])
-            design, best = file.get_tensor("design"), file.get_tensor("best")
-            levels = range(len(start(problem).mean))
-            mean, square = (tuple(file.get_tensor(f"{name}{n}") for n in levels) for name in ("mean", "square"))
-        state = State(note["number"], design, mean, square, best, float.fromhex(note["best_loss"]))
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise Refused(
-            "a checkpoint", f"{path} that cannot be read ({error})", "start anew in another folder"
-        ) from error
-    if note.get("sheet_id") != problem.scene.sheet_id:
-        raise Refused(
-            "the checkpoint of this scene and seed",
-            f"one of another in {out}",
-            "resume with the same scene file and seed, or start anew in another folder",
-        )
-    return state
-
-
 def _cut_log(path: Path, number: int) -> None:
     """Drop log lines after the step that the run goes on from."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[:number] if path.is_file() else []
-    write_whole(path, lambda part: part.write_text("".join(lines), encoding="utf-8"))
+    lines = path.read_bytes().splitlines(keepends=True)[:number] if is_file(path) else []
+    write_whole(path, b"".join(lines))
 
 
 def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict[str, Any]:

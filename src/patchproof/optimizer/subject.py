@@ -17,6 +17,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from patchproof.channel.printer import Printer
+from patchproof.input import opened_picture
 from patchproof.output import write_whole
 from patchproof.render.pixels import Shown
 
@@ -95,6 +96,6 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def read_png(path: Path) -> np.ndarray:
-    """uint8 H×W×3 of a picture file."""
-    with Image.open(path) as image:
+    """uint8 H×W×3 of a picture file that a run wrote."""
+    with opened_picture(path, "a picture of this run", "optimize again") as image:
         return np.asarray(image.convert("RGB"))

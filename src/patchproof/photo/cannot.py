@@ -7,6 +7,7 @@ from __future__ import annotations
 
 CODES = (
     "unreadable",
+    "too_costly",
     "too_few_markers",
     "blurred",
     "clipped",

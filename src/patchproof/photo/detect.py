@@ -19,7 +19,9 @@ import cv2
 import numpy as np
 
 from patchproof.color import LIGHT_OF_CODE, LUMINANCE
+from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.edges import Borders, fit_borders
+from patchproof.photo.limits import squares_in
 from patchproof.photo.rectify import part_around, reduced
 
 DICTIONARY = "DICT_5X5_1000"
@@ -27,6 +29,9 @@ LIGHT = LIGHT_OF_CODE.astype(np.float32)
 COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # of what one level looks at: a second of work and 0.3 GB; sharper pictures are halved
+# Each takes up to 3 ms to be looked into, which nothing interrupts; photographs have some hundreds at most, and a
+# million pixels have no room for many more.
+MOST_SQUARES, _FEW_PX = 3000, 1_000_000
 MIRROR_PX = 3000  # longer side of the picture in which a mirrored sheet is looked for
 DARK = 70  # median code value below which local contrast helps; in light photos it hurts sharp markers
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least that has been read
@@ -185,6 +190,9 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
 
 def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int, np.ndarray]]:
     """Ids and corners of one gray picture, part of one whose longer side has `whole_px` pixels."""
+    if picture.size > _FEW_PX and (squares := squares_in(picture)) > MOST_SQUARES:
+        advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
+        raise CannotJudge("too_costly", squares, MOST_SQUARES, advice)
     settings = detector_settings()
     settings.minDistanceToBorder = 0
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

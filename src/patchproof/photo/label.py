@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.limits import squares_in
 from patchproof.photo.rectify import rectify, reduced
 from patchproof.sheets.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
+_MOST_SQUARES = 1000  # of 900 finder patterns, three squares each, one detector makes codes for 10 s; pages have 300
 _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template
 
 
@@ -45,8 +47,10 @@ def parsed(text: str) -> Label | None:
 
 
 def read_label(srgb: np.ndarray) -> Label | None:
-    """The code that a picture shows."""
+    """The code that a picture shows; none is looked for where all is full of squares."""
     gray = cv2.cvtColor(reduced(srgb, _LARGEST_PX), cv2.COLOR_RGB2GRAY)
+    if squares_in(gray) > _MOST_SQUARES:
+        return None
     # of 7 oblique pages of either size they read 6 and 1 (A4), 5 and 7 (labels): neither is enough
     for detector in (cv2.QRCodeDetectorAruco(), cv2.QRCodeDetector()):
         try:

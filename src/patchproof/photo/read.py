@@ -2,29 +2,41 @@
 
 In: any still picture that Pillow reads as one of `FORMATS` (HEIC with the `heic` extra). Out: `Photo`. EXIF
 orientation is applied, an embedded color profile (phones write Display P3) is converted to sRGB, alpha lies on
-white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, so that one bad file
-never stops a batch. Ignored on purpose: the DPI that a photograph claims, and sidecar files.
+white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, and what takes more
+than `limits` allow "too_costly", so that one bad file never stops a batch. Pixels are converted in strips, since whole
+copies took twice the memory. Ignored on purpose: the DPI that a photograph claims, and sidecar files.
 """
 
 from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from patchproof.input import LARGEST_PX, is_file, is_folder, readable_formats
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.exif import EXIF_SPREAD, focal_of
+from patchproof.photo.limits import MOST_BYTES, limited, limited_memory
 from patchproof.strict import Refused
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
-# an allow-list, because Pillow also opens formats that start other programs (EPS) or hold no photograph
-FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
-LARGEST_PX = 120_000_000  # 360 MB as pixels; the largest phone sensors in common use give 50 to 108 million
 _ORIENTATION = 0x0112
+# how the pixels of each orientation become upright ones (EXIF 2.32)
+_UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.transpose(1, 0, 2),
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: a[::-1, ::-1].transpose(1, 0, 2),
+    8: lambda a: np.rot90(a),
+}
+_STRIP_PX = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -40,38 +52,47 @@ class Photo:
 
 
 def read_photo(path: str | Path) -> Photo:
-    """The photograph at `path`; `CannotJudge("unreadable")` where there is none that can be read whole."""
-    from PIL import Image, ImageOps
-
+    """The photograph at `path`; `CannotJudge` "unreadable" where there is none that can be read whole, "too_costly"
+    where that would take too much.
+    """
     path = Path(path)
     _allow_heic(path)
     try:
-        with warnings.catch_warnings():
-            # oversized pictures get our own limit below; odd EXIF is not worth a word
-            warnings.simplefilter("ignore")
-            with Image.open(path, formats=readable_formats()) as image:
-                pixels = image.width * image.height
-                if pixels > LARGEST_PX:
-                    advice = f"{pixels / 1e6:.0f} megapixels are too many: save it smaller"
-                    raise _unreadable(advice, pixels, LARGEST_PX)
-                focal = focal_of(image)
-                # turning and converting copy the picture, which for most is not needed and takes as long as decoding
-                turned = image.getexif().get(_ORIENTATION, 1) != 1
-                upright = ImageOps.exif_transpose(image) if turned else image
-                srgb = np.ascontiguousarray(_eight_bit_rgb(_in_srgb(upright)))
+        with limited_memory():
+            srgb, orientation, focal = limited(_stored, path)
+            # of the picture as Pillow had it nothing is left by now
+            return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal)
     except CannotJudge:
         raise
     except Exception as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...), all alike here
+        if isinstance(error, MemoryError) or type(error).__name__ == "DecompressionBombError":
+            raise _too_large("the picture takes too much memory: save it smaller") from error
         raise _unreadable(_why(path, error)) from error
-    return Photo(srgb, *focal)
+
+
+def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, bool]]:
+    """(uint8 sRGB H×W×3 as stored, EXIF orientation, what EXIF says of the focal length)."""
+    from PIL import Image
+
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise _too_large(f"a file of {size / 1e9:.1f} GB is too large: save it smaller", size, MOST_BYTES)
+    with warnings.catch_warnings():
+        # oversized pictures get our own limit below; odd EXIF is not worth a word
+        warnings.simplefilter("ignore")
+        with Image.open(path, formats=readable_formats()) as image:
+            pixels = image.width * image.height
+            if pixels > LARGEST_PX:
+                raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX)
+            focal, orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
+            return _pixels(image), orientation if isinstance(orientation, int) else 1, focal
 
 
 def list_photos(folder: str | Path) -> list[Path]:
     """The pictures of a folder by suffix, in the order of their names; refused where there are none."""
     folder = Path(folder)
-    if folder.is_file():
+    if is_file(folder):
         return [folder]
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise Refused("a folder of photographs", f"no folder at {folder}", "check the path")
     paths = pictures_in(folder)
     if not paths:
@@ -82,16 +103,13 @@ def list_photos(folder: str | Path) -> list[Path]:
 
 def pictures_in(folder: Path) -> list[Path]:
     """The files of a folder that are pictures by their suffix, none hidden, in the order of their names."""
-    files = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    files = (p for p in folder.iterdir() if is_file(p) and not p.name.startswith("."))
     return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
 
 
-def readable_formats() -> list[str]:
-    """Those of `FORMATS` that this Pillow reads."""
-    from PIL import Image
-
-    Image.init()
-    return [name for name in FORMATS if name in Image.OPEN]
+def printable(name: str) -> str:
+    """A file's name as text that can be written; what of its bytes is none is spelled out."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def _allow_heic(path: Path) -> None:
@@ -105,49 +123,68 @@ def _allow_heic(path: Path) -> None:
     pillow_heif.register_heif_opener()
 
 
-def _in_srgb(image):
-    """The picture converted from its embedded profile; as it is where there is none or the profile is broken."""
+def _pixels(image) -> np.ndarray:
+    """uint8 sRGB H×W×3 of an open picture."""
+    image.load()
+    if image.mode.startswith("I") or image.mode == "F":
+        return _of_deep_gray(image)
+    into_srgb = _into_srgb(image)
+    pixels = np.empty((image.height, image.width, 3), np.uint8)
+    rows = max(1, _STRIP_PX // image.width)
+    for top in range(0, image.height, rows):
+        strip = image.crop((0, top, image.width, min(top + rows, image.height)))
+        pixels[top : top + rows] = np.asarray(_opaque_rgb(strip if into_srgb is None else into_srgb(strip)))
+    return pixels
+
+
+def _into_srgb(image) -> Callable | None:
+    """What converts the picture's parts from its embedded profile; None where there is none or it is broken."""
     from PIL import ImageCms
 
     profile = image.info.get("icc_profile")
     if not profile or image.mode not in {"RGB", "CMYK"}:
-        return image
+        return None
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         if "srgb" in ImageCms.getProfileDescription(source).lower():
-            return image
-        return ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
+            return None
+        change = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), image.mode, "RGB")
     except (ImageCms.PyCMSError, OSError, ValueError):
-        return image
+        return None
+    return lambda part: ImageCms.applyTransform(part, change)
 
 
-def _eight_bit_rgb(image) -> np.ndarray:
-    if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image)
-        if values.dtype.kind == "f":  # floating point TIFF counts from 0 to 1
-            values = np.nan_to_num(values.astype(np.float32), posinf=1.0)
-            top = max(1.0, float(values.max(initial=0)))
-        else:  # 16-bit gray arrives as I;16 or I
-            values, top = np.clip(values, 0, 65535).astype(np.uint16), 65535
-        gray = cv2.convertScaleAbs(np.maximum(values, 0), alpha=255 / top)
-        return np.repeat(gray[..., None], 3, axis=2)
+def _of_deep_gray(image) -> np.ndarray:
+    values = np.asarray(image)
+    if values.dtype.kind == "f":  # floating point TIFF counts from 0 to 1
+        values = np.nan_to_num(values.astype(np.float32), posinf=1.0)
+        top = max(1.0, float(values.max(initial=0)))
+    else:  # 16-bit gray arrives as I;16 or I
+        values, top = np.clip(values, 0, 65535).astype(np.uint16), 65535
+    gray = cv2.convertScaleAbs(np.maximum(values, 0), alpha=255 / top)
+    return np.repeat(gray[..., None], 3, axis=2)
+
+
+def _opaque_rgb(image):
     if "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "La", "RGBa"}:
         from PIL import Image
 
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+    return image if image.mode == "RGB" else image.convert("RGB")
 
 
 def _why(path: Path, error: Exception) -> str:
     if isinstance(error, FileNotFoundError):
         return "the file is gone: copy it again"
-    if isinstance(error, MemoryError) or type(error).__name__ == "DecompressionBombError":
-        return "the picture is too large: save it smaller"
     if type(error).__name__ == "UnidentifiedImageError":
         return f"{path.name} is not a picture of a known kind: save it as JPEG or PNG"
     return f"{path.name} is damaged or cut short: copy it again from the camera"
 
 
-def _unreadable(advice: str, figure: float | None = None, threshold: float | None = None) -> CannotJudge:
-    return CannotJudge("unreadable", figure, threshold, advice)
+def _unreadable(advice: str) -> CannotJudge:
+    return CannotJudge("unreadable", None, None, advice)
+
+
+def _too_large(advice: str, figure: float | None = None, threshold: float | None = None) -> CannotJudge:
+    return CannotJudge("too_costly", figure, threshold, advice)

@@ -7,6 +7,7 @@ reports, so that two reports can be laid side by side.
 from __future__ import annotations
 
 import base64
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from patchproof.output import image_bytes, make_folder
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
 _JPEG_QUALITY = 82
+_LONGEST_STEM = 220  # bytes; systems take 255, and kind and suffix come after it
 _PNG = b"\x89PNG"
 
 
@@ -51,8 +53,11 @@ def saved_pictures(folder: Path, file: str) -> dict[str, bytes]:
 
 
 def stem_of(file: str) -> str:
-    """How the pictures of a photograph begin, which may lie in a folder of its session."""
-    return file.replace("/", "%2F")
+    """How the pictures of a photograph begin, which may lie in a folder of its session; no longer than names may be."""
+    stem = file.replace("/", "%2F")
+    if len(stem.encode()) <= _LONGEST_STEM:
+        return stem
+    return f"{stem[:40]}-{hashlib.sha256(stem.encode()).hexdigest()[:16]}"
 
 
 def _paths(folder: Path, file: str) -> list[Path]:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.color import codes_of
+from patchproof.input import is_file, is_folder, opened_picture
 from patchproof.scene.rooms import place
 from patchproof.settings import BackgroundSettings
 from patchproof.strict import Refused, expand
@@ -101,9 +102,9 @@ def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     if settings.images is None:
         return _in_parts([])
     folder = Path(expand(settings.images, base))
-    if folder.is_file():
+    if is_file(folder):
         return Backgrounds((_read(folder),))
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES) if is_folder(folder) else []
     if not files:
         raise Refused(
             "a folder of pictures (background.images)", f"none in {folder}", "put photographs there or give a color"
@@ -131,13 +132,10 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
 
 
 def _read(file: Path) -> np.ndarray:
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
 
-    try:
-        with Image.open(file) as image:
-            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise Refused("a background picture", f"{file} that cannot be read", "remove or replace it") from error
+    with opened_picture(file, "a background picture", "remove or replace it") as image:
+        return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
 
 
 def _crop(

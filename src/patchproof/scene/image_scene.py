@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from typing_extensions import Self
 
+from patchproof.input import is_file
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
@@ -127,7 +128,7 @@ def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> 
 
 def labels_of(folder: Path, table: Path) -> list[str]:
     """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
-    found = list(dict.fromkeys(label for name, label in label_rows(table) if (folder / name).is_file()))
+    found = list(dict.fromkeys(label for name, label in label_rows(table) if is_file(folder / name)))
     if not found:
         raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
     return found
@@ -178,7 +179,7 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
             f"{len(rows)} images with other labels ({seen} ...)",
             "name the target as the file does: by the same name or index",
         )
-    missing = [name for name in names if not (folder / name).is_file()]
+    missing = [name for name in names if not is_file(folder / name)]
     if missing:
         raise Refused(
             f"the images that {table.name} names in {folder}",
@@ -190,12 +191,12 @@ def _files_of_class(settings: SceneSettings, base: Path) -> list[Path]:
 
 def label_rows(table: Path) -> list[tuple[str, str]]:
     """(file name, label in small letters) of each line; commas after the first belong to the label."""
-    if not table.is_file():
+    if not is_file(table):
         raise Refused("a CSV of file names and labels (object.labels)", f"no file at {table}", "check the path")
     try:
         with table.open(encoding="utf-8-sig", newline="") as lines:
             rows = [row for row in csv.reader(lines, skipinitialspace=True) if any(row)]
-    except (csv.Error, UnicodeDecodeError) as error:
+    except (OSError, csv.Error, ValueError) as error:
         raise Refused("a CSV of file names and labels", f"{table} that cannot be read ({error})", "mend it") from error
     short = next((row for row in rows if len(row) < 2), None)
     if short is not None:

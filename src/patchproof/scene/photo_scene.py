@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from typing_extensions import Self
 
+from patchproof.input import is_file, is_folder
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import DICTIONARY, find_markers
@@ -177,7 +178,9 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+    return (
+        sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and is_file(p)) if is_folder(folder) else []
+    )
 
 
 def _digest(folder: Path) -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
+from patchproof.input import is_file, opened_picture
 from patchproof.mesh.mesh import Material, Mesh
 from patchproof.mesh.texels import coverage, face_counts
 from patchproof.mesh.unwrap import has_place, unwrap
@@ -95,15 +96,17 @@ def named_faces(mesh: Mesh, materials: tuple[str, ...], faces: str | None, base:
             raise Refused("the name of a material", f'"{name}"', nearest(name, dict.fromkeys(names)))
     chosen = np.isin(mesh.face_material, [i for i, name in enumerate(names) if name in materials])
     if faces is not None:
-        chosen[_read_faces(Path(expand(faces, base)), len(chosen))] = True
+        chosen |= _read_faces(Path(expand(faces, base)), len(chosen))
     return chosen
 
 
 def _read_faces(path: Path, count: int) -> np.ndarray:
-    """The face numbers of a text file: one number, or a range a-b with both ends, per line; # starts a comment."""
-    if not path.is_file():
+    """Which of `count` faces a text file names: one number, or a range a-b with both ends, per line; # starts a
+    comment.
+    """
+    if not is_file(path):
         raise Refused("a file of face numbers", f"no file at {path}", "check the path")
-    ranges = [np.zeros(0, np.int64)]
+    chosen = np.zeros(count, bool)
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.partition("#")[0].split("-")
         if not "".join(words).strip() and len(words) == 1:
@@ -115,24 +118,19 @@ def _read_faces(path: Path, count: int) -> np.ndarray:
         if len(ends) not in (1, 2) or not 0 <= ends[0] <= ends[-1] < count:
             got = f'"{line.strip()[:40]}" in line {number} of {path.name}'
             raise Refused(f"a face number or a range a-b from 0 to {count - 1}", got, "mend that line")
-        ranges.append(np.arange(ends[0], ends[-1] + 1))
-    if len(ranges) == 1:
+        chosen[ends[0] : ends[-1] + 1] = True
+    if not chosen.any():
         raise Refused("face numbers, one per line", f"none in {path.name}", "name some, or leave the file out")
-    return np.concatenate(ranges)
+    return chosen
 
 
 def _read_mask(path: Path) -> np.ndarray:
     """The gray values of a mask as float H×W in 0..255."""
-    from PIL import Image
-
-    if not path.is_file():
+    if not is_file(path):
         raise Refused("a mask image", f"no file at {path}", "check the path")
-    try:
-        with Image.open(path) as image:
-            deep = image.mode.startswith("I")  # 16 bits: Pillow would clip them at 255 instead of scaling them
-            gray = np.asarray(image, float) / 257 if deep else np.asarray(image.convert("L"), float)
-    except Exception as error:  # Pillow's readers raise whatever they stumble over
-        raise Refused("a mask image", f"{path.name} that cannot be read", "save it as PNG") from error
+    with opened_picture(path, "a mask image", "save it as PNG") as image:
+        deep = image.mode.startswith("I")  # 16 bits: Pillow would clip them at 255 instead of scaling them
+        gray = np.asarray(image, float) / 257 if deep else np.asarray(image.convert("L"), float)
     if gray.max() < 128:
         raise Refused("a mask with white where the texture may change", f"none in {path.name}", "paint it white there")
     return gray

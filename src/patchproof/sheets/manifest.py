@@ -9,27 +9,32 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import io
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from patchproof.goal import Goal
+from patchproof.input import opened_picture, read_json
 from patchproof.output import image_bytes
 from patchproof.sessions import Spread, in_sessions, spread_of
-from patchproof.strict import Finite, Gray, Positive, Refused, Share, Strict, validated
+from patchproof.strict import Finite, Gray, NotNegativeRange, Refused, Share, Strict, validated
 
-Point = tuple[Finite, Finite]
-Rect = tuple[Finite, Finite, Positive, Positive]
+Mm = Annotated[Finite, Field(ge=-1e5, le=1e5)]
+SizeMm = Annotated[Finite, Field(ge=0.1, le=1e5)]
+Point = tuple[Mm, Mm]
+Rect = tuple[Mm, Mm, SizeMm, SizeMm]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
 WHOLE_PIECE = 2  # the design fills the piece; before (1) it lay in a frame of markers and swatches
 Worth = Literal["better", "no better", "worse"]
 PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
-Page = Annotated[int, Field(ge=1)]
+_LEAST_MARKER_MM = 1.0
+Page = Annotated[int, Field(ge=1, le=1000)]
+Side = Annotated[int, Field(ge=1, le=2048)]  # designs have up to 512 pixels
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class Design(Strict):
@@ -37,34 +42,43 @@ class Design(Strict):
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     rect_mm: Rect
-    size_px: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    size_px: tuple[Side, Side]
     page: Page
     png: str
 
     def pixels(self) -> np.ndarray:
         """The design as uint8 H×W×3 sRGB; refused where it is not the one that the hash names."""
-        from PIL import Image
-
+        expected, do = "the design's pixels in the manifest", "make the sheet again"
         try:
-            image = Image.open(io.BytesIO(base64.b64decode(self.png, validate=True)), formats=["PNG"])
+            png = base64.b64decode(self.png, validate=True)
+        except ValueError as error:
+            raise Refused(expected, "none that can be read", do) from error
+        with opened_picture(png, expected, do) as image:
             if image.size != self.size_px:
-                raise ValueError("size")
+                raise ValueError(f"{image.width} × {image.height} pixels")
             pixels = np.asarray(image.convert("RGB"))
-        except Exception as error:
-            expected = "the design's pixels in the manifest"
-            raise Refused(expected, "none that can be read", "make the sheet again") from error
         if design_sha256(pixels) != self.sha256:
-            raise Refused("the design that the manifest names", "other pixels", "make the sheet again")
+            raise Refused("the design that the manifest names", "other pixels", do)
         return pixels
 
 
 class Marker(Strict):
     """One ArUco marker: outer corners of its black square, clockwise from the top-left of the code."""
 
-    dictionary: str
+    dictionary: Annotated[str, Field(pattern="^DICT_(4X4|5X5|6X6|7X7)_(50|100|250|1000)$")]
     id: Annotated[int, Field(ge=0)]
     corners_mm: tuple[Point, Point, Point, Point]
     page: Page
+
+    @model_validator(mode="after")
+    def _possible(self) -> Marker:
+        if self.id >= int(self.dictionary.rpartition("_")[2]):
+            raise ValueError(f"marker {self.id} is not one of {self.dictionary}")
+        for i in range(4):  # twice the area of each corner's triangle, y down
+            (ax, ay), (bx, by), (cx, cy) = (self.corners_mm[(i + j) % 4] for j in range(3))
+            if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < _LEAST_MARKER_MM**2:
+                raise ValueError(f"marker {self.id} must run clockwise round more than {_LEAST_MARKER_MM:g} mm")
+        return self
 
 
 class Swatch(Strict):
@@ -81,15 +95,22 @@ class Tile(Strict):
     """
 
     page: Page
-    page_from_design_mm: tuple[tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite]]
+    page_from_design_mm: tuple[tuple[Mm, Mm, Mm], tuple[Mm, Mm, Mm]]
     cut_mm: Rect  # on the page: what shows of it when the piece is assembled
+
+    @model_validator(mode="after")
+    def _invertible(self) -> Tile:
+        (a, b, _), (c, d, _) = self.page_from_design_mm
+        if not 0.5 < a * d - b * c < 2:  # both are millimeters
+            raise ValueError("must have page_from_design_mm that turns and shifts")
+        return self
 
 
 class Target(Strict):
     """What should be recognized; `indices` are the labels that count, the target's first."""
 
     label: str
-    indices: tuple[Annotated[int, Field(ge=0)], ...]
+    indices: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     goal: Goal
 
 
@@ -116,11 +137,11 @@ class ControlClaim(Strict):
 class ConditionClaim(Strict):
     """What a photograph can show of one promised condition, and whether it was recognized."""
 
-    px_per_mm: Finite | None
-    tilt_deg: Finite | None
-    azimuth_deg: Finite | None
-    contrast: Finite | None
-    blur_px: Finite | None
+    px_per_mm: Annotated[Finite, Field(ge=0, le=1e4)] | None
+    tilt_deg: Annotated[Finite, Field(ge=0, le=180)] | None
+    azimuth_deg: Annotated[Finite, Field(ge=-360, le=360)] | None
+    contrast: Annotated[Finite, Field(ge=-4, le=4)] | None
+    blur_px: Annotated[Finite, Field(ge=0, le=1000)] | None
     recognized: bool
 
 
@@ -133,8 +154,8 @@ class Promise(Strict):
     models: Annotated[tuple[ModelClaim, ...], Field(min_length=1)]
     rate: Share
     interval: Interval
-    n: Annotated[int, Field(ge=1)]
-    per_session: Annotated[int, Field(ge=1)] = 1
+    n: Count
+    per_session: Count = 1
     controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
 
@@ -174,23 +195,60 @@ class Promise(Strict):
         )
 
 
+class _Loose(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class _PrinterUsed(_Loose):
+    profile: str = "coated"
+
+
+class _CameraUsed(_Loose):
+    noise: NotNegativeRange = (0.0, 0.0)
+    photo_px: tuple[Count, Count] | None = None
+
+
+class _TargetUsed(_Loose):
+    label: str | int = ""
+    accept: tuple[str | int, ...] = ()
+
+
+class _SheetUsed(_Loose):
+    template: str = ""
+
+
+class _Used(_Loose):
+    """What is read of a manifest's settings when its sheet is judged; of them versions may differ in all else."""
+
+    printer: _PrinterUsed | None = None
+    camera: _CameraUsed = _CameraUsed()
+    target: _TargetUsed = _TargetUsed()
+    sheet: _SheetUsed = _SheetUsed()
+
+
 class Manifest(Strict):
     """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
 
     version: Annotated[int, Field(ge=1, le=WHOLE_PIECE)] = 1
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
     kind: Annotated[str, Gray]  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
-    page_mm: tuple[Positive, Positive]
+    page_mm: tuple[SizeMm, SizeMm]
     design: Design | None
     markers: Annotated[tuple[Marker, ...], Field(min_length=1)]
     chart: tuple[Swatch, ...]
     cut_mm: Rect
-    ruler_mm: tuple[Positive, Positive]
+    ruler_mm: tuple[SizeMm, SizeMm]
     page_code: Annotated[str, Field(pattern=PAGE_CODE)] | None = None  # of a page that several designs share
     plan_page: Page | None = None  # the page for people: where the piece goes, and how to photograph it
     tiles: tuple[Tile, ...] = ()
     promise: Promise | None
     settings: dict[str, Any]
+
+    @field_validator("settings")
+    @classmethod
+    def _usable(cls, settings: dict[str, Any]) -> dict[str, Any]:
+        _Used.model_validate(settings)
+        return settings
 
     @model_validator(mode="before")
     @classmethod
@@ -216,11 +274,6 @@ def dump_manifest(manifest: Manifest) -> str:
 
 def load_manifest(path: str | Path) -> Manifest:
     """A SHEET.json; refused in one sentence where it is missing, broken, or not one."""
-    path = Path(path)
-    if not path.is_file():
-        raise Refused("a manifest (SHEET.json)", f"no file at {path}", "name the JSON that was written beside the PDF")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError, OSError) as error:
-        raise Refused("a manifest (SHEET.json)", f"{path} that is not JSON", "make the sheet again") from error
+    beside = "name the JSON that was written beside the PDF"
+    data = read_json(path, "a manifest (SHEET.json)", "make the sheet again", beside)
     return validated(Manifest, data, str(path))

@@ -281,6 +281,8 @@ def _cover(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None
     x0, y0, x1, y1 = box
     columns = np.arange(max(math.floor(x0), 0), min(math.ceil(x1), coverage.shape[1]))
     rows = np.arange(max(math.floor(y0), 0), min(math.ceil(y1), coverage.shape[0]))
+    if not len(columns) or not len(rows):  # all of it outside
+        return
     in_x = np.clip(np.minimum(columns + 1, x1) - np.maximum(columns, x0), 0, 1)
     in_y = np.clip(np.minimum(rows + 1, y1) - np.maximum(rows, y0), 0, 1)
     coverage[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += in_y[:, None] * in_x

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from patchproof.geometry import MM_PER_INCH
+from patchproof.input import LARGEST_JSON, is_file
 from patchproof.sheets.manifest import Manifest, Tile
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
 from patchproof.strict import Refused, validated
@@ -38,6 +40,7 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
     The number of pixels is the nearest whole one, so each axis' resolution differs from `dpi` by at most half a pixel.
     """
     width, height = (max(round(side / MM_PER_INCH * dpi), 1) for side in manifest.cut_mm[2:])
+    _refuse_size((width, height))
     if not manifest.tiles:
         page = manifest.design.page if manifest.design else 1
         return _part_pixels(pdf_path, page, manifest.cut_mm, (width, height))
@@ -75,10 +78,10 @@ def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Mani
     try:
         with pikepdf.open(pdf_path) as pdf:
             names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered(ATTACHMENT, i) for i in range(99))})
-            texts = [json.loads(pdf.attachments[name].get_file().read_bytes()) for name in names]
+            texts = [json.loads(_unpacked(pdf.attachments[name].get_file().obj)) for name in names]
     except pikepdf.PdfError as error:
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
-    except (KeyError, ValueError, RecursionError) as error:
+    except Exception as error:  # objects of other kinds than they should be fail in many ways
         raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again") from error
     if not texts:
         raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again")
@@ -86,8 +89,18 @@ def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Mani
     return next((manifest for manifest in manifests if manifest.sheet_id == sheet_id), manifests[0])
 
 
+def _unpacked(stream) -> bytes:
+    """An attachment's bytes, as far as a manifest may be long: pikepdf's own reading has no bound."""
+    packing = stream.get("/Filter")
+    if packing is None:
+        return stream.read_raw_bytes()
+    if str(packing) != "/FlateDecode":
+        raise ValueError(f"packed by {packing}")
+    return zlib.decompressobj().decompress(stream.read_raw_bytes(), LARGEST_JSON)
+
+
 def _existing(pdf_path: str | Path) -> None:
-    if not Path(pdf_path).is_file():
+    if not is_file(pdf_path):
         raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
 
 
@@ -97,13 +110,12 @@ def _opened_page(pdf_path: str | Path, page: int) -> Iterator[Any]:
 
     _existing(pdf_path)
     try:
-        pdf = pypdfium2.PdfDocument(str(pdf_path))
+        with pypdfium2.PdfDocument(str(pdf_path)) as pdf:
+            if not 1 <= page <= len(pdf):
+                raise Refused(f"a page from 1 to {len(pdf)} of {pdf_path}", f"{page}", "ask for another page")
+            yield pdf[page - 1]
     except pypdfium2.PdfiumError as error:
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
-    with pdf:
-        if not 1 <= page <= len(pdf):
-            raise Refused(f"a page from 1 to {len(pdf)} of {pdf_path}", f"{page}", "ask for another page")
-        yield pdf[page - 1]
 
 
 def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
@@ -111,8 +123,7 @@ def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> n
     import pypdfium2
     import pypdfium2.raw as pdfium
 
-    if max(size_px) > LARGEST_PX:
-        raise Refused(f"at most {LARGEST_PX} pixels along a side", f"{max(size_px)}", "lower the resolution")
+    _refuse_size(size_px)
     left, _, _, top = page.get_mediabox()
     x, y, w, h = rect_points
     box = (left + x, top - y - h, left + x + w, top - y)
@@ -122,3 +133,9 @@ def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> n
     bitmap.fill_rect((255, 255, 255, 255), 0, 0, *size_px)
     pdfium.FPDF_RenderPageBitmap(bitmap, page, 0, 0, *size_px, 0, pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER)
     return bitmap.to_numpy().copy()
+
+
+def _refuse_size(size_px: tuple[int, int]) -> None:
+    if not 1 <= min(size_px) <= max(size_px) <= LARGEST_PX:
+        got = f"{size_px[0]} × {size_px[1]}"
+        raise Refused(f"at most {LARGEST_PX} pixels along a side, and one at least", got, "lower the resolution")

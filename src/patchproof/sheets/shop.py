@@ -27,7 +27,7 @@ def shop_lines(pdf_path: str | Path) -> list[str]:
     try:
         with pikepdf.open(pdf_path) as pdf:
             lines = [*_pages(pdf), _scaling(pdf), *_fonts(pdf), *_images(pdf), _vector_color(pdf)]
-    except (pikepdf.PdfError, OSError) as error:
+    except Exception as error:  # objects of other kinds than they should be fail in many ways
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
     return [
         *lines,

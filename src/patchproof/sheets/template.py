@@ -14,10 +14,22 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from patchproof.sheets.manifest import Point, Rect
-from patchproof.strict import NotNegative, Positive, Refused, Share, Strict, nearest, read_toml, shipped, validated
+from patchproof.strict import (
+    Finite,
+    NotNegative,
+    Positive,
+    Refused,
+    Share,
+    Strict,
+    nearest,
+    read_toml,
+    shipped,
+    validated,
+)
 
-Count = Annotated[int, Field(ge=1)]
+Point = tuple[Finite, Finite]
+Rect = tuple[Finite, Finite, Positive, Positive]
+PaperMm = Annotated[Positive, Field(le=2000)]  # a side of the largest paper, A0 and more
 
 
 class PieceZone(Strict):
@@ -30,8 +42,8 @@ class ChartGrid(Strict):
     """The color chart's grid; 48 swatches are the fewest that a printer model can be fitted to."""
 
     corner_mm: Point  # its top-left corner
-    columns: Annotated[int, Field(ge=4)]  # swatches side by side
-    rows: Annotated[int, Field(ge=2)]  # swatches one above the other
+    columns: Annotated[int, Field(ge=4, le=40)]  # swatches side by side
+    rows: Annotated[int, Field(ge=2, le=40)]  # swatches one above the other
     swatch_mm: Annotated[Positive, Field(ge=4)]  # side; below 4 a phone's photograph of a whole page has too few pixels
     gap_mm: NotNegative  # between swatches
 
@@ -39,7 +51,7 @@ class ChartGrid(Strict):
 class Rulers(Strict):
     """A ruler to the right and one downwards, from their zero ticks."""
 
-    length_mm: Positive  # of both
+    length_mm: PaperMm  # of both
     x_start_mm: Point  # zero tick of the ruler to the right
     y_start_mm: Point  # zero tick of the ruler downwards
 
@@ -87,7 +99,7 @@ class TextLine(Strict):
 class Template(Strict):
     """A whole template file."""
 
-    page_mm: tuple[Positive, Positive]  # width, height of the paper
+    page_mm: tuple[PaperMm, PaperMm]  # width, height of the paper
     margin_mm: NotNegative  # nothing is printed nearer to the edge; home printers need 3 to 6
     piece: PieceZone | None = None  # none on a page that is a chart alone
     chart: ChartGrid  # at least 48 swatches
@@ -113,7 +125,7 @@ class BoardGrid(Strict):
 class BoardTemplate(Strict):
     """A whole template file of a board page."""
 
-    page_mm: tuple[Positive, Positive]  # width, height of the paper
+    page_mm: tuple[PaperMm, PaperMm]  # width, height of the paper
     margin_mm: NotNegative  # nothing is printed nearer to the edge
     board: BoardGrid
     ruler: Rulers

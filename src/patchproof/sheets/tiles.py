@@ -151,6 +151,9 @@ def _seams(piece: Piece, axis: int, most_mm: float) -> list[float]:
     length = round(piece.size_mm[axis], 6)
     blocked = [(rect[axis], rect[axis] + rect[axis + 2]) for rect in piece.reserved_mm]
     fewest = max(math.ceil(length / most_mm - 1e-9), 1)
+    if fewest > MOST_TILES:
+        got = f"{size_text(piece.size_mm)} mm on tiles of {most_mm:g} mm"
+        raise Refused(f"a piece of at most {MOST_TILES} tiles", got, _larger_tiles())
     for count in range(fewest, fewest + 3):
         seams = [0.0, *(_free(length * i / count, blocked) for i in range(1, count)), length]
         if all(0 < b - a <= most_mm + 1e-6 for a, b in pairwise(seams)):

@@ -24,6 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from patchproof.input import read_json
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.report.results import Results, write_json, write_results
 from patchproof.report.tables import Drawing, Table
@@ -277,7 +278,4 @@ def _through_json(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise Refused("a study's JSON", f"{path} that cannot be read ({error})", "remove it") from error
+    return read_json(path, "a study's JSON", "remove it")

@@ -20,7 +20,7 @@ from patchproof.claims import mean, rate, wilson
 from patchproof.evidence.forecast import forecast_of
 from patchproof.report.tables import Drawing, Table
 from patchproof.sessions import in_sessions, spread_of
-from patchproof.study.grid import grouped, of_values
+from patchproof.study.grid import grouped, networks_at, of_values
 from patchproof.study.record import bits, hits_of
 from patchproof.study.study import Cell, Result, Study
 from patchproof.validation.promises import PromisesSettings, cells, printed_run, take_photos
@@ -40,6 +40,7 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
         folder = Path(temporary)
         made = printed_run(base, cell, folder)
         photos, controls = take_photos(settings, cell, made, folder), None
+        networks = networks_at(base, cell.values)
         if settings.control is not None:
             controls = take_photos(settings, cell, made, folder, settings.control)
         sessions = []
@@ -47,7 +48,7 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
             if own.is_dir():
                 beside = None if controls is None else controls / own.name
                 out = folder / "reports" / own.name
-                report = verify_photos(own, folder / "sheet.json", out, controls=beside, run=made)
+                report = verify_photos(own, folder / "sheet.json", out, models=networks, controls=beside, run=made)
                 sessions.append(_session(report, settings.control))
     promise = made.promise
     promised = bits([condition.recognized for condition in promise.conditions])

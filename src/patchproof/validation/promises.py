@@ -81,8 +81,8 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         made = printed_run(base, cell, folder)
-        photos = take_photos(settings, cell, made, folder)
-        report = verify_photos(photos, folder / "sheet.json", folder / "report")
+        photos, networks = take_photos(settings, cell, made, folder), networks_at(base, cell.values)
+        report = verify_photos(photos, folder / "sheet.json", folder / "report", models=networks)
     promise, summary = made.promise, report.summary
     return {
         "promised": bits([condition.recognized for condition in promise.conditions]),

@@ -1,0 +1,80 @@
+"""The checkpoint: all that the next step depends on, replaced whole.
+
+In: a `State` and its problem. Out: `checkpoint.safetensors` in the run's folder, and the state read back. Tensors are
+compared with those of the problem's own start before memory is taken for them.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+
+from patchproof.input import is_file
+from patchproof.optimizer.loop import State, start
+from patchproof.optimizer.problem import Problem
+from patchproof.output import write_whole
+from patchproof.strict import Refused, Strict
+
+CHECKPOINT = "checkpoint.safetensors"
+
+
+def save_checkpoint(state: State, problem: Problem, out: Path) -> None:
+    """Replace the checkpoint of the run in `out`."""
+    from safetensors.torch import save_file
+
+    tensors = {"design": state.design, "best": state.best}
+    tensors |= {f"mean{level}": one for level, one in enumerate(state.mean)}
+    tensors |= {f"square{level}": one for level, one in enumerate(state.square)}
+    tensors = {name: tensor.cpu().contiguous().clone() for name, tensor in tensors.items()}
+    # the loss as text keeps every bit; the sheet id tells whose checkpoint this is
+    note = {"number": state.number, "best_loss": state.best_loss.hex(), "sheet_id": problem.scene.sheet_id}
+    # one key: safetensors writes several in an order of its own
+    metadata = {"state": json.dumps(note)}
+    write_whole(out / CHECKPOINT, lambda path: save_file(tensors, path, metadata=metadata))
+
+
+def resumed(out: Path, problem: Problem) -> State:
+    """The checkpoint's state, or the start where there is none; refused where it belongs to another scene or seed."""
+    path, begin = out / CHECKPOINT, start(problem)
+    if not is_file(path):
+        return begin
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt", device=str(problem.device)) as file:
+            note = _Note.model_validate_json((file.metadata() or {})["state"])
+            if note.sheet_id != problem.scene.sheet_id:
+                raise Refused(
+                    "the checkpoint of this scene and seed",
+                    f"one of another in {out}",
+                    "resume with the same scene file and seed, or start anew in another folder",
+                )
+            design, best = _tensor(file, "design", begin.design), _tensor(file, "best", begin.design)
+            mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(begin.mean))
+            square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(begin.square))
+        return State(note.number, design, mean, square, best, float.fromhex(note.best_loss))
+    except Refused:
+        raise
+    except (SafetensorError, OSError, LookupError, ValueError, ArithmeticError) as error:
+        got = f"{path} that cannot be read ({str(error)[:100]})"
+        raise Refused("a checkpoint", got, "start anew in another folder") from error
+
+
+class _Note(Strict):
+    number: Annotated[int, Field(ge=0)]
+    best_loss: str
+    sheet_id: str
+
+
+def _tensor(file: Any, name: str, like: torch.Tensor) -> torch.Tensor:
+    """The tensor of that name, if it is as large as another, and all numbers."""
+    if file.get_slice(name).get_shape() != list(like.shape):
+        raise ValueError(f"{name} of another size")
+    tensor = file.get_tensor(name)
+    if tensor.dtype != like.dtype or not bool(torch.isfinite(tensor).all()):
+        raise ValueError(f"{name} with other values")
+    return tensor

@@ -1,0 +1,208 @@
+"""Kills at any moment: what is there under its final name is whole, and a rerun gives the bytes of an unbroken run.
+
+`python tests/test_kill_anywhere.py --kills N [--seed S] [--job NAME]` kills N times. A process of its own imports once,
+starts no thread, and forks for every run; a fork dies at its n-th change to the file system, or after a share of its
+processor time. `optimize` and `verify` are resumed, `sheet` and `reprint` done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
+JOBS = ("optimize", "verify", "sheet", "reprint")
+IN_THE_SUITE = len(JOBS)
+LATE = """
+    kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
+    pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz test_optimize test_verify_run fake_networks
+    patchproof.journey.verify patchproof.optimizer.run patchproof.printing.sheet patchproof.reprints.reprint
+    patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+def test_killed_runs_leave_nothing_half_done_and_end_in_the_same_bytes():
+    command = [sys.executable, __file__, "--kills", str(IN_THE_SUITE)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("killed") >= IN_THE_SUITE / 2 and "Traceback" not in done.stderr, done.stdout
+
+
+def optimize(base: Path, out: Path, again: bool) -> None:
+    from patchproof.optimizer import loop, run
+
+    run.PROMISE_VIEWS, loop.SELECT_VIEWS, loop.SELECT_AFTER = 4, 4, 8
+    run.optimize_scene(base / "scene.toml", out, controls=("bare",), resume=again)
+
+
+def verify(base: Path, out: Path, again: bool) -> None:
+    from fuzz import network
+    from patchproof.journey.verify import verify_photos
+
+    verify_photos(base / "photos", base / "sheet.json", out, models=[network()], resume=again)
+
+
+def sheet(base: Path, out: Path, again: bool) -> None:
+    from patchproof.optimizer.run import load_run
+    from patchproof.printing.sheet import sheet_of
+
+    out.mkdir(exist_ok=True)
+    sheet_of(load_run(base / "run"), out / "sheet.pdf", control="gray")  # without its plan of photographs
+
+
+def reprint(base: Path, out: Path, again: bool) -> None:
+    from patchproof.optimizer.run import load_run
+    from patchproof.reprints.reprint import reprint
+
+    reprint(base / "sheet.pdf", load_run(base / "run"), 3, out)
+
+
+DO = dict(zip(JOBS, (optimize, verify, sheet, reprint), strict=True))
+
+
+def prepare(base: Path) -> None:
+    """What the jobs work on: a scene, a finished run and its sheet, photographs and theirs."""
+    from fuzz import honest_photo, manifests
+    from test_optimize import toml
+
+    toml(base / "scene.toml", optimize__steps=6, background__color=[0.5, 0.5, 0.5])
+    optimize(base, base / "run", False)
+    sheet(base, base / "page", False)
+    shutil.copy(base / "page" / "sheet.pdf", base)
+    (base / "sheet.json").write_text(json.dumps(manifests()[0]))
+    (base / "photos").mkdir()
+    for name in "abc":
+        (base / "photos" / f"{name}.jpg").write_bytes(honest_photo())
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """What lies in a folder under final names, by path."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def check_whole(job: str, out: Path, unbroken: dict[str, bytes]) -> None:
+    """Whatever a killed run has left under a final name is whole: a page or photograph is one of the unbroken run's."""
+    left = contents(out) if out.is_dir() else {}
+    if job == "sheet":
+        assert all(unbroken[name] == content for name, content in left.items()), sorted(left)
+    if job == "reprint":
+        assert left in ({}, unbroken), sorted(left)
+    for name in ("run.json", "design.png", "views.png", "report.json", "report.csv", "report.html"):
+        assert left.get(name) in (None, unbroken.get(name)), name
+
+
+def forked(work: Callable[[], None], die: Callable[[], None] = lambda: None) -> int:
+    """The wait status of a fork that does the work, and calls `die` before."""
+    child = os.fork()
+    if child == 0:
+        try:
+            die()
+            work()
+        except BaseException:
+            import traceback
+
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    return os.waitpid(child, 0)[1]
+
+
+def on_changes(call: Callable[[], None]) -> None:
+    """Call a function right before every change to the file system, for good."""
+
+    def hook(event: str, arguments: tuple) -> None:
+        if event in CHANGES or (event == "open" and isinstance(arguments[1], str) and arguments[1][0] in "wax"):
+            call()
+
+    sys.addaudithook(hook)
+
+
+def at_change(number: int) -> Callable[[], None]:
+    """Die right before a change to the file system, counted from 1."""
+    left = iter(range(number - 1))
+    return lambda: on_changes(lambda: next(left, None) is None and os.kill(os.getpid(), signal.SIGKILL))
+
+
+def after(seconds: float) -> Callable[[], None]:
+    """Die after so much processor time: nothing of ours runs then."""
+    return lambda: signal.setitimer(signal.ITIMER_PROF, seconds)
+
+
+def changes_of(work: Callable[[], None], count: Path) -> int:
+    """How many changes to the file system the work makes, in a fork; `count` is a file to tell it by."""
+
+    def counting() -> None:
+        changes: list[int] = []
+        on_changes(lambda: changes.append(1))
+        work()
+        count.write_text(str(len(changes)))
+
+    assert forked(counting) == 0
+    return int(count.read_text())
+
+
+def killed(base: Path, job: str, rng: np.random.Generator) -> Iterator[str]:
+    """Kill a job again and again, and finish it; a line for each."""
+    unbroken_out, out = base / f"{job}_whole", base / f"{job}_killed"
+
+    def work(out: Path, again: bool = False) -> Callable[[], None]:
+        return lambda: DO[job](base, out, again)
+
+    begin = os.times()
+    total = changes_of(work(unbroken_out), base / "count")
+    seconds = os.times().children_user - begin.children_user
+    unbroken = contents(unbroken_out)
+    while True:
+        by_change = rng.random() < 0.7
+        moment = int(rng.integers(1, total + 1)) if by_change else float(rng.uniform(0, seconds))
+        status = forked(work(out), at_change(moment) if by_change else after(moment))
+        where = f"at change {moment} of {total}" if by_change else f"after {moment:.2f} s"
+        check_whole(job, out, unbroken)
+        if died := os.WIFSIGNALED(status):
+            assert forked(work(out, True)) == 0, (job, where)
+        assert contents(out) == unbroken, (job, where, sorted(contents(out).keys() ^ unbroken.keys()))
+        shutil.rmtree(out)
+        yield f"{job}: {'killed' if died else 'done'} {where}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--job", choices=JOBS)
+    chosen = parser.parse_args()
+    import cv2
+    import torch
+
+    for module in LATE.split():  # once, and not in every fork
+        importlib.import_module(module)
+    warnings.simplefilter("ignore")  # of the fake network, by every fork
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    rng, jobs = np.random.default_rng(chosen.seed), [chosen.job] if chosen.job else JOBS
+    with tempfile.TemporaryDirectory() as name:
+        base = Path(name)
+        assert forked(lambda: prepare(base)) == 0
+        lines = [killed(base, job, rng) for job in jobs]
+        for i in range(chosen.kills):
+            print(next(lines[i % len(lines)]), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""A photograph that takes too long or too much is given up, and only that: in this process and in others."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import toy_studies as toy
+from fuzz import small_task
+from patchproof.evidence.batch import Item, _measured
+from patchproof.photo import detect, label, limits, read
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.detect import printed_markers
+from patchproof.photo.label import read_label
+from patchproof.photo.limits import limited, limited_memory, squares_in
+from patchproof.photo.read import read_photo
+
+needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
+needs_linux = pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is limited on Linux alone")
+
+
+def squares(side: int) -> np.ndarray:
+    """Dark squares of 12 px, as far apart, in a picture side×side."""
+    y, x = np.mgrid[:side, :side]
+    return np.where((y % 24 < 12) & (x % 24 < 12), 0, 255).astype(np.uint8)
+
+
+@needs_timer
+def test_work_is_interrupted_after_its_time_and_not_before(monkeypatch):
+    monkeypatch.setattr(limits, "SECONDS", 0.2)
+    assert limited(toy.spin, 0.1) == 0.1
+    before = time.process_time()
+    with pytest.raises(CannotJudge) as caught:
+        limited(toy.spin, 5.0)
+    assert time.process_time() - before < 1
+    assert (caught.value.code, caught.value.threshold) == ("too_costly", 0.2) and "0.2 s" in caught.value.advice
+    assert signal.getsignal(signal.SIGPROF) == signal.SIG_DFL and signal.getitimer(signal.ITIMER_PROF) == (0, 0)
+
+
+@needs_timer
+def test_a_library_that_swallows_what_interrupts_it_is_interrupted_again(monkeypatch):
+    monkeypatch.setattr(limits, "SECONDS", 0.1)
+    monkeypatch.setattr(limits, "_AGAIN_S", 0.1)
+
+    def stubborn():
+        for _ in range(2):
+            try:
+                toy.spin(5.0)
+            except BaseException:
+                continue
+        toy.spin(5.0)
+
+    with pytest.raises(CannotJudge, match="too_costly"):
+        limited(stubborn)
+
+
+@needs_timer
+def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
+    monkeypatch.setattr(limits, "SECONDS", 0.2)
+    with pytest.raises(CannotJudge):
+        limited(lambda: [limited(toy.spin, 0.1) for _ in range(20)])
+    results = []
+    thread = threading.Thread(target=lambda: results.append(limited(toy.spin, 0.3)))
+    thread.start()
+    thread.join()
+    assert results == [0.3]
+
+
+@needs_timer
+def test_a_photograph_that_takes_too_long_is_rejected_with_advice(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, "SECONDS", 0.2)
+    monkeypatch.setattr("patchproof.evidence.batch.read_photo", lambda path: toy.spin(5.0))
+    entry = _measured(small_task(), Item(tmp_path / "a.jpg", "a.jpg")).entry
+    assert (entry.status, entry.code, entry.remark.threshold) == ("rejected", "too_costly", 0.2)
+    assert "save it smaller" in entry.remark.advice
+
+
+@needs_linux
+def test_memory_is_limited_while_a_photograph_is_read(tmp_path, monkeypatch):
+    with limited_memory():
+        np.empty(limits.MOST_BYTES // 2, np.uint8)
+        with pytest.raises(MemoryError):
+            np.empty(limits.MOST_BYTES + 2**28, np.uint8)
+    np.empty(limits.MOST_BYTES + 2**28, np.uint8)
+    Image.new("RGB", (40, 40)).save(tmp_path / "a.png")
+    monkeypatch.setattr(read, "_pixels", lambda image: np.empty(limits.MOST_BYTES + 2**28, np.uint8))
+    with pytest.raises(CannotJudge, match="too_costly: the picture takes too much memory: save it smaller"):
+        read_photo(tmp_path / "a.png")
+
+
+def test_a_file_that_is_too_large_is_not_opened(tmp_path, monkeypatch):
+    (tmp_path / "a.png").write_bytes(bytes(2001))
+    monkeypatch.setattr(read, "MOST_BYTES", 2000)
+    with pytest.raises(CannotJudge) as caught:
+        read_photo(tmp_path / "a.png")
+    assert (caught.value.code, caught.value.figure, caught.value.threshold) == ("too_costly", 2001, 2000)
+
+
+def test_squares_are_counted_and_too_many_are_not_looked_into(monkeypatch):
+    """1200 / 24 a side. The detector would take 8 s to look into them, and nothing could interrupt it."""
+    picture, printed = squares(1200), printed_markers(detect.DICTIONARY)
+    count = squares_in(picture)
+    assert 2300 <= count <= 2600
+    monkeypatch.setattr(detect, "MOST_SQUARES", count - 1)
+    before = time.process_time()
+    with pytest.raises(CannotJudge) as caught:
+        list(detect._detect(picture, printed, 1200))
+    assert (caught.value.code, caught.value.figure, caught.value.threshold) == ("too_costly", count, count - 1)
+    assert time.process_time() - before < 2
+    # a few squares are looked into, and so is a picture too small for many
+    monkeypatch.setattr(detect, "MOST_SQUARES", squares_in(squares(72)))
+    assert list(detect._detect(np.pad(squares(72), (0, 1100), constant_values=255), printed, 1200)) == []
+    monkeypatch.setattr(detect, "MOST_SQUARES", 0)
+    assert list(detect._detect(squares(72), printed, 72)) == []
+
+
+def test_no_code_is_looked_for_in_a_picture_full_of_finder_patterns(monkeypatch):
+    """900 finder patterns take one detector 10 s."""
+    y, x = np.mgrid[:600, :600]
+    distance = np.maximum(abs(y % 20 - 7), abs(x % 20 - 7)) // 2
+    picture = np.where((distance == 2) | (distance > 3), 255, 0).astype(np.uint8)
+    assert squares_in(picture) > label._MOST_SQUARES
+    before = time.process_time()
+    assert read_label(np.repeat(picture[..., None], 3, 2)) is None
+    assert time.process_time() - before < 2
