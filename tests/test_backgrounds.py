@@ -62,7 +62,8 @@ def test_without_any_word_places_are_procedural_and_always_the_same():
     for number in (0, 1):
         picture = place(number)
         assert picture.shape == (PLACE_PX, PLACE_PX, 3) and picture.dtype == np.uint8 and picture.std() > 1
-        assert np.array_equal(picture, place(number))
+        assert np.array_equal(picture, place.__wrapped__(number))  # drawn anew, not kept
+        assert place(number) is picture and not picture.flags.writeable  # scenes share it
     assert not np.array_equal(place(0), place(2))
 
 

@@ -25,6 +25,7 @@ def test_photographs_on_their_own_are_the_beta_binomial_of_jeffreys_prior(recogn
     spread = alone(recognized, 400)
     np.testing.assert_allclose(spread.chances([1] * 20), expected.pmf(np.arange(21)), atol=2e-4)
     np.testing.assert_allclose(spread.chances([20]), spread.chances([1] * 20), atol=1e-6)
+    assert spread.chances([20]) is spread.chances((20,)) and not spread.chances([20]).flags.writeable  # once for all
     assert spread.counts([20]) == tuple(expected.ppf([TAIL, 1 - TAIL]))
     assert spread.correlation[0] < 1e-6 and spread.rate[0] <= recognized / 400 <= spread.rate[1]
     np.testing.assert_allclose(spread.rate, wilson(recognized, 400), atol=0.01)

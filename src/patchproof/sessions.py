@@ -54,7 +54,7 @@ class Spread:
 
     def chances(self, photos: Sequence[int]) -> np.ndarray:
         """The chance of every count from 0 to all, recognized of so many photographs in each of some new sessions."""
-        return self.weights @ _chances(self.rates, self.correlations, photos)
+        return _chances_of(self, tuple(photos))
 
     def counts(self, photos: Sequence[int]) -> tuple[int, int]:
         """The 95 % interval of those counts."""
@@ -95,6 +95,14 @@ def _spread_of(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Spread:
     weights = np.exp(log - log.max())
     kept = weights > _NEGLIGIBLE
     return Spread(rate[kept], correlation[kept], weights[kept] / weights[kept].sum())
+
+
+@lru_cache(maxsize=32)
+def _chances_of(spread: Spread, photos: tuple[int, ...]) -> np.ndarray:
+    """`Spread.chances`, once for all counts that are judged by it."""
+    chances = spread.weights @ _chances(spread.rates, spread.correlations, photos)
+    chances.flags.writeable = False
+    return chances
 
 
 def in_sessions(hits: Sequence[bool] | np.ndarray, each: int) -> tuple[list[int], list[int]]:
