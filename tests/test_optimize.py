@@ -360,7 +360,7 @@ def test_every_goal_has_a_loss_that_falls_the_way_it_wants():
         assert goal.sign * (unlikely - likely) > 0
 
 
-def test_a_run_from_when_designs_lay_in_a_frame_is_refused_with_the_piece_s_size(tmp_path):
+def test_a_run_from_when_designs_lay_in_a_frame_is_refused_with_the_piece_s_size(tmp_path, few_views):
     optimize_scene(scene_with(tmp_path, optimize__steps=1), tmp_path / "run")
     details = json.loads((tmp_path / "run" / "run.json").read_text())
     details["placement"]["piece_mm"] = [147.4, 147.4]

@@ -58,7 +58,9 @@ def test_the_page_says_so_in_its_first_line():
     assert kinds == ["design", "design, no better than bare", "design, worse than bare"]
 
 
-def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_path):
+def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_path, monkeypatch):
+    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
     scene = tmp_path / "scene.toml"
     scene.write_text(
         '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 60\nheight_mm = 60\n'
