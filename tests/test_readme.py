@@ -213,6 +213,19 @@ def test_rates_in_new_places_are_the_stored_ones():
     assert f"interval in {sum(within)} of {len(rows)}," in words(NOTEBOOK)
 
 
+def test_figures_of_places_are_the_stored_ones():
+    rates: dict[str, dict[str, float]] = {}
+    for row in rows_of("layouts/places_cells.csv"):
+        rates.setdefault(row["scene"], {})[row["layout"]] = 100 * float(row["design"])
+    assert len(rates) == 4
+    for scene in rates.values():
+        auto, default = scene.pop("auto"), scene.pop("+x")
+        assert f"({default:.1f}, {max(scene.values()):.1f})" in words(NOTEBOOK).replace("default side ", "").replace(
+            "best other ", ""
+        )
+        assert f" {auto:.1f} " in words(NOTEBOOK)
+
+
 def test_figures_of_all_pairs_are_the_stored_ones():
     gains: dict[str, dict[str, list[float]]] = {}
     for row in rows_of("layouts/layouts_cells.csv") + rows_of("layouts/pieces_cells.csv"):
