@@ -27,7 +27,8 @@ MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.85 GB while they are read
 _AGAIN_S = 0.5  # should a library swallow the first interruption
 _SMALLEST_SQUARE_PX = 36  # perimeter of the least marker that is read
 
-Arguments, Result = ParamSpec("Arguments"), TypeVar("Result")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 class _Expired(BaseException):
