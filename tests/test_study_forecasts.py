@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from patchproof.reprints import retake
 from patchproof.study.study import Cell, Result
 from patchproof.validation import forecasts
 from test_study_promises import small_study
@@ -44,8 +45,10 @@ def test_nothing_to_forecast_is_no_figure():
 
 
 def test_a_cell_goes_from_the_scene_to_forecasts_and_effects(tmp_path, monkeypatch):
+    monkeypatch.setattr(retake, "DRAWS", 2)
     (one,) = small_study("forecasts", tmp_path, monkeypatch).results
     assert len(one.answers["sessions"]) == 2
     for session in one.answers["sessions"]:
-        assert len(session["forecast"]) == 5 and all(0 < chance < 1 for chance, _ in session["forecast"])
+        # a photograph or two may be too small to be taken again
+        assert 3 <= len(session["forecast"]) <= 5 and all(0 < chance < 1 for chance, _ in session["forecast"])
         assert -1 <= session["photographed"] <= 1 and 0 <= session["agree"] <= 1

@@ -1,5 +1,4 @@
-"""Whether single photographs were forecast well, and whether effects estimated from them are those of photographed
-controls.
+"""Whether photographs were forecast well, and effects estimated from them are those of photographed controls.
 
 In: as `promises`, and a control. Out: for every session of photographs by a renderer that is not ours, each
 photograph's chance as `verify --run` states it beside what it showed, and the effect as estimated from the photographs
