@@ -18,7 +18,7 @@ from patchproof.photo import detect, label, limits, read
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import printed_markers
 from patchproof.photo.label import read_label
-from patchproof.photo.limits import limited, limited_memory, squares_in
+from patchproof.photo.limits import finder_lines_in, limited, limited_memory, squares_in
 from patchproof.photo.read import read_photo
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
@@ -120,7 +120,20 @@ def test_squares_are_counted_and_too_many_are_not_looked_into(monkeypatch):
     assert list(detect._detect(squares(72), printed, 72)) == []
 
 
-def test_no_code_is_looked_for_in_a_picture_full_of_finder_patterns(monkeypatch):
+def test_no_code_is_looked_for_in_a_picture_full_of_lines_like_a_finders():
+    """Rows of 1:1:3:1:1 alone: of 2000 px a side, the other detector takes more than 40 s."""
+    row = np.repeat([0, 255, 0, 255, 0, 255], np.array([1, 1, 3, 1, 1, 6]) * 2).astype(np.uint8)
+    picture = np.tile(row, (1000, 1000 // len(row)))
+    assert finder_lines_in(picture) == pytest.approx(picture.size / len(row), rel=0.2) and squares_in(picture) == 0
+    assert finder_lines_in(np.ascontiguousarray(picture.T)) < 1000
+    picture = np.tile(picture, (2, 2))
+    assert finder_lines_in(picture) > label._MOST_LINES
+    before = time.process_time()
+    assert read_label(np.repeat(picture[..., None], 3, 2)) is None
+    assert time.process_time() - before < 2
+
+
+def test_no_code_is_looked_for_in_a_picture_full_of_finder_patterns():
     """900 finder patterns take one detector 10 s."""
     y, x = np.mgrid[:600, :600]
     distance = np.maximum(abs(y % 20 - 7), abs(x % 20 - 7)) // 2

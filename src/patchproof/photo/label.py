@@ -14,12 +14,13 @@ import cv2
 import numpy as np
 
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.limits import squares_in
+from patchproof.photo.limits import finder_lines_in, squares_in
 from patchproof.photo.rectify import rectify, reduced
 from patchproof.sheets.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
 _MOST_SQUARES = 1000  # of 900 finder patterns, three squares each, one detector makes codes for 10 s; pages have 300
+_MOST_LINES = 100_000  # the other takes 1.6 s for so many, and 5.7 s for twice as many; photographs have some thousands
 _PAGE_PX_PER_MM = 8.0  # of the page seen from above: 6.6 px for a module of the A4 template
 
 
@@ -47,14 +48,17 @@ def parsed(text: str) -> Label | None:
 
 
 def read_label(srgb: np.ndarray) -> Label | None:
-    """The code that a picture shows; none is looked for where all is full of squares."""
+    """The code that a picture shows; a detector that it would keep busy for long is not asked."""
     gray = cv2.cvtColor(reduced(srgb, _LARGEST_PX), cv2.COLOR_RGB2GRAY)
-    if squares_in(gray) > _MOST_SQUARES:
-        return None
     # of 7 oblique pages of either size they read 6 and 1 (A4), 5 and 7 (labels): neither is enough
-    for detector in (cv2.QRCodeDetectorAruco(), cv2.QRCodeDetector()):
+    for detector, count, most in (
+        (cv2.QRCodeDetectorAruco, squares_in, _MOST_SQUARES),
+        (cv2.QRCodeDetector, finder_lines_in, _MOST_LINES),
+    ):
+        if count(gray) > most:
+            continue
         try:
-            label = parsed(detector.detectAndDecode(gray)[0])
+            label = parsed(detector().detectAndDecode(gray)[0])
         except cv2.error:  # some quadrangles that are no code make its decoder stumble
             continue
         if label is not None:

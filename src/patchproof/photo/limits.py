@@ -1,10 +1,10 @@
 """What a photograph may cost: ten seconds of processor time, and a gigabyte of memory to be read.
 
 In: work on a photograph. Out: its result, or `CannotJudge("too_costly")`. A timer interrupts the work between two steps
-of Python, so that a long call into a library is seen through first; those that a picture could make endless are bounded
-where they are called (`squares_in`). There are such timers on Linux and macOS, in a process's main thread: not on
-Windows, and not in the threads of a cluster's workers. Memory is limited where the kernel says how much there is of it:
-on Linux. Inside another limit, or a profiler's timer, that one counts.
+of Python, so that a long call into a library is seen through first; those that a picture could make endless are not
+made where `squares_in` or `finder_lines_in` count too many. There are such timers on Linux and macOS, in a process's
+main thread: not on Windows, and not in the threads of a cluster's workers. Memory is limited where the kernel says how
+much there is of it: on Linux. Inside another limit, or a profiler's timer, that one counts.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from patchproof.photo.cannot import CannotJudge
 SECONDS = 10.0  # of processor time: a photograph of 119 megapixels takes 7.6, one of 12 less than 1
 MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.85 GB while they are read
 _AGAIN_S = 0.5  # should a library swallow the first interruption
+_SPARSE = 4  # rows of which one is looked at
 _SMALLEST_SQUARE_PX = 36  # perimeter of the least marker that is read
 
 Arguments = ParamSpec("Arguments")
@@ -87,6 +88,17 @@ def squares_in(gray: np.ndarray) -> int:
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     polygons = (cv2.approxPolyDP(o, 0.03 * len(o), True) for o in outlines if len(o) >= _SMALLEST_SQUARE_PX)
     return sum(len(polygon) == 4 for polygon in polygons)
+
+
+def finder_lines_in(gray: np.ndarray) -> int:
+    """About how many stretches of rows look like the middle of a QR code's finder pattern (runs of 1:1:3:1:1)."""
+    light = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, 83, 2)[::_SPARSE]
+    runs = np.diff(np.flatnonzero(np.diff(light.reshape(-1)))).astype(np.float32)
+    if len(runs) < 5:
+        return 0
+    five = np.lib.stride_tricks.sliding_window_view(runs, 5)
+    away = np.abs(five / five.sum(1, keepdims=True) - np.float32([1 / 7, 1 / 7, 3 / 7, 1 / 7, 1 / 7])).sum(1)
+    return _SPARSE * int((away < 0.2).sum())  # as OpenCV's detector has it
 
 
 def _has_timer() -> bool:
