@@ -213,6 +213,15 @@ def test_rates_in_new_places_are_the_stored_ones():
     assert f"interval in {sum(within)} of {len(rows)}," in words(NOTEBOOK)
 
 
+def test_figures_of_peers_are_the_stored_ones():
+    for row in rows_of("layouts/peers_cells.csv"):
+        rates = " | ".join(f"{100 * float(row[key]):.1f}" for key in ("bare", "gray", "ours", "sign", "flat", "art"))
+        assert f"| {rates} |" in words(NOTEBOOK)
+    for row in rows_of("layouts/peers_pooled.csv")[1:]:
+        value, low, high = (f"{100 * float(row[f'ours minus it{end}']):.1f}" for end in ("", "_low", "_high"))
+        assert re.search(rf"{value}( points)?( more)? \[{low}, {high}\]", words(NOTEBOOK)), row["method"]
+
+
 def test_figures_of_places_are_the_stored_ones():
     rates: dict[str, dict[str, float]] = {}
     for row in rows_of("layouts/places_cells.csv"):
