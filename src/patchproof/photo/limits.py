@@ -97,7 +97,7 @@ def finder_lines_in(gray: np.ndarray) -> int:
     if len(runs) < 5:
         return 0
     five = np.lib.stride_tricks.sliding_window_view(runs, 5)
-    away = np.abs(five / five.sum(1, keepdims=True) - np.float32([1 / 7, 1 / 7, 3 / 7, 1 / 7, 1 / 7])).sum(1)
+    away = np.abs(five / five.sum(1, keepdims=True) - np.array([1, 1, 3, 1, 1], np.float32) / 7).sum(1)
     return _SPARSE * int((away < 0.2).sum())  # as OpenCV's detector has it
 
 
