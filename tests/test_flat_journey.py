@@ -101,10 +101,8 @@ def few_views():
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
     text = shipped("print_templates", "blank_a4.toml").read_text(encoding="utf-8")
-    for old, new in (
-        ("piece_mm = [162.0, 162.0]", f"piece_mm = [{PIECE_MM}, {PIECE_MM}]"),
-        ("= 19.0", f"= {MARKER_MM}"),
-    ):
+    smaller = {"piece_mm = [162.0, 162.0]": f"piece_mm = [{PIECE_MM}, {PIECE_MM}]", "= 19.0": f"= {MARKER_MM}"}
+    for old, new in smaller.items():
         assert old in text
         text = text.replace(old, new)
     (folder / "small_blank.toml").write_text(text, encoding="utf-8")
@@ -166,13 +164,10 @@ def design_pixels(homography, scene, size_px) -> np.ndarray:
     import cv2
 
     mask = np.zeros(size_px[::-1], np.uint8)
-    for rect, value in [
-        (grown((0, 0, *scene.piece.size_mm), -3), 1),
-        *((grown(r, 3), 0) for r in scene.piece.reserved_mm),
-    ]:
-        cv2.fillConvexPoly(
-            mask, np.round(apply_homography(homography, rect_corners(rect)) - 0.5).astype(np.int32), value
-        )
+    rects = [(grown((0, 0, *scene.piece.size_mm), -3), 1), *((grown(r, 3), 0) for r in scene.piece.reserved_mm)]
+    for rect, value in rects:
+        corners = apply_homography(homography, rect_corners(rect)) - 0.5
+        cv2.fillConvexPoly(mask, np.round(corners).astype(np.int32), value)
     return mask.astype(bool)
 
 
@@ -241,7 +236,11 @@ def test_fresh_photographs_of_the_print_are_judged(photos, tmp_path):
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert [photo["code"] for photo in report["photos"]] == [None] * PHOTOS
     assert report["summary"]["measured"] == report["summary"]["judged"] == PHOTOS
-    assert report["summary"]["effect"] in ("shown", "not_shown")
+    (control,) = report["controls"]
+    assert control["pairs"] == control["n"] == PHOTOS
+    assert control["difference"] == pytest.approx(report["summary"]["rate"] - control["recognized"] / PHOTOS)
+    # six pairs show an effect only where all of them differ: p = 2 / 2^6
+    assert report["summary"]["effect"] == ("shown" if control["difference"] == 1 else "not_shown")
 
 
 @pytest.mark.parametrize("kind", ["photos", "images"])

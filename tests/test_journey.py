@@ -5,6 +5,7 @@ types.
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -85,13 +86,20 @@ def test_design_corners_are_where_the_truth_says(journey, report):
 
 
 @pytest.fixture(scope="module")
-def again(journey, tmp_path_factory):
-    """The report of the same photographs with the run at hand, beside a gray control's under the same conditions."""
-    folder = tmp_path_factory.mktemp("again")
-    pdf, run, sheet = journey / "sheet.pdf", journey / "run", journey / "sheet.json"
-    gray = folder / "gray"
-    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--control", "gray", "--out", gray) == 0
-    with_run = ("--run", run, "--controls", gray, "--out", folder / "report")
+def controls(journey, tmp_path_factory):
+    """A folder of photographs of the bare object and of a gray control, under the conditions of the design's."""
+    folder = tmp_path_factory.mktemp("controls")
+    for control in ("bare", "gray"):
+        arguments = ("--run", journey / "run", "--n", PHOTOS, "--control", control, "--out", folder / control)
+        assert command("reprint", journey / "sheet.pdf", *arguments) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def again(journey, controls, tmp_path_factory):
+    """The report of the same photographs with the run at hand, beside the gray control's."""
+    folder, sheet = tmp_path_factory.mktemp("again"), journey / "sheet.json"
+    with_run = ("--run", journey / "run", "--controls", controls / "gray", "--out", folder / "report")
     assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
     return json.loads((folder / "report" / "report.json").read_text())
 
@@ -210,20 +218,26 @@ def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_
     (photo,) = scanned["photos"]
     assert photo["scale_x"] == pytest.approx(0.97, abs=0.003) and photo["scale_y"] == pytest.approx(0.97, abs=0.003)
     assert photo["code"] == "scale_off" and scanned["summary"]["rate"] is None
+    (tmp_path / "photo").mkdir()
+    shutil.copy(journey / "photos" / "photo_0001.jpg", tmp_path / "photo")
     arguments = ("--sheet", sheet, "--out", tmp_path / "ruler", "--ruler-mm", "97.1x97.3")
-    assert command("verify", journey / "photos", *arguments) == 0
-    typed = json.loads((tmp_path / "ruler" / "report.json").read_text())["photos"][0]
+    assert command("verify", tmp_path / "photo", *arguments) == 0
+    (typed,) = json.loads((tmp_path / "ruler" / "report.json").read_text())["photos"]
     assert (typed["scale_x"], typed["scale_y"]) == pytest.approx((0.971, 0.973))
 
 
-def test_control_photographs_test_the_effect(journey, tmp_path, report):
-    for control in ("bare", "gray"):
-        arguments = ("--run", journey / "run", "--n", PHOTOS, "--out", tmp_path / "controls" / control)
-        assert command("reprint", journey / "sheet.pdf", *arguments, "--control", control) == 0
-    arguments = ("--sheet", journey / "sheet.json", "--out", tmp_path / "report", "--controls", tmp_path / "controls")
+def test_control_photographs_test_the_effect(journey, controls, tmp_path, report):
+    """A carton is recognized with or without the patch: an effect is tested, and none is shown."""
+    arguments = ("--sheet", journey / "sheet.json", "--out", tmp_path / "report", "--controls", controls)
     assert command("verify", journey / "photos", *arguments) == 0
-    tested = json.loads((tmp_path / "report" / "report.json").read_text())["summary"]
-    assert report["summary"]["effect"] == "not_tested" and tested["effect"] in ("shown", "not_shown")
+    tested = json.loads((tmp_path / "report" / "report.json").read_text())
+    bare, gray = tested["controls"]
+    assert (bare["name"], gray["name"]) == ("bare", "gray")
+    for control in (bare, gray):
+        assert control["pairs"] == control["n"] == PHOTOS
+        assert control["difference"] == pytest.approx(tested["summary"]["rate"] - control["recognized"] / PHOTOS)
+    assert bare["recognized"] >= PHOTOS - 1 and bare["shown"] is False
+    assert report["summary"]["effect"] == "not_tested" and tested["summary"]["effect"] == "not_shown"
 
 
 def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
@@ -297,8 +311,6 @@ def test_a_folder_in_which_nothing_can_be_judged_exits_with_1_and_still_reports(
 
 
 def test_require_kept_makes_any_other_verdict_exit_with_1(journey, tmp_path):
-    import shutil
-
     few = tmp_path / "few"
     few.mkdir()
     for name in ("photo_0001.jpg", "photo_0002.jpg"):
