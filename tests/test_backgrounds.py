@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from patchproof.scene.backgrounds import ENOUGH, FEW, ROOMS, load_backgrounds
+from patchproof.scene.backgrounds import ENOUGH, FEW, RARE, ROOMS, load_backgrounds
 from patchproof.scene.rooms import PLACE_PX, place
 from patchproof.scene.scene import make_scene
+from patchproof.sessions import in_sessions, spread_of
 from patchproof.settings import BackgroundSettings
 
 STREAMS = ("train", "select", "promise", "evaluate")
@@ -23,29 +24,46 @@ def folder_of(tmp_path, count):
 
 
 def shown(backgrounds, stream):
-    """The numbers of files, and of procedural places, that a stream may show."""
-    chosen = backgrounds.chosen(stream, (np.arange(4000) + 0.5) / 4000)
-    pictures = [backgrounds.pictures[int(each * len(backgrounds.pictures))] for each in np.unique(chosen)]
-    files = {int(p[0, 0, 0]) for p in pictures if not isinstance(p, int)}
-    return files, {p for p in pictures if isinstance(p, int)}
+    """The numbers of files, and of procedural places, that a stream may show, and the share of views with files."""
+    chosen = backgrounds.chosen(stream, (np.arange(40_000) + 0.5) / 40_000)
+    pictures = [backgrounds.pictures[int(each * len(backgrounds.pictures))] for each in chosen]
+    real = [int(p[0, 0, 0]) for p in pictures if not isinstance(p, int)]
+    return set(real), {p for p in pictures if isinstance(p, int)}, len(real) / len(pictures)
 
 
 @pytest.mark.parametrize("count", [1, 4, FEW, 200])
 def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
     backgrounds = folder_of(tmp_path, count)
     parts = {stream: shown(backgrounds, stream) for stream in STREAMS}
-    files = [file for own, _ in parts.values() for file in own]
-    made = [number for _, own in parts.values() for number in own]
+    files = [file for own, _, _ in parts.values() for file in own]
+    made = [number for _, own, _ in parts.values() for number in own]
     assert sorted(files) == list(range(count)) and len(set(made)) == len(made)
-    assert all(len(own) >= ENOUGH or len(rooms) == ROOMS[stream] for stream, (own, rooms) in parts.items())
+    for stream, (own, rooms, _) in parts.items():
+        enough = ENOUGH if stream in ("train", "select") else RARE
+        assert rooms <= set(ROOMS[stream]) and bool(rooms) == (len(own) < enough) and len(own) + len(rooms) >= ENOUGH
     assert shown(backgrounds, "reprint") == parts["evaluate"]
     assert bool(backgrounds.notes) == (count < FEW)
-    if count == FEW:  # three of them, and each as often as four procedural ones
-        chosen = backgrounds.chosen("promise", (np.arange(4000) + 0.5) / 4000) * len(backgrounds.pictures)
-        real = [not isinstance(backgrounds.pictures[int(each)], int) for each in chosen]
-        assert np.mean(real) == pytest.approx(12 / (12 + ROOMS["promise"]), abs=0.01)
+    if count == FEW:  # three of them: in training as often as four procedural ones each, else one view in fifty each
+        assert parts["promise"][2] == pytest.approx(3 / RARE, abs=1e-3)
+        assert parts["train"][2] == pytest.approx(16 / (16 + len(ROOMS["train"])), abs=1e-3)
     if count == 200:
-        assert len(parts["promise"][0]) == 60 and {stream for stream in STREAMS if parts[stream][1]} == {"select"}
+        assert len(parts["promise"][0]) == 60
+        assert {stream for stream in STREAMS if parts[stream][1]} == {"select", "evaluate"}
+
+
+def test_a_promise_knows_another_place_for_every_session_and_says_which_share_one(tmp_path):
+    for count, least in ((0, 98), (10, 93)):
+        (tmp_path / str(count)).mkdir()
+        backgrounds = folder_of(tmp_path / str(count), count) if count else load_backgrounds(BackgroundSettings(), None)
+        chosen = backgrounds.chosen("promise", np.random.default_rng(0).random(100))
+        assert len(np.unique(chosen)) >= least
+    hits = [True] * 4 + [False] * 4 + [True, True, False, False] * 2
+    assert in_sessions(hits, 4, (0, 1, 1, 3)) == ([4, 2, 2], [4, 8, 4])
+    assert in_sessions(hits, 4) == ([4, 0, 2, 2], [4, 4, 4, 4])
+    # sessions of one place say less of the rate than as many of places of their own
+    hits = [True] * 4 + [False] * 4
+    together, apart = (spread_of(*in_sessions(hits * 20, 4, places)).rate for places in ((0, 1) * 20, ()))
+    assert np.ptp(together) > 2 * np.ptp(apart)
 
 
 def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):
@@ -62,8 +80,7 @@ def test_without_any_word_places_are_procedural_and_always_the_same():
     for number in (0, 1):
         picture = place(number)
         assert picture.shape == (PLACE_PX, PLACE_PX, 3) and picture.dtype == np.uint8 and picture.std() > 1
-        assert np.array_equal(picture, place.__wrapped__(number))  # drawn anew, not kept
-        assert place(number) is picture and not picture.flags.writeable  # scenes share it
+        assert np.array_equal(picture, place(number))
     assert not np.array_equal(place(0), place(2))
 
 

@@ -14,7 +14,7 @@ SETTINGS = forecasts.ForecastsSettings(scenes=("a",), networks=("builtin",))
 
 def result(scene, *sessions, hits=320, n=400):
     values = {"name": scene, "network": "builtin", "seed": 0}
-    answers = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "sessions": list(sessions)}
+    answers = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "places": [], "sessions": list(sessions)}
     return Result(Cell(f"{scene}{len(sessions)}", values), answers, Path())
 
 

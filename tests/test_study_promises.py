@@ -22,7 +22,8 @@ def result(scene, *sessions, hits=320, n=400):
         "scene": {"printer": {"profile": "coated"}},
         "seed": 0,
     }
-    found = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "sessions": sessions, "verdict": "kept"}
+    found = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "places": []}
+    found |= {"sessions": sessions, "verdict": "kept", "elsewhere": "1" * 79 + "0" * 21}
     return Result(Cell(f"{scene}{sessions}", values), found, Path())
 
 
@@ -43,9 +44,12 @@ def test_shares_and_biases_by_hand():
     assert len(each.rows) == 6
     many = promises.tables(settings, [result("a", *((20 + i % 20, 40) for i in range(40)))])[0]
     assert many.rows[0][3] == pytest.approx(19 / 40, abs=0.01)
+    settings = settings.model_copy(update={"elsewhere": 100})
+    _, elsewhere, _ = promises.tables(settings, [result("a", (20, 40)), result("a", (20, 40), hits=280)])
+    assert [(row[6].value, row[7]) for row in elsewhere.rows] == [(0.79, True), (0.79, False)]
 
 
-def small_study(study, tmp_path, monkeypatch):
+def small_study(study, tmp_path, monkeypatch, more=""):
     """A finished study of that name: one cell, two sessions of five photographs by our own renderer."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
@@ -58,16 +62,17 @@ def small_study(study, tmp_path, monkeypatch):
     ]
     (tmp_path / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
     names = 'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\n'
-    (tmp_path / "study.toml").write_text(names + "sessions = 2\nphotos = 5\npath_traced = false\n")
+    (tmp_path / "study.toml").write_text(names + "sessions = 2\nphotos = 5\npath_traced = false\n" + more)
     finished = run_study(study, tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
     return finished
 
 
 def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
-    finished = small_study("promises", tmp_path, monkeypatch)
+    finished = small_study("promises", tmp_path, monkeypatch, "elsewhere = 6\n")
     (one,) = finished.results
     assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == PER_SESSION
+    assert len(one.answers["elsewhere"]) == 6
     judged = [judged for _, judged in one.answers["sessions"]]
     assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])
     assert (tmp_path / "out" / "promises_calibration.png").is_file()

@@ -9,8 +9,7 @@ A session's own rate is Beta-distributed about the rate of all, so that its coun
 31 (1975) 949-952, with the intraclass correlation ρ = 1 / (α + β + 1)). Both are uncertain: predictions are means over
 a grid of the posterior, with Jeffreys' prior of the rate and a flat one of √ρ. Sessions of one photograph each say
 nothing of ρ, which then is 0, as if every photograph were taken on its own.
-Left out on purpose: sessions that resemble each other (the same place twice); a rate that depends on the pose, which
-all sessions share.
+Left out on purpose: a rate that depends on the pose, which all sessions share.
 """
 
 from __future__ import annotations
@@ -105,10 +104,17 @@ def _chances_of(spread: Spread, photos: tuple[int, ...]) -> np.ndarray:
     return chances
 
 
-def in_sessions(hits: Sequence[bool] | np.ndarray, each: int) -> tuple[list[int], list[int]]:
-    """(recognized, photographs) of sessions of `each` photographs in a row; the last may have fewer."""
+def in_sessions(
+    hits: Sequence[bool] | np.ndarray, each: int, places: Sequence[int] = ()
+) -> tuple[list[int], list[int]]:
+    """(recognized, photographs) of sessions of `each` photographs in a row; the last may have fewer. Sessions whose
+    `places`, if given, are the same count as one, since the place is most of what sessions differ by.
+    """
     parts = _parts(hits, each)
-    return [sum(map(bool, part)) for part in parts], [len(part) for part in parts]
+    together: dict[int, list[bool]] = {}
+    for place, part in zip(places or range(len(parts)), parts, strict=True):
+        together.setdefault(place, []).extend(map(bool, part))
+    return list(map(sum, together.values())), list(map(len, together.values()))
 
 
 def _parts(values: Sequence[bool] | np.ndarray, each: int) -> list[Sequence[bool] | np.ndarray]:

@@ -50,7 +50,8 @@ def make_promise(
         rest = responses(problem, {"design": shown["design"]}, conditions[~beside], on_views=on_views)["design"]
         order = np.argsort(np.concatenate([np.flatnonzero(beside), np.flatnonzero(~beside)]), kind="stable")
         answers = joined([{"design": compared["design"]}, {"design": rest}])["design"].at(order)
-    models = model_claims(problem, answers, per_session)
+    places = _places(conditions, per_session)
+    models = model_claims(problem, answers, per_session, places)
     target = problem.scene.settings.target
     return Promise(
         target=Target(label=str(target.label), indices=problem.indices[0], goal=target.goal),
@@ -59,9 +60,17 @@ def make_promise(
         interval=models[0].interval,
         n=len(conditions),
         per_session=per_session,
+        places=places,
         controls=control_claims(compared, 0, min(CONTROL_VIEWS, per_session)),
         conditions=_condition_claims(problem, conditions, answers.recognized[0]),
     )
+
+
+def _places(conditions: Conditions, per_session: int) -> tuple[int, ...]:
+    """A number for each session's place, as they come; none where all are others, or the one place is known."""
+    chosen = conditions.pose.background[::per_session, 0]
+    places, first, which = np.unique(chosen, return_index=True, return_inverse=True)
+    return tuple(map(int, first[which])) if 1 < len(places) < len(chosen) else ()
 
 
 def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence[str]) -> dict[str, Shown]:
@@ -74,15 +83,17 @@ def shown_with_controls(problem: Problem, design: np.ndarray, controls: Sequence
     return shown
 
 
-def model_claims(problem: Problem, design: Answers, per_session: int = 1) -> tuple[ModelClaim, ...]:
-    """Each network's rate and confidence of the design; intervals are over sessions."""
+def model_claims(
+    problem: Problem, design: Answers, per_session: int = 1, places: Sequence[int] = ()
+) -> tuple[ModelClaim, ...]:
+    """Each network's rate and confidence of the design; intervals are over sessions, those of one place together."""
     rows = zip(problem.classifiers, design.recognized, design.confidence, strict=True)
     return tuple(
         ModelClaim(
             name=classifier.name,
             sha256=classifier.sha256,
             rate=float(recognized.mean()),
-            interval=spread_of(*in_sessions(recognized, per_session)).rate,
+            interval=spread_of(*in_sessions(recognized, per_session, places)).rate,
             confidence=float(confidence.mean()),
         )
         for classifier, recognized, confidence in rows

@@ -5,8 +5,9 @@ The photograph and its centered square show the same crop, so that what trains a
 
 Each file of a folder belongs to one part only: to what trains, selects, promises, or is reprinted and evaluated. A rate
 in places that training knows would say little of the place where somebody will take photographs. Parts with few files
-have procedural places (`rooms`) beside them, and a file counts as several of those. A picture that is named itself is
-the known place of all parts.
+have procedural places (`rooms`) beside them: training a few that it learns, a promise another one for every session,
+since only from many places it knows how much places differ. A picture that is named itself is the known place of all
+parts.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -27,30 +28,50 @@ from patchproof.strict import Refused, expand
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits
 FEW = 10  # files of which the scene is told that they are few
-ENOUGH = 24  # files of one part that need no procedural places beside them
-# Those of each part: where a promise knows few places, it does not know how much places differ.
-ROOMS = {"train": 24, "select": 24, "promise": 72, "evaluate": 72}
-OFTEN = 4  # a file is seen as often as so many procedural places
+# The procedural places of each part, by number.
+ROOMS = {
+    "train": range(24),
+    "select": range(1_000, 1_024),
+    "promise": range(10_000, 20_000),
+    "evaluate": range(20_000, 30_000),
+}
+ENOUGH = 24  # files that need no procedural places beside them, of a part that learns or selects
+OFTEN = 4  # where a file is seen as often as so many procedural places
+RARE = 50  # elsewhere a file is seen in one view of so many, lest a rate hang on two or three
 # whose the files are, in the order of a hash of their names, again and again
 _DEALT = ("train", "promise", "evaluate", "select", "train", "promise", "train", "evaluate", "promise", "train")
-_PART = 1000  # procedural places of a part are numbered from its own thousand
+_KEPT = 192  # procedural places at a time, with their halvings 0.3 MB each; drawing one takes 50 ms
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Of the pictures: a part's own files from `first`, `files` of them, then its procedural places; and in which share
+    of its views files are seen.
+    """
+
+    first: int
+    files: int
+    rooms: int
+    share: float
 
 
 @dataclass(frozen=True)
 class Backgrounds:
     """Pictures as uint8 H×W×3 or numbers of procedural places, a single 1×1 picture where the background is plain; by
-    stream the first and the end of those that it may show, all where it is not named.
+    stream the part that it may show, all where it is not named.
     """
 
     pictures: tuple[np.ndarray | int, ...]
-    of_stream: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    of_stream: Mapping[str, _Part] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def chosen(self, stream: str, choice: np.ndarray) -> np.ndarray:
         """Numbers in [0, 1) that choose among all pictures, from numbers that choose among a stream's."""
-        first, end = self.of_stream.get(stream, (0, len(self.pictures)))
-        return (first + np.floor((end - first) * choice) + 0.5) / len(self.pictures)
+        part = self.of_stream.get(stream, _Part(0, len(self.pictures), 0, 1.0))
+        of_files = np.floor(choice / max(part.share, 1e-9) * part.files)
+        of_rooms = part.files + np.floor((choice - part.share) / max(1 - part.share, 1e-9) * part.rooms)
+        return (part.first + np.where(choice < part.share, of_files, of_rooms) + 0.5) / len(self.pictures)
 
     @cached_property
     def _reduced(self) -> dict[int, list[np.ndarray]]:
@@ -58,17 +79,12 @@ class Backgrounds:
         return {}
 
     def _levels(self, number: int) -> list[np.ndarray]:
-        import cv2
-
         picture = self.pictures[number]
-        key = picture if isinstance(picture, int) else -id(picture)  # a picture may stand there several times
-        if key not in self._reduced:
-            levels = [place(picture) if isinstance(picture, int) else picture]
-            while min(levels[-1].shape[:2]) >= 256:
-                height, width = levels[-1].shape[:2]
-                levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-            self._reduced[key] = levels
-        return self._reduced[key]
+        if isinstance(picture, int):
+            return _place_levels(picture)
+        if number not in self._reduced:
+            self._reduced[number] = _halvings(picture)
+        return self._reduced[number]
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is
@@ -95,6 +111,22 @@ class Backgrounds:
         return picture[:, ::-1] if choice[4] < 0.5 else picture
 
 
+@lru_cache(maxsize=_KEPT)
+def _place_levels(number: int) -> list[np.ndarray]:
+    return _halvings(place(number))
+
+
+def _halvings(picture: np.ndarray) -> list[np.ndarray]:
+    """The picture, its half, and so on while its shorter side has 256 pixels or more."""
+    import cv2
+
+    levels = [picture]
+    while min(levels[-1].shape[:2]) >= 256:
+        height, width = levels[-1].shape[:2]
+        levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+    return levels
+
+
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:
     """The scene's backgrounds; refused where the folder is missing, empty, or holds a picture that cannot be read."""
     if settings.color is not None:
@@ -116,19 +148,26 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
     """Files dealt to the parts, which procedural places fill up."""
     files = sorted(files, key=lambda file: hashlib.sha256(file.name.encode()).digest())
     pictures: list[np.ndarray | int] = []
-    ends, filled = {}, 0
-    for part, (name, rooms) in enumerate(ROOMS.items()):
-        first, own = len(pictures), [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
-        more = 0 if len(own) >= ENOUGH else rooms
-        pictures += [*(OFTEN if more else 1) * list(map(_read, own)), *(_PART * part + i for i in range(more))]
-        ends[name], filled = (first, len(pictures)), filled + more
+    parts = {}
+    for name, rooms in ROOMS.items():
+        own = [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
+        share = _share(name, len(own))
+        parts[name] = _Part(len(pictures), len(own), len(rooms) if share < 1 else 0, share)
+        pictures += [*map(_read, own), *(rooms if share < 1 else ())]
     notes = ()
     if 0 < len(files) < FEW:
         notes = (
-            f"only {len(files)} pictures in background.images: {filled} procedural places stand in for real ones; with "
-            f"{FEW} or more, training and promise know different ones",
+            f"only {len(files)} pictures in background.images: procedural places stand in for real ones; with {FEW} or "
+            "more, training and promise know different ones",
         )
-    return Backgrounds(tuple(pictures), ends | {"reprint": ends["evaluate"]}, notes)
+    return Backgrounds(tuple(pictures), parts | {"reprint": parts["evaluate"]}, notes)
+
+
+def _share(part: str, files: int) -> float:
+    """In which share of a part's views its own files are seen."""
+    if part in ("train", "select"):
+        return 1.0 if files >= ENOUGH else OFTEN * files / (OFTEN * files + len(ROOMS[part]))
+    return min(1.0, files / RARE)
 
 
 def _read(file: Path) -> np.ndarray:

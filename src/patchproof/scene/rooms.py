@@ -7,7 +7,7 @@ what is far is blurred. Every other place is one of the flat backgrounds of `pat
 
 from __future__ import annotations
 
-from functools import lru_cache, reduce
+from functools import reduce
 
 import numpy as np
 
@@ -16,19 +16,15 @@ from patchproof.scene.patterns import background, color, texture
 
 PLACE_PX = 256
 _SEED = 20
-_KEPT = 192  # as many as a scene has; 0.2 MB each, where drawing one takes 50 ms
 _TEXTURE_PX = 128
 _STRONG = 0.6  # of a texture's color that is left: walls and floors are grayish
 _SKY = 1e6  # how far away it is, in the camera's heights above the floor
 
 
-@lru_cache(maxsize=_KEPT)
 def place(number: int) -> np.ndarray:
-    """The place of a number, P×P×3 uint8, not to be written to: scenes share it."""
+    """The place of a number, P×P×3 uint8."""
     rng = np.random.default_rng([_SEED, number])
-    picture = background(rng, PLACE_PX) if number % 2 else _room(rng, PLACE_PX)
-    picture.flags.writeable = False
-    return picture
+    return background(rng, PLACE_PX) if number % 2 else _room(rng, PLACE_PX)
 
 
 def _room(rng: np.random.Generator, px: int) -> np.ndarray:

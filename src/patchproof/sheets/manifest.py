@@ -147,7 +147,8 @@ class ConditionClaim(Strict):
 
 class Promise(Strict):
     """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
-    of one session. Promises from before sessions drew everything anew for each condition.
+    of one session. Promises from before sessions drew everything anew for each condition. `places` has a number for
+    each session's place where some share one.
     """
 
     target: Target
@@ -156,6 +157,7 @@ class Promise(Strict):
     interval: Interval
     n: Count
     per_session: Count = 1
+    places: tuple[Annotated[int, Field(ge=0, le=10**6)], ...] = ()
     controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
 
@@ -170,7 +172,8 @@ class Promise(Strict):
         hits = [condition.recognized for condition in self.conditions]
         if len(hits) != self.n:  # of pages that say no conditions
             hits = [number < round(self.rate * self.n) for number in range(self.n)]
-        return spread_of(*in_sessions(hits, self.per_session))
+        places = self.places if len(self.places) == self.sessions else ()
+        return spread_of(*in_sessions(hits, self.per_session, places))
 
     @property
     def best_control(self) -> str:

@@ -18,14 +18,20 @@ import numpy as np
 from patchproof.claims import mean, rate, wilson
 from patchproof.evidence.forecast import forecast_of
 from patchproof.report.tables import Drawing, Table
-from patchproof.sessions import in_sessions, spread_of
 from patchproof.study.grid import grouped, networks_at, of_values
-from patchproof.study.record import bits, hits_of
+from patchproof.study.record import hits_of
 from patchproof.study.study import Cell, Result, Study
-from patchproof.validation.promises import PromisesSettings, cells, printed_run, take_photos
+from patchproof.validation.promises import (
+    SessionsSettings,
+    cells,
+    printed_run,
+    recorded_promise,
+    recorded_spread,
+    take_photos,
+)
 
 
-class ForecastsSettings(PromisesSettings):
+class ForecastsSettings(SessionsSettings):
     """As promises, with a control in the place of each design."""
 
     control: Literal["mean", "gray", "noise"] | None = "gray"  # photographed, too, under the same conditions
@@ -49,9 +55,7 @@ def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
                 out = folder / "reports" / own.name
                 report = verify_photos(own, folder / "sheet.json", out, models=networks, controls=beside, run=made)
                 sessions.append(_session(report, settings.control))
-    promise = made.promise
-    promised = bits([condition.recognized for condition in promise.conditions])
-    return {"promised": promised, "per_session": promise.per_session, "sessions": sessions}
+    return recorded_promise(made) | {"sessions": sessions}
 
 
 def _session(report: Any, control: str | None) -> dict[str, Any]:
@@ -95,8 +99,7 @@ def _forecast_row(group: Sequence[Result]) -> tuple:
     chances, hits = np.array(pairs, float).T
     held, widths, held_promise, widths_promise, promised = [], [], [], [], []
     for result in group:
-        promise = hits_of(result.answers["promised"])
-        spread, level = spread_of(*in_sessions(promise, result.answers["per_session"])), float(np.mean(promise))
+        spread, level = recorded_spread(result), float(np.mean(hits_of(result.answers["promised"])))
         for session in result.answers["sessions"]:
             if not session["forecast"]:
                 continue

@@ -4,7 +4,8 @@ Many runs are promised, printed, photographed by a renderer that is not ours, an
 In: scene files, networks, printers, seeds. Out: for every combination the promised rate, and for each session of its
 photographs (one print, one place, light and camera) the counts that the promise allows for and what it shows; the share
 of intervals that held, their widths beside those of the best possible ones, and each scene's bias. Beside them the rule
-that takes photographs for independent. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
+that takes photographs for independent, and, if asked for, the rate in many other places. A cell runs the same commands
+as a user does: optimize, sheet, reprint, verify.
 
 Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; with
 `path_traced = false` they are ours, and only sampling and the page in between are tested.
@@ -23,6 +24,9 @@ import numpy as np
 from pydantic import Field
 
 from patchproof.claims import mean, rate
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.sessions import TAIL, Spread, in_sessions, spread_of
 from patchproof.study.grid import (
@@ -50,8 +54,8 @@ if TYPE_CHECKING:
 _LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
 
 
-class PromisesSettings(GridSettings):
-    """A run for each scene, network, printer and seed."""
+class SessionsSettings(GridSettings):
+    """A run for each scene, network, printer and seed, and sessions of photographs of each."""
 
     printers: Names = ("coated",)  # that print the designs, and are known while optimizing
     sessions: Count = 4  # of each print
@@ -59,7 +63,13 @@ class PromisesSettings(GridSettings):
     path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
 
 
-def cells(settings: PromisesSettings, base: Path) -> list[Cell]:
+class PromisesSettings(SessionsSettings):
+    """As above, and more views in other places."""
+
+    elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views by our own renderer, each in a place of its own
+
+
+def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
     """One per combination, with the whole scene in it."""
     return [
         cell_of(
@@ -83,13 +93,26 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
         made = printed_run(base, cell, folder)
         photos, networks = take_photos(settings, cell, made, folder), networks_at(base, cell.values)
         report = verify_photos(photos, folder / "sheet.json", folder / "report", models=networks)
-    promise, summary = made.promise, report.summary
-    return {
-        "promised": bits([condition.recognized for condition in promise.conditions]),
-        "per_session": promise.per_session,
-        "sessions": [(session.recognized, session.judged) for session in summary.sessions],
-        "verdict": summary.verdict,
-    }
+    sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
+    kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
+    if settings.elsewhere:
+        problem, conditions = set_problem(made.scene), made.scene.draw("evaluate", settings.elsewhere)
+        answers = responses(problem, shown_with_controls(problem, made.design, ()), conditions)["design"]
+        kept["elsewhere"] = bits(answers.recognized[0])
+    return kept
+
+
+def recorded_promise(made: Run) -> dict[str, Any]:
+    """What answers keep of a run's promise."""
+    promise = made.promise
+    hits = bits([condition.recognized for condition in promise.conditions])
+    return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
+
+
+def recorded_spread(result: Result) -> Spread:
+    """What that promise says of photographs to come."""
+    answers = result.answers
+    return spread_of(*in_sessions(hits_of(answers["promised"]), answers["per_session"], answers["places"]))
 
 
 def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
@@ -105,7 +128,7 @@ def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
     return made
 
 
-def take_photos(settings: PromisesSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
+def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
     """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
     conditions.
     """
@@ -121,8 +144,9 @@ def take_photos(settings: PromisesSettings, cell: Cell, made: Run, folder: Path,
 
 
 def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Shares that held, by scene and in all; every combination."""
-    return _shares(settings, results), _each(results)
+    """Shares that held, by scene and in all; every combination; rates elsewhere."""
+    elsewhere = (_elsewhere(settings, results),) if settings.elsewhere else ()
+    return _shares(settings, results), *elsewhere, _each(results)
 
 
 @dataclass(frozen=True)
@@ -153,8 +177,7 @@ class Counted:
 def counted(result: Result) -> list[Counted]:
     """A run's sessions in which anything could be judged."""
     hits = hits_of(result.answers["promised"])
-    spread = spread_of(*in_sessions(hits, result.answers["per_session"]))
-    about = sum(hits) / len(hits), spread, spread_of(*in_sessions(hits, 1))
+    about = sum(hits) / len(hits), recorded_spread(result), spread_of(*in_sessions(hits, 1))
     return [Counted(recognized, judged, *about) for recognized, judged in result.answers["sessions"] if judged]
 
 
@@ -213,6 +236,19 @@ def _each(results: Sequence[Result]) -> Table:
             what = (session.rate, session.spread.correlation[0], session.judged, session.recognized)
             rows.append((*start, *what, *session.interval(), session.held(), result.answers["verdict"]))
     return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
+
+
+def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
+    rows = []
+    for result in results:
+        values, (low, high) = result.cell.values, recorded_spread(result).rate
+        shown, promised = rate(hits_of(result.answers["elsewhere"])), hits_of(result.answers["promised"])
+        within = shown is not None and low <= shown.value <= high
+        about = (values["name"], values["network"], values["seed"])
+        rows.append((*about, sum(promised) / len(promised), low, high, shown, within))
+    head = ("scene", "network", "seed", "promised", "low", "high", "elsewhere", "within")
+    about = f"{settings.elsewhere} views by our own renderer, each in another place that the promise does not know"
+    return Table("elsewhere", "Rates elsewhere within the promised interval", head, tuple(rows), about)
 
 
 def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
