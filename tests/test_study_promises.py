@@ -23,7 +23,7 @@ def result(scene, *sessions, hits=320, n=400):
         "seed": 0,
     }
     found = {"promised": "1" * hits + "0" * (n - hits), "per_session": 1, "places": []}
-    found |= {"sessions": sessions, "verdict": "kept", "elsewhere": "1" * 79 + "0" * 21}
+    found |= {"sessions": sessions, "verdict": "kept", "elsewhere": "1" * 79 + "0" * 21, "rendered": sessions}
     return Result(Cell(f"{scene}{sessions}", values), found, Path())
 
 
@@ -44,8 +44,11 @@ def test_shares_and_biases_by_hand():
     assert len(each.rows) == 6
     many = promises.tables(settings, [result("a", *((20 + i % 20, 40) for i in range(40)))])[0]
     assert many.rows[0][3] == pytest.approx(19 / 40, abs=0.01)
-    settings = settings.model_copy(update={"elsewhere": 100})
-    _, elsewhere, _ = promises.tables(settings, [result("a", (20, 40)), result("a", (20, 40), hits=280)])
+    settings = settings.model_copy(update={"elsewhere": 100, "rendered": 1})
+    of_photos, of_views, elsewhere, _ = promises.tables(
+        settings, [result("a", (20, 40)), result("a", (20, 40), hits=280)]
+    )
+    assert of_photos.rows == of_views.rows
     assert [(row[6].value, row[7]) for row in elsewhere.rows] == [(0.79, True), (0.79, False)]
 
 
@@ -69,10 +72,10 @@ def small_study(study, tmp_path, monkeypatch, more=""):
 
 
 def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
-    finished = small_study("promises", tmp_path, monkeypatch, "elsewhere = 6\n")
+    finished = small_study("promises", tmp_path, monkeypatch, "elsewhere = 6\nrendered = 2\n")
     (one,) = finished.results
     assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == PER_SESSION
-    assert len(one.answers["elsewhere"]) == 6
+    assert len(one.answers["elsewhere"]) == 6 and [n for _, n in one.answers["rendered"]] == [5, 5]
     judged = [judged for _, judged in one.answers["sessions"]]
     assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])
     assert (tmp_path / "out" / "promises_calibration.png").is_file()

@@ -4,8 +4,8 @@ Many runs are promised, printed, photographed by a renderer that is not ours, an
 In: scene files, networks, printers, seeds. Out: for every combination the promised rate, and for each session of its
 photographs (one print, one place, light and camera) the counts that the promise allows for and what it shows; the share
 of intervals that held, their widths beside those of the best possible ones, and each scene's bias. Beside them the rule
-that takes photographs for independent, and, if asked for, the rate in many other places. A cell runs the same commands
-as a user does: optimize, sheet, reprint, verify.
+that takes photographs for independent. If asked for, sessions of views by our own renderer and the rate in many other
+places, too. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
 
 Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; with
 `path_traced = false` they are ours, and only sampling and the page in between are tested.
@@ -17,6 +17,7 @@ import tempfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -64,9 +65,10 @@ class SessionsSettings(GridSettings):
 
 
 class PromisesSettings(SessionsSettings):
-    """As above, and more views in other places."""
+    """As above, and views by our own renderer without paper, in places that the promise does not know."""
 
-    elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views by our own renderer, each in a place of its own
+    rendered: Annotated[int, Field(ge=0, le=1000)] = 0  # sessions of as many views as photographs
+    elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views, each in a place of its own
 
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
@@ -95,10 +97,14 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
         report = verify_photos(photos, folder / "sheet.json", folder / "report", models=networks)
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
     kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
+    problem, scene = set_problem(made.scene), made.scene
+    show = partial(responses, problem, shown_with_controls(problem, made.design, ()))
+    if settings.rendered:
+        views = scene.draw("reprint", settings.rendered * settings.photos, per_session=settings.photos)
+        hits = show(views)["design"].recognized[0]
+        kept["rendered"] = list(zip(*in_sessions(hits, settings.photos), strict=True))
     if settings.elsewhere:
-        problem, conditions = set_problem(made.scene), made.scene.draw("evaluate", settings.elsewhere)
-        answers = responses(problem, shown_with_controls(problem, made.design, ()), conditions)["design"]
-        kept["elsewhere"] = bits(answers.recognized[0])
+        kept["elsewhere"] = bits(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
     return kept
 
 
@@ -144,9 +150,16 @@ def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path,
 
 
 def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """Shares that held, by scene and in all; every combination; rates elsewhere."""
-    elsewhere = (_elsewhere(settings, results),) if settings.elsewhere else ()
-    return _shares(settings, results), *elsewhere, _each(results)
+    """Shares that held, by scene and in all; every combination; the same of views; rates elsewhere."""
+    how = "path-traced photographs" if settings.path_traced else "photographs by our own renderer"
+    about = f"{settings.sessions} sessions of {settings.photos} {how} for each promise"
+    all_tables = [_shares("held", "Sessions in which promises held", about, results)]
+    if settings.rendered:
+        about = f"{settings.rendered} sessions of {settings.photos} views by our own renderer for each promise"
+        all_tables.append(_shares("rendered", "Sessions of views in which promises held", about, results))
+    if settings.elsewhere:
+        all_tables.append(_elsewhere(settings, results))
+    return *all_tables, _each(results)
 
 
 @dataclass(frozen=True)
@@ -174,11 +187,11 @@ class Counted:
         return low <= self.recognized <= high
 
 
-def counted(result: Result) -> list[Counted]:
-    """A run's sessions in which anything could be judged."""
+def counted(result: Result, sessions: str = "sessions") -> list[Counted]:
+    """A run's sessions, or those of "rendered" views, in which anything could be judged."""
     hits = hits_of(result.answers["promised"])
     about = sum(hits) / len(hits), recorded_spread(result), spread_of(*in_sessions(hits, 1))
-    return [Counted(recognized, judged, *about) for recognized, judged in result.answers["sessions"] if judged]
+    return [Counted(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
 
 
 def _width(sessions: Sequence[Counted], alone: bool = False) -> float:
@@ -196,33 +209,32 @@ def _best_width(sessions: Sequence[Counted]) -> float | None:
     return float(high - low)
 
 
-def _shares(settings: PromisesSettings, results: Sequence[Result]) -> Table:
+def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
+    kind = "rendered" if name == "rendered" else "sessions"
     scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
     rows = []
-    for name, group in {**scenes, "all": list(results)}.items():
-        sessions = [session for result in group for session in counted(result)]
+    for scene, group in {**scenes, "all": list(results)}.items():
+        by_run = [own for result in group if (own := counted(result, kind))]
+        sessions = [session for own in by_run for session in own]
         if not sessions:
             continue
-        bias = [float(np.mean([s.share - s.rate for s in counted(result)])) for result in group if counted(result)]
         rows.append(
             (
-                name,
+                scene,
                 rate([session.held() for session in sessions]),
                 _width(sessions),
                 _best_width(sessions),
                 rate([session.held(alone=True) for session in sessions]),
                 _width(sessions, alone=True),
-                mean(bias),
+                mean([float(np.mean([session.share - session.rate for session in own])) for own in by_run]),
             )
         )
-    how = "path-traced" if settings.path_traced else "our own renderer's"
     about = (
-        f"{settings.sessions} sessions of {settings.photos} {how} photographs for each promise; widths: medians, as a "
-        "share of the photographs; best: between the ends of what sessions showed; bias: recognized minus promised "
-        "rate, over runs"
+        f"{about}; widths: medians, as a share of the photographs; best: between the ends of what sessions showed; "
+        "bias: recognized minus promised rate, over runs"
     )
     head = ("scene", "held", "width", "best width", "held, if independent", "width, if independent", "bias")
-    return Table("held", "Sessions in which promises held", head, tuple(rows), about)
+    return Table(name, title, head, tuple(rows), about)
 
 
 def _each(results: Sequence[Result]) -> Table:
