@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import typer
 from PIL import Image, ImageCms
 
 from patchproof import cli
@@ -34,15 +35,15 @@ from patchproof.channel.printer import load_printer, vary
 from patchproof.channel.tone import codes_of_light, light_of_codes
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.read import Photo
+from patchproof.photo.read import Photo, read_photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprints.chart_photos import chart_manifest, photograph_page, printed_page
 from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
+from patchproof.reprints.page_photos import chart_manifest, photograph_page, printed_page
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import make_scene
 from patchproof.sheets.chart import chart_colors
-from patchproof.sheets.manifest import dump_manifest
+from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.strict import Refused
 
 UNSEEN = np.random.default_rng(8).random((500, 3))
@@ -215,6 +216,22 @@ def test_swatches_are_read_relative_to_paper_under_uneven_light(shots):
         error = difference(srgb_from_linear(read.light), shown(printer, sent))
         assert error.mean() < 1.2 and error.max() < 4
         np.testing.assert_allclose(read.paper, shot.paper, rtol=0.06)
+
+
+def test_a_chart_page_is_rehearsed_without_a_printer(tmp_path):
+    cli.app(["sheet", "--template", "chart48_a4", "--out", str(tmp_path / "chart.pdf")], standalone_mode=False)
+    rehearsed = ["reprint", str(tmp_path / "chart.pdf"), "--n", "1", "--printer", "uncoated"]
+    cli.app([*rehearsed, "--print-scale", "0.97", "--out", str(tmp_path / "photos")], standalone_mode=False)
+    manifest = load_manifest(tmp_path / "chart.json")
+    read = read_chart(read_photo(tmp_path / "photos/photo_0001.jpg"), manifest)
+    sent = torch.tensor(np.array([swatch.srgb for swatch in manifest.chart]).T[None, :, :, None], dtype=torch.float32)
+    uncoated = load_printer("uncoated").apply(torch.cat([sent, torch.ones_like(sent[:, :, :1])], 2))[0, :, :, 0].T
+    light = linear_from_srgb(uncoated.numpy())
+    read_well = np.isfinite(read.light).all(1)
+    error = difference(srgb_from_linear(read.light), srgb_from_linear(light[:-1] / light[-1]))[read_well]
+    assert read_well.sum() >= 40 and error.mean() < 1.5
+    with pytest.raises(typer.BadParameter, match="of a run's sheet"):
+        cli.app([*rehearsed, "--sessions", "2", "--out", str(tmp_path / "other")], standalone_mode=False)
 
 
 def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots):

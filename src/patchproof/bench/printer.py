@@ -1,7 +1,7 @@
 """Calibrating printers: what each rung of the ladder costs and how near it comes, by the number of swatches.
 
 In: nothing; printers are those of `inkjets` and the shipped profiles (each with the other as its only prior), charts
-are photographed by `chart_photos`. Out: a chart of every rung's time against its error, with the choice among them.
+are photographed by `page_photos`. Out: a chart of every rung's time against its error, with the choice among them.
 
 The error is the mean ΔE00 over 1,000 colors that no chart holds, against what the same camera would show of the true
 print under even light at the chart's exposure: paper is white in both. A choice is held against the best of all rungs
@@ -22,8 +22,8 @@ from patchproof.calibrate.color_ladder import Map, choose, difference, distinct,
 from patchproof.claims import mean, median, rate, student_mean
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.report.tables import Table
-from patchproof.reprints.chart_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
 from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
+from patchproof.reprints.page_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
 
 SWATCHES = (6, 48, 96)
 TARGETS = {48: 2.5, 96: 1.8}

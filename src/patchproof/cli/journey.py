@@ -167,9 +167,12 @@ def sheet(
 
 def reprint(
     pdf: Annotated[Path, typer.Argument(help="A sheet's PDF.")],
-    run: Annotated[Path, typer.Option(help="The run it was made from.")],
     n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
     out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
+    run: Annotated[
+        Path | None,
+        typer.Option(help="The run it was made from; none for blank, chart and board pages."),
+    ] = None,
     sessions: Annotated[
         int, typer.Option(min=1, help="Places to take them in, each with its light, camera and folder.")
     ] = 1,
@@ -188,6 +191,7 @@ def reprint(
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
     from patchproof.reprints.hung_sheet import Hanging
+    from patchproof.reprints.page_photos import reprint_pages
     from patchproof.reprints.reprint import reprint as reprint_sheet
     from patchproof.reprints.reprint import scan
 
@@ -196,8 +200,15 @@ def reprint(
         raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
     if path_traced and scan_dpi is not None:
         raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
-    made = load_run(run)
     how = Hanging(printer, scale, control, path_traced)
+    if run is None:
+        if scan_dpi is not None or control is not None or path_traced or sessions > 1:
+            raise typer.BadParameter(
+                "scans, controls, sessions and path tracing are of a run's sheet; name the run", param_hint="--run"
+            )
+        say(f"{reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)} photographs: {out}")
+        return
+    made = load_run(run)
     if scan_dpi is not None:
         truth = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
     else:

@@ -34,6 +34,12 @@ def page_pixels(pdf_path: str | Path, page: int = 1, dpi: float = 150.0) -> np.n
         return _render(opened, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
 
 
+def page_count(pdf_path: str | Path) -> int:
+    """How many pages a PDF has."""
+    with _opened(pdf_path) as pdf:
+        return len(pdf)
+
+
 def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
     """The piece alone: its cut line is exactly the picture's border, so that pixel = mm × width_px / width_mm.
 
@@ -105,17 +111,23 @@ def _existing(pdf_path: str | Path) -> None:
 
 
 @contextmanager
-def _opened_page(pdf_path: str | Path, page: int) -> Iterator[Any]:
+def _opened(pdf_path: str | Path) -> Iterator[Any]:
     import pypdfium2
 
     _existing(pdf_path)
     try:
         with pypdfium2.PdfDocument(str(pdf_path)) as pdf:
-            if not 1 <= page <= len(pdf):
-                raise Refused(f"a page from 1 to {len(pdf)} of {pdf_path}", f"{page}", "ask for another page")
-            yield pdf[page - 1]
+            yield pdf
     except pypdfium2.PdfiumError as error:
         raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
+
+
+@contextmanager
+def _opened_page(pdf_path: str | Path, page: int) -> Iterator[Any]:
+    with _opened(pdf_path) as pdf:
+        if not 1 <= page <= len(pdf):
+            raise Refused(f"a page from 1 to {len(pdf)} of {pdf_path}", f"{page}", "ask for another page")
+        yield pdf[page - 1]
 
 
 def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""Simulated photographs of a printed chart page: any printer, uneven light, and the reprint's camera.
+"""Simulated photographs of a page that lies flat: any printer, uneven light, and the reprint's camera.
 
-In: a number of swatches, a printer as a function from sRGB to light, a seed. Out: a manifest, pages as light, uint8
-photographs. The page is drawn here, not written as a PDF, so that charts of any size can be tried; light (ambient, sun
-and a lamp near the page), blur, noise, vignetting and clipping are those of `channel`, JPEG is a real file's.
+In: a page as pixels, or a number of swatches; a printer as a function from sRGB to light; a seed. Out: a chart's
+manifest, pages as light, photographs as JPEG files. Charts are drawn here, too, not only written as PDFs, so that those
+of any size can be tried; light (ambient, sun and a lamp near the page), blur, noise, vignetting and clipping are those
+of `channel`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,13 +23,17 @@ from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.light import Lamp, Lighting, irradiance
-from patchproof.color import codes_of, photo_codes_of
-from patchproof.output import image_bytes, image_pixels
+from patchproof.channel.printer import load_printer
+from patchproof.color import codes_of, linear_from_srgb, photo_codes_of
+from patchproof.geometry import MM_PER_INCH
+from patchproof.output import image_bytes, image_pixels, new_folder
 from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
+from patchproof.reprints.hung_sheet import Hanging
 from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import hash_order
+from patchproof.sheets.raster import page_count, page_pixels
 
 Shows = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
 
@@ -40,10 +47,15 @@ _GAP_MM = 0.4
 
 @dataclass(frozen=True)
 class Shot:
-    """A photograph, and the light of bare paper in the middle of the page as its sensor saw it (3,)."""
+    """A photograph's file, and the light of bare paper in the middle of the page as its sensor saw it (3,)."""
 
-    photo: Photo
+    file: bytes
     paper: np.ndarray
+
+    @cached_property
+    def photo(self) -> Photo:
+        """The file as it is read."""
+        return Photo(image_pixels(self.file), None)
 
 
 def chart_manifest(count: int) -> Manifest:
@@ -78,10 +90,40 @@ def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
         cv2.putText(page, f"{line} what stands beside a chart is not white paper", where, 0, 0.9, (0, 0, 0), 2)
     for swatch in manifest.chart:
         _fill(page, swatch.rect_mm, codes_of(np.array(swatch.srgb)))
+    return page_light(page, shows)
+
+
+def page_light(page: np.ndarray, shows: Shows) -> np.ndarray:
+    """A page's uint8 H×W×3 as the light of its print, of bare paper 1; a tall page is turned as photographs lie."""
+    page = np.rot90(page) if page.shape[0] > page.shape[1] else page
     white = shows(np.ones((1, 3)))
     packed, index = np.unique(page.reshape(-1, 3) @ np.array([65536, 256, 1]), return_inverse=True)
     colors = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1) / 255
     return (shows(colors) / white)[index.reshape(-1)].reshape(page.shape).astype(np.float32)
+
+
+def reprint_pages(
+    pdf_path: str | Path, n: int, out: str | Path, how: Hanging, *, seed: int | None = None, overwrite: bool = False
+) -> int:
+    """Write n photographs of the pages of a PDF, in turn, lying flat: of pages that belong to no run, as blank ones,
+    charts and boards. `how` names their printer (without a name: coated) and the print's size.
+    """
+    printer = load_printer(how.printer or "coated")
+
+    def shows(colors: np.ndarray) -> np.ndarray:
+        sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)
+        return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
+
+    with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
+        pages = [
+            cv2.resize(page_light(page_pixels(pdf_path, i + 1, PX_PER_MM * MM_PER_INCH), shows), None, None, *scale)
+            for scale in [how.print_scale]
+            for i in range(page_count(pdf_path))
+        ]
+        for i in range(n):
+            shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
+            (folder / f"photo_{i + 1:04d}.jpg").write_bytes(shot.file)
+    return n
 
 
 def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:
@@ -113,7 +155,7 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
     codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
     file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
-    return Shot(Photo(image_pixels(file), None), at_middle * exposure * white_balance)
+    return Shot(file, at_middle * exposure * white_balance)
 
 
 def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
