@@ -10,12 +10,17 @@ import pytest
 import torch
 
 from patchproof import geometry
+from patchproof.claims import Estimate, paired_difference
 from patchproof.optimizer.run import optimize_scene
 from patchproof.render.photograph import photograph
+from patchproof.report.tables import drawn as drawing_of
 from patchproof.scene.conditions import with_values
 from patchproof.strict import Refused
 from patchproof.study.study import run_study
 from patchproof.validation.envelope.axes import AXES, conditions_at, placed_at
+from patchproof.validation.envelope.fit import BEYOND
+from patchproof.validation.envelope.gains import gain_break, gains_of, has_effect
+from patchproof.validation.envelope.pages import figures
 from patchproof.validation.envelope.sweeps import EnvelopeSettings, cells
 from patchproof.validation.envelope.window import window
 from patchproof.validation.envelope.world import (
@@ -102,6 +107,15 @@ def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world)
     assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
 
 
+def test_the_gray_piece_is_the_printed_control_and_suffers_what_the_design_does(world):
+    design, gray = piece_at(world, {}, 0).srgb, piece_at(world, {}, 0, gray=True).srgb
+    middle = gray[len(gray) // 2, len(gray) // 2]
+    assert gray.shape == design.shape and float(np.ptp(middle)) < 0.05  # as this printer makes gray
+    assert not torch.equal(piece_at(world, {"mismatch": 1.0}, 0, gray=True).srgb, gray)
+    taped = [piece_at(world, {"hidden": 4.0}, 0, gray=is_gray).srgb for is_gray in (False, True)]
+    assert torch.equal(*taped)
+
+
 def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
     one = with_values(drawn[:1], noise=0.0, blur_px=0.0)
     stage, shown = _Stages(world).at({}), piece_at(world, {}, 0)
@@ -125,8 +139,10 @@ def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world,
 def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn):
     points = [{"blur": 20.0}, {}, {"distance": 4000.0}, {"blur": 3.0}]
     together = recognized(world, points, drawn)
-    alone = np.concatenate([recognized(world, [point], drawn) for point in points])
-    assert np.array_equal(together, alone)
+    alone = [recognized(world, [point], drawn) for point in points]
+    assert list(together) == ["design", "bare", "gray"]
+    for kind, hits in together.items():
+        assert np.array_equal(hits, np.concatenate([each[kind] for each in alone]))
 
 
 def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
@@ -144,8 +160,75 @@ def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
     assert float(rows[0]["measured"]) == 1 and float(rows[2]["measured"]) == 0
     (broken,) = rows_of(tmp_path / "out/envelope_breaks.csv")
     assert 0.5 <= float(broken["measured_low"]) <= float(broken["measured"]) <= float(broken["measured_high"]) <= 16
-    assert len(rows_of(tmp_path / "out/envelope_maps.csv")) == 9
+    maps = rows_of(tmp_path / "out/envelope_maps.csv")
+    assert len(maps) == 9 and {row["effect"] for row in maps} <= {"gains", "no effect"}
     assert (tmp_path / "out/envelope_page.png").is_file()
+
+
+# ------------------------------------------------------------------------------------------------ beside controls
+
+
+def test_a_gain_is_over_the_control_that_is_hardest_to_beat_at_that_point():
+    design = np.array([[1] * 20, [1] * 20, [1] * 20], bool)
+    bare = np.array([[0] * 20, [0] * 15 + [1] * 5, [1] * 20], bool)
+    gray = np.array([[0] * 10 + [1] * 10, [0] * 20, [0] * 20], bool)
+    gains = gains_of(design, {"bare": bare, "gray": gray})
+    assert [gain.value for gain in gains] == [0.5, 0.75, 0.0] and [has_effect(gain) for gain in gains] == [1, 1, 0]
+    assert (gains[0].low, gains[0].high) == pytest.approx(paired_difference(design[0].tolist(), gray[0].tolist())[1])
+    # last that shows a gain and first that does not: of 20 conditions 5 more, and 3 more
+    assert has_effect(gains_of(design[:1], {"bare": bare[1:2] | (np.arange(20) >= 5)})[0])
+    assert not has_effect(gains_of(design[:1], {"bare": np.arange(20)[None] >= 3})[0])
+    assert not has_effect(gains_of(bare[:1], {"bare": design[:1]})[0])  # it does harm
+
+
+def test_a_gain_ends_between_the_last_point_with_one_and_the_first_without():
+    at, some, none = np.linspace(0, 1, 5), Estimate(0.3, 0.1, 0.5, 50), Estimate(0.1, 0.0, 0.2, 50)
+    ends = gain_break([some, some, none, none, some], at)
+    assert (ends.low, ends.value, ends.high, ends.rates) == (0.25, 0.375, 0.5, (0.3, 0.3))
+    assert gain_break([some] * 5, at).value == BEYOND and gain_break([none, *[some] * 4], at).value is None
+
+
+@pytest.fixture(scope="module")
+def blue_run(tmp_path_factory):
+    """Of a network that tells red from blue and has no other answer: of noise it says blue half of the time."""
+    import conftest
+
+    folder = tmp_path_factory.mktemp("blue")
+    scene = conftest.SCENE.replace('"carton"\nmodels = ["builtin"]', BLUE).replace("[800, 600]", "[96, 96]")
+    (folder / "scene.toml").write_text(scene.replace("steps = 3", "steps = 8").replace("[500, 900]", "[330, 340]"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        optimize_scene(folder / "scene.toml", folder / "run")
+    return folder / "run"
+
+
+BLUE = '"blue"\nmodels = ["module:fake_networks.red_against_blue"]'
+
+
+def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is_recognized(blue_run, tmp_path):
+    config, out = tmp_path / "envelope.toml", tmp_path / "out"
+    config.write_text(
+        f'run = "{blue_run}"\nn = 32\nphotos = 1\nmap_n = 16\nmap_photos = 1\n'
+        'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 400, points = 3}]\n'
+        'maps = [{x = "noise", y = "mismatch", points = 3}]\n'
+    )
+    finished = run_study("envelope", config, out)
+    assert not finished.failed
+    rows = {
+        name: [row for row in rows_of(out / "envelope_sweeps.csv") if row["axis"] == name] for name in ("noise", "blur")
+    }
+    print(rows)
+    for easy, _, hard in rows.values():
+        assert easy["effect"] == "gains" and float(easy["gain_low"]) > 0
+        assert hard["effect"] == "no effect" and float(hard["gain_low"]) <= 0 <= float(hard["gain_high"])
+    assert 0.2 < float(rows["noise"][-1]["recognized"]) < 0.8
+    for row in rows_of(out / "envelope_breaks.csv"):
+        assert float(row["design gains_high"]) <= float(row["hard"]) and row["no effect at"]
+    cells = rows_of(out / "envelope_maps.csv")
+    assert {row["effect"] for row in cells if float(row["at x"]) == 16} == {"no effect"}
+    (page,) = figures(None, finished.results)
+    assert drawing_of(page.draw, (8, 6), "svg").decode().count("no effect<") == 2
+    assert "no effect" in (out / "envelope.html").read_text("utf-8")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 In: scenes with a mesh, networks, seeds. Out, per cell: a black square over every position of the picture; maps of pose
 × light; the worst pose and the worst light that a random search finds that closes in round by round, each with the
 condition found and its confidence. Whatever was chosen for being worst is measured again on draws of the evaluate
-stream that the choice never saw: the same draws flatter a choice.
+stream that the choice never saw: the same draws flatter a choice. Cells of a map where the object is recognized no more
+often than the background alone are said to show no effect: a network may answer the label of anything.
 
 Sources: occlusion and maps as in Pestana et al., figures 1 and 2 (occlusion maps: Zeiler and Fergus, ECCV 2014); search
 for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random search.
@@ -19,11 +20,12 @@ import numpy as np
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.claims import difference, rate
+from patchproof.claims import difference, paired_difference, rate
 from patchproof.experiments.stress_map import (
     LIGHT,
     POSE,
     MapSettings,
+    Place,
     axes_of,
     axes_values,
     clean,
@@ -47,6 +49,10 @@ from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import bits, hits_of
 from patchproof.study.study import Cell, Result, Study
 
+_MAP_HEAD = (
+    *("pose", "from", "to", "light", "from ", "to "),
+    *("rate", "background alone", "difference", "effect", "confidence"),
+)
 _PARTS = ("typical", "worst pose", "worst light", "worst occlusion")
 _MEASURING = 3_000_001  # added to a seed: the evaluate stream's draws that measure what was chosen
 
@@ -115,12 +121,13 @@ def _again(problem: Problem, there: Conditions, anywhere: Conditions) -> dict[st
 
 def _mapped(problem: Problem, asked: MapSettings, seed: int) -> dict[str, Any]:
     axes = axes_of(problem.scene.settings, asked)
-    hits, confidence = map_of(problem, axes, problem.scene.draw("select", asked.n, seed))
+    hits, confidence, alone = map_of(problem, axes, problem.scene.draw("select", asked.n, seed))
     worst = worst_cells(hits, confidence, problem.scene.settings.target.goal)
     fresh = problem.scene.draw("evaluate", asked.n * len(worst), seed + _MEASURING)
     return {
         "axes": axes_values(axes),
         "hits": [[bits(place) for place in column] for column in hits],
+        "alone": [[bits(place) for place in column] for column in alone],
         "confidence": confidence.mean(2).tolist(),
         "worst": [list(place) for place in worst],
         "again": _again(problem, in_cells(fresh, axes, worst), fresh),
@@ -218,9 +225,10 @@ def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, 
         Table(
             "maps",
             "Maps of pose × light",
-            (*start, "pose", "from", "to", "light", "from ", "to ", "rate", "confidence"),
+            (*start, *_MAP_HEAD),
             tuple(row for result in results for map_ in result.answers["maps"] for row in _map_rows(result, map_)),
-            "The clean object in every cell; all cells of a map share their other draws.",
+            "The clean object in every cell, beside the background without it; all cells of a map share their other "
+            "draws. “no effect”: the 95 % interval of the paired difference does not lie above 0.",
         ),
     )
 
@@ -245,10 +253,23 @@ def _worst_rows(result: Result) -> Iterator[tuple]:
 
 def _map_rows(result: Result, map_: Mapping[str, Any]) -> Iterator[tuple]:
     (pose, light), (poses, lights) = map_["axes"]["names"], map_["axes"]["edges"]
+    empty = _empty_cells(map_)
     for i, column in enumerate(map_["hits"]):
-        for j, hits in enumerate(column):
+        for j, hits in enumerate(map(hits_of, column)):
             place = (pose, poses[i], poses[i + 1], light, lights[j], lights[j + 1])
-            yield (*who(result), *place, rate(hits_of(hits)), map_["confidence"][i][j])
+            alone, effect = hits_of(map_["alone"][i][j]), "no effect" if (i, j) in empty else "seen"
+            beside = rate(alone), difference(hits, alone), effect
+            yield (*who(result), *place, rate(hits), *beside, map_["confidence"][i][j])
+
+
+def _empty_cells(map_: Mapping[str, Any]) -> list[Place]:
+    """Where the object is not shown to be recognized more often than the background alone."""
+    return [
+        (i, j)
+        for i, columns in enumerate(zip(map_["hits"], map_["alone"], strict=True))
+        for j, (hits, alone) in enumerate(zip(*columns, strict=True))
+        if paired_difference(hits_of(hits), hits_of(alone))[1][0] <= 0
+    ]
 
 
 def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
@@ -260,8 +281,9 @@ def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
     name, title = result.cell.name, "{}, {}, seed {}: clean object".format(*who(result))
     for number, (map_, asked) in enumerate(zip(result.answers["maps"], settings.maps, strict=True)):
         rates = [[float(np.mean(hits_of(hits))) for hits in column] for column in map_["hits"]]
-        caption = f"rate, n = {asked.n} draws per cell; framed: the worst tenth"
-        yield heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], map_ticks(map_["axes"]))
+        caption = f"rate, n = {asked.n} draws per cell; framed: the worst tenth\ngray: no effect over background alone"
+        ticks, empty = map_ticks(map_["axes"]), _empty_cells(map_)
+        yield heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], ticks, empty=empty)
     hidden, asked = result.answers["occlusion"], settings.occlusion
     grid = np.reshape([np.mean(hits_of(hits)) for hits in hidden["hits"]], (asked.positions, asked.positions)).T
     middles = [f"{asked.share / 2 + (1 - asked.share) * i / (asked.positions - 1):.0%}" for i in range(asked.positions)]

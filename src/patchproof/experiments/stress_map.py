@@ -1,25 +1,27 @@
 """Maps of stress tests: cells of pose × light, what a network answers to the clean object there, and how that is drawn.
 
 In: a scene with a mesh before one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
-a map while everything else stays as drawn; recognized and confidence per draw; the worst tenth of a map's cells; and
-`Drawing`s, which share one scale from 0 to 1. All cells of a map share the same draws of background, camera and
-whatever is no axis, so that cells differ in pose and light alone.
+a map while everything else stays as drawn; recognized and confidence per draw, and what the network answers to the
+background alone; the worst tenth of a map's cells; and `Drawing`s, which share one scale from 0 to 1. All cells of a
+map share the same draws of background, camera and whatever is no axis, so that cells differ in pose and light alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import torch
 
 from patchproof.channel.effects import EFFECT, EFFECTS
 from patchproof.goal import Goal
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, responses
+from patchproof.optimizer.responses import Answers, ask, in_parts, joined, responses
+from patchproof.render.photograph import expose
 from patchproof.report.tables import Drawing
 from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
 from patchproof.settings import SceneSettings
@@ -124,12 +126,27 @@ def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) 
     return responses(problem, {"clean": None}, conditions, side_px)["clean"]
 
 
-def map_of(problem: Problem, axes: tuple[Axis, Axis], drawn: Conditions) -> tuple[np.ndarray, np.ndarray]:
-    """The clean object's hits (bool) and confidence, each P×L×N: poses, lights, draws."""
+def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Answers, Answers]:
+    """The networks' answers to the clean object, and to the background alone through the same camera."""
+    parts: list[dict[str, Answers]] = []
+    with torch.no_grad():
+        for part in in_parts(conditions):
+            views = problem.see(None, part, problem.figure_px)
+            shown = {"clean": views, "alone": replace(views, object=None)}
+            parts.append({name: ask(problem, expose(each, None)) for name, each in shown.items()})
+    answers = joined(parts)
+    return answers["clean"], answers["alone"]
+
+
+def map_of(problem: Problem, axes: tuple[Axis, Axis], drawn: Conditions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The clean object's hits (bool) and confidence, and the hits of the background alone, each P×L×N: poses, lights,
+    draws.
+    """
     shape = (len(axes[0]), len(axes[1]), len(drawn))
-    answers = [clean(problem, in_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])]
-    hits, confidence = ([getattr(answer, name)[0] for answer in answers] for name in ("recognized", "confidence"))
-    return np.reshape(hits, shape), np.reshape(confidence, shape)
+    answers = [with_and_without(problem, in_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])]
+    hits, confidence = ([getattr(own, name)[0] for own, _ in answers] for name in ("recognized", "confidence"))
+    alone = [background.recognized[0] for _, background in answers]
+    return np.reshape(hits, shape), np.reshape(confidence, shape), np.reshape(alone, shape)
 
 
 def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assist) -> list[Place]:
@@ -146,13 +163,17 @@ def heat_map(
     framed: Sequence[Sequence[int]],
     ticks: Sequence[Ticks],
     upward: bool = True,
+    empty: Sequence[Place] = (),
 ) -> Drawing:
-    """Rates over two axes, the second one upward or down; `titles` are the drawing's and the plot's own."""
+    """Rates over two axes, the second one upward or down; `titles` are the drawing's and the plot's own. `empty` cells,
+    whose rates say nothing, are gray.
+    """
 
     def draw(figure: Figure) -> None:
         plot, values = figure.add_subplot(), np.array(rates).T
         texts = [[f"{value:.2f}" for value in row] for row in values]
-        image = number_grid(plot, values, texts, [(y, x) for x, y in framed], fontsize=8)
+        gray = [(y, x) for x, y in empty]
+        image = number_grid(plot, values, texts, [(y, x) for x, y in framed], fontsize=8, empty=gray)
         figure.colorbar(image, ax=plot, label="rate")
         for axis, (label, places, words) in zip((plot.xaxis, plot.yaxis), ticks, strict=True):
             axis.set_ticks(places, words)

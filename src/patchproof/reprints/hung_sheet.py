@@ -133,9 +133,9 @@ def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:
     return HungSheet(stage, manifest, sent, how.printer_for(scene), how)
 
 
-def hang_own(run: Run) -> HungSheet:
-    """The sheet that the run makes."""
-    return _printed_and_hung(set_stage(run.scene), lambda pdf: sheet_of(run, pdf))
+def hang_own(run: Run, control: str | None = None) -> HungSheet:
+    """The sheet that the run makes, or that of a printed control (as `sheet_of` has them)."""
+    return _printed_and_hung(set_stage(run.scene), lambda pdf: sheet_of(run, pdf, control=control))
 
 
 def hang_piece(stage: Stage, content: PrintedPiece) -> HungSheet:

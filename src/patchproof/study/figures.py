@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
+EMPTY = "#dddddd"  # where there is nothing to see
+
 
 def picture_sheet(
     name: str,
@@ -53,14 +55,17 @@ def number_grid(
     colors: str = "viridis",
     limits: tuple[float, float] = (0.0, 1.0),
     fontsize: float = 7,
+    empty: Sequence[tuple[int, int]] = (),
 ) -> AxesImage:
-    """R×C colored cells with a text in each; `framed` are (row, column)."""
+    """R×C colored cells with a text in each; `framed` and `empty` ones, which say nothing, are (row, column)."""
     from matplotlib.patches import Rectangle
 
     image = axes.imshow(values, cmap=colors, vmin=limits[0], vmax=limits[1], aspect="auto")
+    for row, column in empty:
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=EMPTY))
     for (row, column), value in np.ndenumerate(values):
         red, green, blue, _ = image.cmap(image.norm(value))
-        ink = "black" if 0.3 * red + 0.6 * green + 0.1 * blue > 0.45 else "white"
+        ink = "black" if (row, column) in empty or 0.3 * red + 0.6 * green + 0.1 * blue > 0.45 else "white"
         axes.text(column, row, str(texts[row][column]), ha="center", va="center", color=ink, fontsize=fontsize)
     for row, column in framed:
         axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="red", linewidth=2))

@@ -36,13 +36,13 @@ BEYOND = 2.0  # stands for a breaking point that is not in the sweep
 class Break:
     """Positions in the sweep, `BEYOND` where the curve holds; None where nothing worked at the easy end.
 
-    `rates` are those of the best curve at both ends.
+    `rates` are those of the best curve at both ends; `monotone_p` is None where no curve was fitted.
     """
 
     value: float | None
     low: float | None
     high: float | None
-    monotone_p: float
+    monotone_p: float | None
     rates: tuple[float, float]
 
 

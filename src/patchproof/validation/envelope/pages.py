@@ -2,13 +2,14 @@
 
 In: finished cells. Out: tables, and drawings of which the first is one page to print beside the patch. Breaking points
 come as values of their axis; one outside of the sweep is said to hold, and an interval that ends at the sweep's own end
-is open there.
+is open there. A design breaks where it stops gaining over its controls, whatever label the network answers beyond.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,9 +17,10 @@ import numpy as np
 from patchproof.claims import Estimate, rate
 from patchproof.goal import Goal
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.study.figures import number_grid
+from patchproof.study.figures import EMPTY, number_grid
 from patchproof.validation.envelope.axes import AXES
 from patchproof.validation.envelope.fit import BEYOND, LEAST_LOST, NOT_MONOTONE
+from patchproof.validation.envelope.gains import CONTROLS, gains_of, has_effect
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,10 +28,12 @@ if TYPE_CHECKING:
 
     from patchproof.study.study import Result
 
-STAGES = {"recognized": "recognized", "found": "sheet found", "measured": "measured"}
-_COLORS = {"recognized": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
+STAGES = {"gains": "design gains", "found": "sheet found", "measured": "measured"}
+_COLORS = {"gains": "#2a6f97", "found": "#e09f3e", "measured": "#2a9d6f"}
+_RATES = ("recognized", *CONTROLS, "gain", "effect", "sheet found", "measured")
 End = Break = Mapping[str, Any]  # of a cell's values its axis with both ends; of its answers where a stage breaks
-HOLDS, NEVER = "holds", "never worked"
+HOLDS, NEVER, EFFECT, NO_EFFECT = "holds", "never worked", "gains", "no effect"
+_BESIDE = "the better of the bare object and a gray piece in the same markers, on the same conditions"
 _PAGE_IN = (11.69, 8.27)  # A4, lying
 
 
@@ -41,11 +45,13 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
         Table(
             "breaks",
             "Breaking points",
-            (*ends, *STAGES.values(), "not monotone"),
+            (*ends, *STAGES.values(), "not monotone", f"{NO_EFFECT} at"),
             tuple(_break_row(result) for result in sweeps),
-            "Where a fitted falling curve has lost half of what it loses over the sweep: median of the bootstrap over "
-            f"conditions, 95 % interval. “{HOLDS}”: it loses less than {LEAST_LOST:.0%} of its rate. n conditions: "
-            f"{settings.n} shown to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
+            f"The design gains up to where it does no more than {_BESIDE}: the last point at which the 95 % interval "
+            "of the difference lies above 0, and the first at which it does not. For the sheet, where a fitted falling "
+            "curve has lost half of what it loses over the sweep: median of the bootstrap over conditions, 95 % "
+            f"interval; “{HOLDS}”: it loses less than {LEAST_LOST:.0%} of its rate. n conditions: {settings.n} shown "
+            f"to the network (a quarter where JPEG is varied), {settings.photos} photographed.",
         ),
         Table(
             "beyond",
@@ -57,15 +63,15 @@ def tables(settings: Any, results: Sequence[Result]) -> Sequence[Table]:
         Table(
             "sweeps",
             "All points",
-            ("axis", "value", *STAGES.values(), "median error mm", "largest error mm", "said"),
+            ("axis", "value", *_RATES, "median error mm", "largest error mm", "said"),
             tuple(row for result in sweeps for row in _point_rows(result)),
-            "Errors are the largest of the design's four corners, against the simulation's truth, where a flat sheet "
-            "was measured. Intervals: Wilson.",
+            f"Gain: over {_BESIDE} (Newcombe). “{NO_EFFECT}”: none is shown. Errors are the largest of the design's "
+            "four corners, against the simulation's truth, where a flat sheet was measured. Intervals: Wilson.",
         ),
         Table(
             "maps",
             "Maps",
-            ("x", "y", "at x", "at y", *STAGES.values()),
+            ("x", "y", "at x", "at y", *_RATES),
             tuple(row for result in maps for row in _map_rows(result)),
             f"n per point: {settings.map_n} recognized, {settings.map_photos} photographed.",
         ),
@@ -81,8 +87,10 @@ def figures(settings: Any, results: Sequence[Result]) -> Sequence[Drawing]:
         "Operating envelope",
         lambda figure: _draw_page(figure, sweeps, maps),
         _PAGE_IN,
-        "Bars run from the easy end to where half of what the sweep takes is lost; whiskers: 95 % intervals; →: it "
-        "holds; !: not monotone; in brackets the fitted rates at both ends.",
+        f"The design gains where it does better than {_BESIDE} (95 %); beyond, it has no effect, whatever the "
+        "network answers. Beside its bar: the last point with a gain and the first without, in brackets the gains "
+        "at both ends. Bars of the sheet run to where half of what the sweep takes is lost; whiskers: 95 % intervals; "
+        "→: it holds; !: not monotone; in brackets the fitted rates at both ends.",
     )
     return (page,)
 
@@ -92,26 +100,31 @@ def _split(results: Sequence[Result]) -> tuple[list[Result], list[Result]]:
     return sweeps, maps
 
 
-def worked(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """P×N bool by stage."""
+def found_and_measured(answers: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """P×N bool by stage of the sheet."""
     status = np.array(answers["status"])
-    return {
-        "recognized": np.array(answers["recognized"], bool),
-        "found": status != "rejected",
-        "measured": status == "measured",
-    }
+    return {"found": status != "rejected", "measured": status == "measured"}
+
+
+def gains_in(answers: Mapping[str, Any]) -> list[Estimate]:
+    """Per point how much more often the design worked than the better control."""
+    controls = {kind: np.array(hits, bool) for kind, hits in answers["controls"].items()}
+    return gains_of(np.array(answers["recognized"], bool), controls)
 
 
 def _break_row(result: Result) -> tuple[Value, ...]:
-    x, breaks = result.cell.values["x"], result.answers["breaks"]
-    axis, works = AXES[x["axis"]], worked(result.answers)
+    x, answers = result.cell.values["x"], result.answers
+    axis, breaks = AXES[x["axis"]], answers["breaks"]
     rising = [f"{STAGES[name]} (p = {b['monotone_p']:.3f})" for name, b in breaks.items() if _rises(b)]
-    values = [_break_value(x, breaks[name], works[name].shape[1]) for name in STAGES]
-    return axis.title, axis.unit, x["easy"], x["hard"], *values, ", ".join(rising)
+    shown, photographed = len(answers["recognized"][0]), len(answers["status"][0])
+    values = [_break_value(x, breaks[name], shown if name == "gains" else photographed) for name in STAGES]
+    gains = zip(answers["points"], gains_in(answers), strict=True)
+    without = [_short(point[x["axis"]]) for point, gain in gains if not has_effect(gain)]
+    return axis.title, axis.unit, x["easy"], x["hard"], *values, ", ".join(rising), ", ".join(without)
 
 
 def _rises(break_: Break) -> bool:
-    return break_["monotone_p"] < NOT_MONOTONE
+    return break_["monotone_p"] is not None and break_["monotone_p"] < NOT_MONOTONE
 
 
 def _break_value(x: End, break_: Break, n: int) -> Value:
@@ -143,21 +156,32 @@ def _counted(codes: Sequence[str | None]) -> str:
 
 def _point_rows(result: Result) -> list[tuple[Value, ...]]:
     name, answers = result.cell.values["x"]["axis"], result.answers
-    works, rows = worked(answers), []
-    for i, point in enumerate(answers["points"]):
+    rows = []
+    for i, (point, rates) in enumerate(zip(answers["points"], _rates(answers), strict=True)):
         errors = [e for e in answers["error_mm"][i] if e is not None]
         median, largest = (float(np.median(errors)), max(errors)) if errors else (None, None)
-        rates = [rate(works[stage][i].tolist()) for stage in STAGES]
         rows.append((AXES[name].title, point[name], *rates, median, largest, _counted(answers["code"][i])))
     return rows
 
 
 def _map_rows(result: Result) -> list[tuple[Value, ...]]:
-    x, y = (result.cell.values[key]["axis"] for key in ("x", "y"))
-    works = worked(result.answers)
+    (x, y), answers = (result.cell.values[key]["axis"] for key in ("x", "y")), result.answers
+    points = zip(answers["points"], _rates(answers), strict=True)
+    return [(AXES[x].title, AXES[y].title, point[x], point[y], *rates) for point, rates in points]
+
+
+def _rates(answers: Mapping[str, Any]) -> list[tuple[Value, ...]]:
+    """Per point what `_RATES` names."""
+    shown = [answers["recognized"], *(answers["controls"][kind] for kind in CONTROLS)]
+    sheet = found_and_measured(answers).values()
     return [
-        (AXES[x].title, AXES[y].title, point[x], point[y], *(rate(works[stage][i].tolist()) for stage in STAGES))
-        for i, point in enumerate(result.answers["points"])
+        (
+            *(rate(hits[i]) for hits in shown),
+            gain,
+            EFFECT if has_effect(gain) else NO_EFFECT,
+            *(rate(hits[i].tolist()) for hits in sheet),
+        )
+        for i, gain in enumerate(gains_in(answers))
     ]
 
 
@@ -176,39 +200,60 @@ def _draw_page(figure: Figure, sweeps: Sequence[Result], maps: Sequence[Result])
             _draw_map(axes, result)
         for axes in right.axes[len(maps) :]:
             axes.set_axis_off()
-        note = "number: share recognized, %; ×: fewer than half of the photographs can be measured"
-        right.supxlabel(note, fontsize=7)
+        right.supxlabel(
+            f"above: share recognized, %; below: gain over the better control; gray: {NO_EFFECT} shown\n"
+            "×: fewer than half of the photographs can be measured",
+            fontsize=7,
+        )
 
 
 def _draw_bars(axes: Axes, sweeps: Sequence[Result]) -> None:
     for row, result in enumerate(sweeps):
         x = result.cell.values["x"]
         for k, (stage, color) in enumerate(_COLORS.items()):
-            label = None if row else STAGES[stage]
-            _draw_bar(axes, row + 0.24 * (k - 1), x, result.answers["breaks"][stage], color, label)
+            label, y = None if row else STAGES[stage], row + 0.24 * (k - 1)
+            if stage == "gains":
+                _draw_without(axes, y, [has_effect(gain) for gain in gains_in(result.answers)], color)
+            _draw_bar(axes, y, x, result.answers["breaks"][stage], color, label)
         axis = AXES[x["axis"]]
         axes.text(-0.02, row, f"{axis.title}\n{axis.unit}", ha="right", va="center", fontsize=7.5)
         axes.text(0.0, row + 0.46, _short(x["easy"]), ha="left", va="center", fontsize=6, alpha=0.7)
         axes.text(1.0, row + 0.46, _short(x["hard"]), ha="right", va="center", fontsize=6, alpha=0.7)
-    axes.set_xlim(-0.3, 1.22)
+    axes.set_xlim(-0.3, 1.3)
     axes.set_ylim(len(sweeps) - 0.3, -0.7)
     axes.set_axis_off()
     axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.55, 1.04), frameon=False, fontsize=8)
 
 
+def _draw_without(axes: Axes, y: float, gains: Sequence[bool], color: str) -> None:
+    """Beyond its breaking point: where the design has no effect, and where it gains again."""
+    ends = [0.0, *((np.arange(len(gains) - 1) + 0.5) / (len(gains) - 1)).tolist(), 1.0]  # half way between the points
+    for gaining, run in groupby(range(len(gains)), lambda i: gains[i]):
+        left, *_, right = (ends[i] for point in run for i in (point, point + 1))
+        if not gaining:
+            axes.barh(y, right - left, left=left, height=0.2, color=EMPTY)
+            axes.text((left + right) / 2, y, NO_EFFECT, ha="center", va="center", fontsize=5.5)
+        elif left:
+            axes.barh(y, right - left, left=left, height=0.2, color=color, alpha=0.75)
+
+
 def _draw_bar(axes: Axes, y: float, x: End, break_: Break, color: str, label: str | None) -> None:
     value, low, high = (break_[name] for name in ("value", "low", "high"))
     axes.barh(y, min(value or 0.0, 1.0), height=0.2, color=color, alpha=0.75, label=label)
+    of_sheet = break_["monotone_p"] is not None
     if value is None:
-        axes.text(0.01, y, NEVER, va="center", fontsize=6.5)
+        axes.text(0.01, y, NEVER if of_sheet else "", va="center", fontsize=6.5)
         return
     if value >= BEYOND:
         axes.text(1.01, y, "→", va="center", fontsize=8, color=color)
         return
-    axes.plot([low, min(high, 1.0)], [y, y], color="black", linewidth=0.9)
     first, last = break_["rates"]
-    text = f"{_short(_at(x, value))} ({first:.2f}–{last:.2f})" + (" !" if _rises(break_) else "")
-    axes.text(min(high, 1.0) + 0.01, y, text, va="center", fontsize=6.5)
+    where, end = f"{_short(_at(x, low))} to {_short(_at(x, high))}", 1.0
+    if of_sheet:
+        where, end = _short(_at(x, value)), min(high, 1.0)
+        axes.plot([low, end], [y, y], color="black", linewidth=0.9)
+    text = f"{where} ({first:.2f}, {last:.2f})" + (" !" if _rises(break_) else "")
+    axes.text(end + 0.01, y, text, va="center", fontsize=6.5)
 
 
 def _short(value: float) -> str:
@@ -218,11 +263,12 @@ def _short(value: float) -> str:
 def _draw_map(axes: Axes, result: Result) -> None:
     x, y = result.cell.values["x"], result.cell.values["y"]
     shape = (y["points"], x["points"])
-    works = worked(result.answers)
-    share, can = (works[stage].mean(1).reshape(shape) for stage in ("recognized", "measured"))
-    rows = zip(share, can, strict=True)
-    texts = [[f"{100 * a:.0f}" + ("×" if b < 0.5 else "") for a, b in zip(*row, strict=True)] for row in rows]
-    number_grid(axes, share, texts, colors="RdYlGn", fontsize=6)
+    share = np.mean(result.answers["recognized"], 1).reshape(shape)
+    can, gains = found_and_measured(result.answers)["measured"].mean(1).reshape(shape), gains_in(result.answers)
+    gain = np.reshape([100 * each.value for each in gains], shape)
+    without = [divmod(i, x["points"]) for i, each in enumerate(gains) if not has_effect(each)]
+    texts = np.vectorize(lambda a, b, c: f"{100 * a:.0f}{'×' if c < 0.5 else ''}\n{b:+.0f}")(share, gain, can)
+    number_grid(axes, gain / 100, texts, colors="Greens", fontsize=6, empty=without)
     axes.invert_yaxis()
     for drawn, end in ((axes.xaxis, x), (axes.yaxis, y)):
         axis = AXES[end["axis"]]

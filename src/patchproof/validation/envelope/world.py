@@ -1,9 +1,10 @@
 """The photographs behind an operating envelope, what a network makes of them, and what the tool measures in them.
 
-In: a run and points (values of axes). Out: per point and condition whether the target was recognized, and the codes and
-corner errors of full photographs. The piece comes from the sheet's PDF, as in `reprint`. Recognition is judged at the
-promise's resolution, except where JPEG is varied: that is met at full size or not at all. Of a photograph that is to be
-measured only the window around the piece is rendered (see `window`).
+In: a run and points (values of axes). Out: per point and condition whether the target was recognized, of the design, of
+the bare object and of a gray piece in its place; and the codes and corner errors of full photographs. Pieces come from
+the PDFs of their sheets, as in `reprint`, and what a point does to the design it does to the gray one. Recognition is
+judged at the promise's resolution, except where JPEG is varied: that is met at full size or not at all. Of a photograph
+that is to be measured only the window around the piece is rendered (see `window`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +38,7 @@ from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene, needs_mesh, needs_piece
 from patchproof.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
+from patchproof.validation.envelope.gains import CONTROLS
 from patchproof.validation.envelope.window import Frame, on_plain_ground, window
 
 _TAPE_SRGB = 0.45  # what hides a corner
@@ -43,11 +46,12 @@ _TAPE_SRGB = 0.45  # what hides a corner
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A run with its hung sheet, the sheet's surface, and a printer that was not promised."""
+    """A run with its hung sheet and the gray control's, the sheet's surface, and a printer that was not promised."""
 
     run: Run
     problem: Problem
     sheet: HungSheet
+    gray: HungSheet
     surface: Surface
     other: Printer
 
@@ -73,13 +77,13 @@ def open_world(folder: Path, other_printer: str | None) -> World:
     needs_piece(run.scene, "name the run of a printed patch")
     profile = run.scene.settings.printer.profile
     other = other_printer or ("coated" if profile == "uncoated" else "uncoated")
-    sheet = hang_own(run)
-    return World(run, set_problem(run.scene), sheet, surface_of(sheet.manifest), load_printer(other, run.scene.base))
+    sheet, printer = hang_own(run), load_printer(other, run.scene.base)
+    return World(run, set_problem(run.scene), sheet, hang_own(run, "gray"), surface_of(sheet.manifest), printer)
 
 
-def piece_at(world: World, point: Point, first_corner: int) -> PiecePicture:
+def piece_at(world: World, point: Point, first_corner: int, gray: bool = False) -> PiecePicture:
     """The piece as this point's printer shows it, with quarters hidden beginning at one of its corners."""
-    whole = _printed(world, float(point.get("mismatch", 0.0)))
+    whole = _printed(world, gray, float(point.get("mismatch", 0.0)))
     if not point.get("hidden"):
         return whole
     srgb, left = whole.srgb.clone(), float(point["hidden"])
@@ -94,20 +98,21 @@ def piece_at(world: World, point: Point, first_corner: int) -> PiecePicture:
     return replace(whole, srgb=srgb)
 
 
-@lru_cache(maxsize=8)
-def _printed(world: World, mismatch: float) -> PiecePicture:
+@lru_cache(maxsize=12)  # both pieces at a sweep's six points
+def _printed(world: World, gray: bool, mismatch: float) -> PiecePicture:
     """The printed piece with `mismatch` times the difference between the two printers added."""
+    sheet = world.gray if gray else world.sheet
 
     def seen(sent: Tensor) -> Tensor:
-        promised = world.sheet.printer.apply(sent)
+        promised = sheet.printer.apply(sent)
         return (promised + mismatch * (world.other.apply(sent) - promised)).clamp(0, 1) if mismatch else promised
 
-    return world.sheet.printed(seen)
+    return sheet.printed(seen)
 
 
-def recognized(world: World, points: Sequence[Point], conditions: Conditions) -> np.ndarray:
-    """P×N bool: whether the run's first network sees the target."""
-    out = np.zeros((len(points), len(conditions)), bool)
+def recognized(world: World, points: Sequence[Point], conditions: Conditions) -> dict[str, np.ndarray]:
+    """P×N bool by what is shown, the design and `CONTROLS`: whether the run's first network sees the target."""
+    out = {kind: np.zeros((len(points), len(conditions)), bool) for kind in ("design", *CONTROLS)}
     as_file = any("jpeg" in point for point in points)
     side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
     stages, first_network = _Stages(world), world.problem.before([0])
@@ -117,9 +122,10 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
             size = 1 if as_file else AT_A_TIME
             for rows in (every[i : i + size] for i in range(0, len(every), size)):
                 views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
-                for i in _by_cost(points):
-                    pictures = views.at(points[i]) if not as_file else from_pixels(views.file(points[i])[0])[None]
-                    out[i, rows] = ask(first_network, pictures).recognized
+                for i, kind in product(_by_cost(points), out):
+                    file = views.file(points[i], kind)[0] if as_file else None
+                    pictures = views.at(points[i], kind) if file is None else from_pixels(file)[None]
+                    out[kind][i, rows] = ask(first_network, pictures).recognized
     return out
 
 
@@ -157,30 +163,35 @@ class _Views:
 
     def __init__(self, world: World, drawn: Conditions, first: int, frame_of: Callable[[Point, Conditions], Frame]):
         self._world, self._drawn, self._first, self._frame_of = world, drawn, first, frame_of
-        self._kept: tuple[tuple, Views] | None = None
-        self._picture: tuple[Point, Tensor] | None = None
+        self._kept: tuple[Point, Views] | None = None
+        self._pictures: dict[str, tuple[Point, Tensor]] = {}
         self._origin_px = (0, 0)
 
-    def at(self, point: Point, jpeg: bool = True) -> Tensor:
-        """N×3×H×W pictures."""
-        shown = piece_at(self._world, point, self._first)
-        conditions = conditions_at(self._world.scene, self._drawn, point)
-        if self._kept is None or self._kept[0] != _geometry(point):
-            frame = self._frame_of(point, conditions)
-            self._origin_px = frame.origin_px
-            views = see(frame.stage, shown, conditions, frame.size_px)
-        else:
-            views = relit(self._kept[1], conditions)
-        self._kept = _geometry(point), views
-        return expose(views, shown, jpeg)
+    def at(self, point: Point, kind: str = "design", jpeg: bool = True) -> Tensor:
+        """N×3×H×W pictures of the design, or of a control."""
+        shown = None if kind == "bare" else piece_at(self._world, point, self._first, kind == "gray")
+        return expose(self._views(point), shown, jpeg)
 
-    def file(self, point: Point) -> tuple[np.ndarray, tuple[int, int]]:
+    def file(self, point: Point, kind: str = "design") -> tuple[np.ndarray, tuple[int, int]]:
         """The only picture as uint8 H×W×3, read back from a JPEG file of its quality, and where its corner lies."""
         rest = {name: value for name, value in point.items() if name != "jpeg"}
-        if self._picture is None or self._picture[0] != rest:
-            self._picture = rest, self.at(rest, jpeg=False)
+        if kind not in self._pictures or self._pictures[kind][0] != rest:
+            self._pictures[kind] = rest, self.at(rest, kind, jpeg=False)
         drawn = conditions_at(self._world.scene, self._drawn, point)
-        return image_pixels(jpeg_of(self._picture[1], drawn)), self._origin_px
+        return image_pixels(jpeg_of(self._pictures[kind][1], drawn)), self._origin_px
+
+    def _views(self, point: Point) -> Views:
+        """The point's views, in which any piece of the sheet's size can be shown."""
+        if self._kept is None or self._kept[0] != point:
+            conditions = conditions_at(self._world.scene, self._drawn, point)
+            if self._kept is None or _geometry(self._kept[0]) != _geometry(point):
+                frame = self._frame_of(point, conditions)
+                self._origin_px = frame.origin_px
+                views = see(frame.stage, piece_at(self._world, {}, 0), conditions, frame.size_px)
+            else:
+                views = relit(self._kept[1], conditions)
+            self._kept = point, views
+        return self._kept[1]
 
 
 def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px) -> Measurement:
