@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from patchproof.channel.effects import FIELDS
-from patchproof.experiments.stress import OcclusionSettings, SearchSettings, occluded, worst_case
+from patchproof.experiments.stress import OcclusionSettings, SearchSettings, _empty_cells, occluded, worst_case
 from patchproof.experiments.stress_map import (
     LIGHT,
     Axis,
@@ -29,6 +29,7 @@ from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
 from patchproof.study.grid import GridSettings
+from patchproof.study.record import bits
 from patchproof.study.study import run_study
 
 SCENE = {
@@ -112,10 +113,26 @@ def test_a_map_shows_where_light_fails(tmp_path):
     light = {"ambient": [0.0, 1.2], "directional": [0, 0]}
     problem = problem_with(tmp_path, target=BRIGHT, light=light, camera={"exposure_ev": [0, 0]}, **dark)
     both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=2, light_cells=3))
-    hits, confidence = map_of(problem, both, problem.scene.draw("select", 8))
-    assert hits.shape == confidence.shape == (2, 3, 8)
+    hits, confidence, alone = map_of(problem, both, problem.scene.draw("select", 8))
+    assert hits.shape == confidence.shape == alone.shape == (2, 3, 8) and not alone.any()
     assert not hits[:, 0].any() and (confidence.mean((0, 2))[1:] > confidence.mean((0, 2))[:-1]).all()
     assert worst_cells(hits, confidence)[0][1] == 0
+
+
+def test_cells_where_the_object_is_recognized_no_more_often_than_its_background_are_empty(tmp_path):
+    """Before black the lit object is bright and the background is not; before white it is, with the object or not."""
+    light = {"ambient": [0.0, 4.0], "directional": [0, 0]}
+    view = {"azimuth_deg": [-10, 10], "elevation_deg": [0, 5], "distance_mm": [280, 290], "look_at_jitter": 0}
+    look, empty = {"view": view, "camera": {"exposure_ev": [0, 0]}}, {}
+    for color in (0, 1):
+        problem = problem_with(tmp_path, target=BRIGHT, light=light, background={"color": [color] * 3}, **look)
+        both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=1, light_cells=8))
+        hits, _, alone = map_of(problem, both, problem.scene.draw("select", 8))
+        assert alone.all() == alone.any() == color
+        map_ = {"hits": [[bits(cell) for cell in hits[0]]], "alone": [[bits(cell) for cell in alone[0]]]}
+        empty[color] = _empty_cells(map_)
+        assert hits[0, 7].all()
+    assert (0, 0) in empty[0] and (0, 7) not in empty[0] and len(empty[1]) == 8
 
 
 # ------------------------------------------------------------------------------------------ black squares, searches
@@ -178,7 +195,9 @@ def test_the_stress_study_leaves_tables_maps_and_a_page_twice_alike(tmp_path):
     who = "scene.builtin.0"
     assert {f"stress_{what}_{who}.png" for what in ("map0", "occlusion", "views")} <= names
     assert [row[3] for row in finished.tables[0].rows] == ["worst pose", "worst light", "black square", "map"]
-    assert len(finished.tables[1].rows) == 4 and all(row[-2].n == 2 for row in finished.tables[1].rows)
+    rates, effects = zip(*((row[9:12], row[12]) for row in finished.tables[1].rows), strict=True)
+    assert len(rates) == 4 and all(each.n == 2 for row in rates for each in row)
+    assert set(effects) <= {"seen", "no effect"}
     for name in ("stress_worst.csv", "stress_maps.csv", "stress.html", "stress.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from patchproof.channel.printer import identity_printer, load_printer
+from patchproof.claims import wilson
 from patchproof.classifier import Classifier
 from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
 from patchproof.evidence.appearance import _fitted_by_others, cells_fit
@@ -275,6 +276,35 @@ def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
     assert prediction.label == "bright" and prediction.recognized
     assert prediction.confidence == prediction.target_confidence > 0.5
     assert report.photos[0].predictions == {} and report.photos[-1].predictions
+
+
+def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(folder, tmp_path):
+    """A network may have one answer for everything: pure noise, a black picture and a white one are no evidence."""
+    rng = np.random.default_rng(0)
+    always = Classifier("net", "ab" * 32, 32, ("bright", "dark"), lambda p: torch.tensor([[9.0, 0]]).expand(len(p), 2))
+    pictures = {
+        "noise": rng.integers(0, 256, (240, 320, 3)),
+        "faint": rng.normal(128, 3, (240, 320, 3)),
+        "black": np.zeros((240, 320, 3)),
+        "white": np.full((240, 320, 3), 255),
+    }
+    for name, picture in pictures.items():
+        save(picture.astype(np.uint8), tmp_path / f"{name}.png")
+
+    def report():
+        return gather_evidence(tmp_path, make_manifest(promise()), Options([always], identity_printer()))
+
+    nothing = report()
+    for photo in nothing.photos:
+        assert photo.predictions["net"].recognized
+        assert (photo.status, photo.code, photo.markers_found) == ("rejected", "too_few_markers", 0)
+    summary = nothing.summary
+    assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 0, None, "cannot_tell")
+    assert [(s.recognized, s.judged) for s in summary.sessions] == [(0, 0)] * len(summary.sessions)
+    (tmp_path / "b0.jpg").write_bytes((folder / "b0.jpg").read_bytes())  # beside one that shows the sheet
+    summary = report().summary
+    assert (summary.judged, summary.models["net"].interval) == (1, wilson(1, 1))
+    assert sum(s.recognized for s in summary.sessions) == 1 and summary.verdict == "cannot_tell"
 
 
 def test_two_processes_give_the_same_bytes_as_one(folder):
