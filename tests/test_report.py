@@ -111,6 +111,17 @@ def test_the_page_says_what_the_report_says_and_escapes_it(tmp_path):
     assert text.count("<svg") == 4  # tilt, pixels per mm, print scale, ledger
 
 
+def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recognized(tmp_path):
+    report = some_report()
+    rejected = report.photos[-1].changed(predictions=report.photos[0].predictions)
+    manifest = make_manifest(promise()).model_dump(mode="json")
+    words = "<span>recognized</span>", "<span>not counted</span>"
+    for photos, word in ((report.photos[:1], words[0]), ((rejected,), words[1])):
+        write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path, None)
+        page = (tmp_path / "report.html").read_text("utf-8")
+        assert [each for each in words if each in page] == [word]
+
+
 def test_json_is_the_report_and_nothing_else(tmp_path):
     written(tmp_path)
     assert json.loads((tmp_path / "report.json").read_text()) == some_report().model_dump(mode="json")

@@ -2,11 +2,10 @@
 
 In: what worked, conditions × points, and where in the sweep the points lie (0 easy, 1 hard). Out: `Break`. The curve
 is a logistic between two levels; its breaking point is where it has lost half of what the sweep takes from it, if that
-is a quarter or more of what it began with. (Half of what it began with would be simpler, but an object that is
-recognized half of the time without its patch hovers there for ever.) Likelihood is maximized over a grid, which never
-fails to converge and shows where data leave the curve open: between two points of rate 1 and 0 the breaking point may
-lie anywhere, and the interval says so. All points share their conditions, and whole conditions are drawn anew for the
-bootstrap, so that what they have in common does not pass for precision.
+is a quarter or more of what it began with. Likelihood is maximized over a grid, which never fails to converge and shows
+where data leave the curve open: between two points of rate 1 and 0 the breaking point may lie anywhere, and the interval
+says so. All points share their conditions, and whole conditions are drawn anew for the bootstrap, so that what they
+have in common does not pass for precision.
 
 A curve that falls is fitted whatever the data do. Whether they contradict it is tested apart: the distance from the
 best falling rates against that of bootstrap samples moved to where the rates do fall.
@@ -26,7 +25,7 @@ from patchproof.claims import wilson
 
 DRAWS = 200
 TOLERANCE = 0.1  # in log-likelihood: curves this near to the best are as good as it
-NOT_MONOTONE = 0.01  # three curves to a sweep are tested at once
+NOT_MONOTONE = 0.01  # two curves to a sweep are tested at once
 LEAST_AT_EASY_END = 0.05  # Wilson's lower end of the rate there, below which there is nothing to lose
 LEAST_LOST = 0.25  # of the rate at the easy end: what loses less over the whole sweep holds
 BEYOND = 2.0  # stands for a breaking point that is not in the sweep
