@@ -3,9 +3,9 @@
 In: what worked, conditions × points, and where in the sweep the points lie (0 easy, 1 hard). Out: `Break`. The curve
 is a logistic between two levels; its breaking point is where it has lost half of what the sweep takes from it, if that
 is a quarter or more of what it began with. Likelihood is maximized over a grid, which never fails to converge and shows
-where data leave the curve open: between two points of rate 1 and 0 the breaking point may lie anywhere, and the interval
-says so. All points share their conditions, and whole conditions are drawn anew for the bootstrap, so that what they
-have in common does not pass for precision.
+where data leave the curve open: between two points of rate 1 and 0 the breaking point may lie anywhere, as the
+interval says. All points share their conditions, and whole conditions are drawn anew for the bootstrap, so that what
+they have in common does not pass for precision.
 
 A curve that falls is fitted whatever the data do. Whether they contradict it is tested apart: the distance from the
 best falling rates against that of bootstrap samples moved to where the rates do fall.
