@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from patchproof.evidence.verdict import compare, kept_chance
+from patchproof.evidence.verdict import EACH, KEPT, compare, kept_chance
 from patchproof.goal import Goal
-from patchproof.printing.shots import EACH, KEPT, fewest, paired_power, plan_shots, unpaired_power
+from patchproof.printing.shots import fewest, paired_power, plan_shots, unpaired_power
 from test_verify_verdict import promise_of
 
 

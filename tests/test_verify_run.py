@@ -313,7 +313,7 @@ def test_two_processes_give_the_same_bytes_as_one(folder):
 
 def test_controls_decide_the_effect(folder, tmp_path):
     for i in range(6):
-        save(np.full((100, 100, 3), 20, np.uint8), tmp_path / f"b{i}.jpg")
+        save(np.full((100, 100, 3), 20 + i, np.uint8), tmp_path / f"b{i}.jpg")
     evidence = verified(folder, controls=tmp_path)
     assert evidence.summary.effect == "shown"
     (control,) = evidence.controls

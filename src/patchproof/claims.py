@@ -115,8 +115,15 @@ def paired_difference(a: list[bool], b: list[bool]) -> tuple[float, tuple[float,
 
 def independent_difference(successes_a: int, n_a: int, successes_b: int, n_b: int) -> tuple[float, tuple[float, float]]:
     """Rate of a minus rate of b on different images, with Newcombe's interval of two Wilson scores."""
-    (low_a, high_a), (low_b, high_b) = wilson(successes_a, n_a), wilson(successes_b, n_b)
-    rate_a, rate_b = successes_a / max(n_a, 1), successes_b / max(n_b, 1)
+    rates = successes_a / max(n_a, 1), successes_b / max(n_b, 1)
+    return rates_difference(rates[0], wilson(successes_a, n_a), rates[1], wilson(successes_b, n_b))
+
+
+def rates_difference(
+    rate_a: float, interval_a: tuple[float, float], rate_b: float, interval_b: tuple[float, float]
+) -> tuple[float, tuple[float, float]]:
+    """Rate a minus rate b on different images, with the interval that theirs make (Newcombe's method 10)."""
+    (low_a, high_a), (low_b, high_b) = interval_a, interval_b
     difference = rate_a - rate_b
     low = difference - math.hypot(rate_a - low_a, high_b - rate_b)
     return difference, (low, difference + math.hypot(high_a - rate_a, rate_b - low_b))

@@ -6,6 +6,7 @@ beside it where one was measured.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -274,6 +275,17 @@ class SceneSettings(Strict):
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
         return self
+
+
+def behind(settings: Mapping[str, Any]) -> str:
+    """What stood behind the object, in words, of a scene's settings as plain data; "" where they do not say."""
+    if (settings.get("object") or {}).get("mesh") is None:
+        return "the scene's own pictures" if "object" in settings else ""
+    background = settings.get("background") or {}
+    if background.get("color") is not None:
+        return "ONE PLAIN COLOR, before which patches gain far more than in real places"
+    images = background.get("images")
+    return "procedural rooms" if images is None else f"pictures ({Path(images).name})"
 
 
 def load_scene_settings(path: str | Path) -> SceneSettings:

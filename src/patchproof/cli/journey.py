@@ -78,6 +78,7 @@ def optimize(
     from patchproof.optimizer.places import place_lines
     from patchproof.optimizer.run import optimize_scene
     from patchproof.report.summary import promise_lines
+    from patchproof.settings import behind
 
     if require not in (None, "better"):
         raise typer.BadParameter('takes "better" only', param_hint="--require")
@@ -95,7 +96,8 @@ def optimize(
             on_promise=lambda done, total: bar("promise", done, total),
         )
     place = read_place(out)
-    say(*promise_lines(run.promise), *([] if place is None else place_lines(place)), f"run: {out}")
+    background = behind(run.scene.settings.model_dump())
+    say(*promise_lines(run.promise, background), *([] if place is None else place_lines(place)), f"run: {out}")
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
 
 
@@ -142,6 +144,7 @@ def sheet(
     from patchproof.optimizer.run import load_run
     from patchproof.output import check_file
     from patchproof.printing.sheet import blank_page, sheet_of, sheet_of_several
+    from patchproof.settings import behind
     from patchproof.sheets.shop import shop_lines
     from patchproof.sheets.write import check_sheet, manifest_paths
 
@@ -158,7 +161,13 @@ def sheet(
     else:
         manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=control)
     for manifest, path in zip(manifests, paths, strict=True):
-        say(*([] if manifest.promise is None else [manifest.promise.headline]))
+        say(
+            *(
+                []
+                if manifest.promise is None
+                else [manifest.promise.headline, f"promised before {behind(manifest.settings)}"]
+            )
+        )
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
         lines = (line for manifest in manifests for line in check_sheet(manifest))

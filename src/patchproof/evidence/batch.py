@@ -30,9 +30,10 @@ from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
 from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.exif import of_a_camera
 from patchproof.photo.limits import limited
 from patchproof.photo.quality import FrameLight
-from patchproof.photo.read import read_photo
+from patchproof.photo.read import Photo, read_photo
 from patchproof.strict import Finite, Share, Strict
 from patchproof.workers import WorkerDied, Workers, result_of
 
@@ -40,6 +41,7 @@ WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keep
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
+_PART = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 
 # linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
 Light = Annotated[Finite, Field(ge=-4, le=4)]
@@ -157,11 +159,19 @@ def _measure(task: Task, item: Item) -> MeasuredPhoto:
         return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
     view = view_of(photo, task.camera)
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi)
+    if measured.counted and measured.entry.code is None and _is_part(photo, task):
+        measured = replace(measured, entry=measured.entry.changed(remark=Remark(code="cropped", advice=_PART)))
     if not item.with_pictures:
         return replace(measured, pictures={}, squares=squares)
     geometry = measured.entry.geometry
     small = _thumbnail(view.srgb, geometry and geometry.homography_px_from_mm, task.surface)
     return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
+
+
+def _is_part(photo: Photo, task: Task) -> bool:
+    """Whether it is a crop or a screenshot: EXIF or its name says so, or cameras and the promise have other shapes."""
+    height, width = photo.srgb.shape[:2]
+    return photo.part or not of_a_camera((width, height), task.photo_px)
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:

@@ -44,7 +44,13 @@ PRINT_AND_LIGHT = "print_light_and_camera"
 LEAST_PHOTOS = LEAST_CLUSTERS
 LEAST_SHARE = 0.05  # a culprit costs at least as much
 _RESAMPLES = 2000
-_USABLE = (None, "clipped", "blurred", "too_small")  # codes of photographs whose homography can still be believed
+_USABLE = (
+    None,
+    "clipped",
+    "blurred",
+    "too_small",
+    "cropped",
+)  # codes of photographs whose homography can still be believed
 
 
 def usable(status: str, code: str | None) -> bool:

@@ -44,10 +44,17 @@ MOST_SCALE_ERROR = 0.01
 _MOST_PERSPECTIVE = 0.005  # of a scan: relative change of length between opposite sides; scanners have none
 _SIZES = (0.8, 1.25)  # prints off by more than this are no prints of this page
 _COME_CLOSER = "come closer or use the camera's full resolution"
+_SQUARELY = "look at the patch more squarely: so far from the side its cells are too narrow"
 _FEW = "show more of the piece: its markers fix where it lies"
 _FEW_AGREE = "too few markers agree to tell flat paper from bent: show all of the piece"
 _BENT = "the markers lie neither in a plane nor on rolled paper: press the sheet flat and show all of it"
-_SHIFTED = "the design lies elsewhere than its markers say, on paper that is bent between them: press the sheet flat"
+_BENT_ANEW = (
+    "the markers do not lie as on paper that is rolled in one direction: show all of the piece from nearer to the "
+    "middle of its bend, and glue down what stands off the surface"
+)
+_SHIFTED = (
+    "the design lies elsewhere than its markers say, on paper that is bent between them: press it down on its surface"
+)
 _HIDDEN = "a corner of the design is covered, folded away or out of the picture: show all of it"
 
 
@@ -185,16 +192,21 @@ def _trouble(
     shift, most_shift = geometry.design_shift_mm or 0.0, MOST_SHIFT * side_mm
     most_uncertain = min(MOST_UNCERTAIN * side_mm, MOST_UNCERTAIN_MM)
     uncertain = uncertainty > most_uncertain
+    # foreshortened to cos(tilt); px_per_mm is the mean of both directions
+    cosine = float(np.cos(np.radians(tilt)))
+    small = _SQUARELY if side_px >= SMALLEST_DESIGN_PX * cosine**0.5 else _COME_CLOSER
+    unsure = _SQUARELY if uncertainty * cosine <= most_uncertain else _COME_CLOSER
+    curled = _BENT_ANEW if surface.bent else _BENT
     for wrong, code, figure, limit, advice in (
         (tilt > MOST_TILT_DEG, "tilted", tilt, MOST_TILT_DEG, "look at the patch less from the side"),
         (blur > most_blur, "blurred", blur, most_blur, "hold still, tap to focus on the patch, or use more light"),
-        (side_px < SMALLEST_DESIGN_PX, "too_small", side_px, SMALLEST_DESIGN_PX, _COME_CLOSER),
+        (side_px < SMALLEST_DESIGN_PX, "too_small", side_px, SMALLEST_DESIGN_PX, small),
         (agreeing < least, "too_few_markers", agreeing, least, _FEW_AGREE),
-        (bent, "curled", residual, most_residual, _BENT),
-        (bend > most_bend, "curled", bend, most_bend, _BENT),
-        (fit.odd_mm > MOST_ODD * side_mm, "curled", fit.odd_mm, MOST_ODD * side_mm, _BENT),
+        (bent, "curled", residual, most_residual, curled),
+        (bend > most_bend, "curled", bend, most_bend, curled),
+        (fit.odd_mm > MOST_ODD * side_mm, "curled", fit.odd_mm, MOST_ODD * side_mm, curled),
         (uncertain and markers < 3, "too_few_markers", markers, 3, _FEW),
-        (uncertain, "too_small", uncertainty, most_uncertain, _COME_CLOSER),
+        (uncertain, "too_small", uncertainty, most_uncertain, unsure),
         (shift > most_shift, "curled", shift, most_shift, _SHIFTED),
         (corners < 4, "too_few_markers", corners, 4, _HIDDEN),
     ):

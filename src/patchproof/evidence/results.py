@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from patchproof.evidence.worth import Worth
 from patchproof.photo.cannot import CannotJudge
 from patchproof.strict import Finite, Strict
 
@@ -213,7 +214,7 @@ class SessionCount(Strict):
 
 class Summary(Strict):
     """All photographs together, for the promise's primary model. The rate's interval knows how much sessions differ,
-    and `sessions_known_from` says how sessions were told apart.
+    and `sessions_known_from` says how sessions were told apart; `left_out` names what was not looked at.
     """
 
     photos: int
@@ -228,6 +229,10 @@ class Summary(Strict):
     ledger: dict[str, LedgerShare] | None = None
     culprit: str | None = None
     reason: str = ""  # for the verdict, in a sentence
+    next_step: str = ""  # what to do where photographs cannot tell
+    worth: Worth | None = None  # beside its controls; null where there is nothing to compare
+    left_out: tuple[str, ...] = ()
+    background: str = ""  # what stood behind the object when the promise was made
     models: dict[str, ModelRate] = Field(default_factory=dict)
     sessions: tuple[SessionCount, ...] = ()
     sessions_known_from: str = ""

@@ -19,6 +19,7 @@ import numpy as np
 from patchproof.claims import wilson
 from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
 from patchproof.evidence.classify import Judges, judges_of
+from patchproof.evidence.copies import COPY, without_copies
 from patchproof.evidence.estimated import estimate_effect
 from patchproof.evidence.forecast import forecast_of
 from patchproof.evidence.grouping import Grouping, group
@@ -29,10 +30,12 @@ from patchproof.evidence.ranges import matched_rate
 from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
-from patchproof.evidence.verdict import Verdict, compare, effect_of, judge
+from patchproof.evidence.verdict import Verdict, compare, effect_of, judge, next_step
+from patchproof.evidence.worth import worth_of
 from patchproof.input import is_folder
-from patchproof.photo.read import pictures_in, printable
+from patchproof.photo.read import not_looked_at, pictures_in, printable
 from patchproof.sessions import TAIL
+from patchproof.settings import behind
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
 from patchproof.workers import open_workers
@@ -69,12 +72,14 @@ def gather_evidence(
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with kept as open_journal, open_workers(jobs, cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
-        own, ledger, estimated = results[: len(paths)], None, None
+        own = without_copies(results[: len(paths)], grouping.session, task.surface.rect_mm)
+        ledger, estimated = None, None
         if judges and task.promised:
-            most, name = min(len(paths), options.ledger_photos), judges.primary.name
-            chosen = [number * len(paths) // most for number in range(most)]  # evenly spread
+            others = [number for number, photo in enumerate(own) if photo.entry.code != COPY]
+            most, name = min(len(others), options.ledger_photos), judges.primary.name
+            chosen = [others[number * len(others) // most] for number in range(most)]  # evenly spread
             again = partial(shot_again, task, judges.primary.input_px)
-            shots = workers.map(again, [(paths[number], results[number]) for number in chosen])
+            shots = workers.map(again, [(paths[number], own[number]) for number in chosen])
             shots = [shot for shot in shots if shot is not None]
             judged = {photo.entry.file: photo.entry.predictions[name] for photo in own if photo.entry.predictions}
             confidence = {file: prediction.target_confidence for file, prediction in judged.items()}
@@ -83,12 +88,24 @@ def gather_evidence(
             estimated = estimate_effect(shots, manifest, task.surface, options.printer, judges, recognized)
             if forecast is not None:
                 own = [_forecast(again, forecast, path, photo) for path, photo in zip(paths, own, strict=True)]
-    controls: dict[str, list[PhotoEntry]] = {}
+    shown: dict[str, dict[str, PhotoEntry]] = {}
+    left_out = _left_out(photos, options.controls)
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
-            controls.setdefault(item.control, []).append(result.entry)
+            name, entry, others = item.control, result.entry, shown.setdefault(item.control, {})
+            first = others.setdefault(entry.sha256 or item.name, entry)
+            if first is not entry:
+                left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
+    controls = {name: list(entries.values()) for name, entries in shown.items()}
     report = _report(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
-    return report.changed(summary=report.summary.changed(estimated=estimated))
+    return report.changed(summary=report.summary.changed(estimated=estimated, left_out=tuple(left_out)))
+
+
+def _left_out(photos: str | Path, controls: str | Path | None) -> list[str]:
+    """What lies beside photographs and controls and is not looked at."""
+    apart = None if controls is None else Path(controls)
+    lost = not_looked_at(Path(photos), apart and apart.resolve())
+    return lost + [f"{printable(apart.name)}: {sentence}" for sentence in (not_looked_at(apart) if apart else ())]
 
 
 def _forecast(
@@ -133,6 +150,7 @@ def _report(
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
     compared, rates, rate, interval, sessions, forecast = [], {}, _rate({}), None, (), None
+    do, worth = "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
@@ -152,6 +170,10 @@ def _report(
             chances = [entry.forecast for entry in expected if entry.forecast is not None]
             forecast = forecast_of(chances, [recognized[entry.file] for entry in expected], promise.rate)
         compared = [compare(recognized, name, _recognized(shown, primary), goal) for name, shown in controls.items()]
+        if verdict.verdict == "cannot_tell":
+            do = next_step(promise, counts[1], without)
+        if rate.rate is not None and interval is not None:
+            worth = worth_of(rate.rate, interval, compared, promise)
     summary = Summary(
         photos=len(entries),
         judged=len(counted),
@@ -167,6 +189,9 @@ def _report(
         ledger=ledger and ledger.shares,
         culprit=ledger and ledger.culprit,
         reason=verdict.reason,
+        next_step=do,
+        worth=worth,
+        background=behind(manifest.settings),
         models=rates,
         forecast=forecast,
     )

@@ -41,6 +41,7 @@ class Surface:
     label: Label  # what the page's code says
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
+    bent: bool = False  # whether the piece was made to follow a curved surface
 
     @property
     def center_mm(self) -> tuple[float, float]:
@@ -111,6 +112,7 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
         label=label_of(manifest),
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
+        bent=(manifest.settings.get("patch") or {}).get("bend") is True,
     )
 
 

@@ -52,6 +52,7 @@ class Task:
     sizes_px: tuple[int, ...]  # of the networks' squares
     scan_dpi: float | None
     camera: Camera | None
+    photo_px: tuple[int, int] | None  # of the promised photographs
 
 
 def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task:
@@ -60,4 +61,5 @@ def task_of(manifest: Manifest, options: Options, judges: Judges | None) -> Task
     promised = promised_of(manifest, surface, options.printer)
     ranges = promised_ranges(manifest.promise.conditions if manifest.promise else (), promised_side_px(manifest))
     sizes = tuple(sorted({model.input_px for model in judges.models})) if judges else ()
-    return Task(surface, promised, ranges, sizes, options.scan_dpi, options.camera)
+    photo_px = manifest.settings.get("camera", {}).get("photo_px")
+    return Task(surface, promised, ranges, sizes, options.scan_dpi, options.camera, photo_px and tuple(photo_px))

@@ -27,6 +27,9 @@ LEAST_JUDGED = 5
 MOST_WITHOUT_MARKERS = 0.10
 SLACK = 0.20  # how far below the promised rate the photographs may leave the true one
 LEAST_PAIRS = 6  # fewer pairs can never reach 5 % in McNemar's test; the unpaired interval is used then
+EACH = 10  # photographs of a session, where their number is asked for
+KEPT = 0.80  # chance of `kept` that is enough
+MOST_PHOTOS = 150  # nobody takes more
 LEAST_PAIRED = 0.5  # of either folder's photographs: a few names that happen to be equal are no pairs
 
 
@@ -49,7 +52,7 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     spread = promise.spread
     low, high = spread.counts(photos)
     allowed = f"the promise allows for {low} to {high} in {_sessions(photos)}"
-    lost = without_markers / (judged + without_markers)
+    lost = _lost(judged, without_markers)
     if lost > MOST_WITHOUT_MARKERS:
         reason = f"{without_markers} readable photographs show no marker ({lost:.0%}, at most 10 % are allowed)."
         return Verdict("cannot_tell", (low, high), reason)
@@ -79,6 +82,39 @@ def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
     chances = promise.spread.chances(photos)
     words = (judge(count, photos, promise).verdict for count in range(len(chances)))
     return float(sum(chance for chance, word in zip(chances, words, strict=True) if word == "kept"))
+
+
+def sessions_needed(promise: Promise) -> int | None:
+    """In how many places `EACH` photographs prove the promise, where it holds, with a chance of `KEPT`; None where that
+    takes more than `MOST_PHOTOS`.
+    """
+    counts = range(1, MOST_PHOTOS // EACH + 1)
+    return next((s for s in counts if kept_chance(promise, (EACH,) * s) >= KEPT), None)
+
+
+def next_step(promise: Promise, photos: Sequence[int], without_markers: int = 0) -> str:
+    """What to do where photographs, so many judged in each session, cannot tell."""
+    if _lost(sum(photos), without_markers) > MOST_WITHOUT_MARKERS:
+        return "Leave out pictures that do not show the piece, and take again those whose markers cannot be read."
+    needed = sessions_needed(promise)
+    if needed is None:
+        return f"No {MOST_PHOTOS} photographs are likely to prove this promise: make a design that gains more."
+    if sum(photos) >= EACH * needed and len(photos) >= needed:
+        return f"Take {EACH * needed} more, {EACH} in each of {places(needed)} that are new."
+    so_far = f"{sum(photos)} in {places(len(photos))} so far" if photos else "none so far"
+    return (
+        f"Take {EACH} photographs in each of {places(needed)}, in other light and a folder for each, {EACH * needed} "
+        f"in all ({so_far})."
+    )
+
+
+def places(count: int) -> str:
+    """So many places."""
+    return "1 place" if count == 1 else f"{count} places"
+
+
+def _lost(judged: int, without_markers: int) -> float:
+    return without_markers / max(judged + without_markers, 1)
 
 
 def _sessions(photos: Sequence[int]) -> str:

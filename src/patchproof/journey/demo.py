@@ -16,6 +16,7 @@ from patchproof.output import new_folder
 from patchproof.printing.sheet import sheet_of
 from patchproof.report.summary import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint
+from patchproof.settings import behind
 
 PHOTOS, SESSIONS = 48, 12
 OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
@@ -90,7 +91,7 @@ def run_demo(
         )
     return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
-        *promise_lines(run.promise),
+        *promise_lines(run.promise, behind(run.scene.settings.model_dump())),
         *verdict_lines(report),
         *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
     ]

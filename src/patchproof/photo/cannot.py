@@ -19,6 +19,8 @@ CODES = (
     "several_sheets",
     "mirrored",
     "curled",
+    "cropped",
+    "copy",
 )
 
 

@@ -5,6 +5,7 @@ on film of 36×24 mm, by the diagonal: of a picture that was cropped or zoomed d
 point in the middle is true. So none is taken where EXIF has another size than the picture, a digital zoom, or where the
 picture has a shape that no sensor has. What an editor saved, and 16:9, which cameras cut from 4:3 or 3:2, is believed
 less. A crop that keeps the shape and mends EXIF leaves no trace here; the sheet's perspective may still contradict it.
+`is_part` is stricter: a picture that was made smaller as a whole, or zoomed by its camera, is still a photograph.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ _EDITORS = re.compile(
     r"photoshop|lightroom|gimp|snapseed|darktable|affinity|paint|pixelmator|capture one|luminar", re.I
 )
 _EXIF_IFD, _FOCAL_35MM, _WIDTH, _HEIGHT, _ZOOM, _SOFTWARE = 0x8769, 0xA405, 0xA002, 0xA003, 0xA404, 0x0131
+_COMMENT = 0x9286  # in which phones and desktops of one maker name their screenshots
+_SCREEN = re.compile(r"screen.?shot", re.I)
 
 
 def focal_of(image) -> tuple[float | None, float, bool]:
@@ -41,6 +44,27 @@ def focal_of(image) -> tuple[float | None, float, bool]:
     edited = bool(_EDITORS.search(str(exif.get(_SOFTWARE, ""))))
     loose = edited or not _has_shape(long, short, _SENSOR_SHAPES)
     return focal_35mm / _DIAGONAL_35MM * math.hypot(long, short), LOOSE_SPREAD if loose else EXIF_SPREAD, False
+
+
+def is_part(image, name: str) -> bool:
+    """Whether EXIF says that this was of another shape, or it or the file's name says that it is a screenshot."""
+    try:
+        details = image.getexif().get_ifd(_EXIF_IFD)
+    except (TypeError, ValueError, ZeroDivisionError, KeyError, SyntaxError, OSError):
+        details = {}
+    stated = [side for key in (_WIDTH, _HEIGHT) if (side := _number(details.get(key))) is not None]
+    other = len(stated) == 2 and not _has_shape(max(image.size), min(image.size), (max(stated) / min(stated),))
+    comment = details.get(_COMMENT, "")
+    comment = comment.decode("latin-1").replace("\0", "") if isinstance(comment, bytes) else str(comment)
+    return other or bool(_SCREEN.search(name) or _SCREEN.search(comment))
+
+
+def of_a_camera(size_px: tuple[int, int], also_px: tuple[int, int] | None) -> bool:
+    """Whether cameras take pictures of that shape (their sensors', what they cut from it, a square), or it is the shape
+    of `also_px`.
+    """
+    also = () if also_px is None else (max(also_px) / min(also_px),)
+    return _has_shape(max(size_px), min(size_px), (*_SENSOR_SHAPES, *_CUT_SHAPES, 1.0, *also))
 
 
 def _has_shape(long: int, short: int, shapes: tuple[float, ...]) -> bool:

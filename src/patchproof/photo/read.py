@@ -10,6 +10,7 @@ copies took twice the memory. Ignored on purpose: the DPI that a photograph clai
 from __future__ import annotations
 
 import io
+import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,9 +21,9 @@ import numpy as np
 
 from patchproof.input import LARGEST_PX, is_file, is_folder, readable_formats
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.exif import EXIF_SPREAD, focal_of
+from patchproof.photo.exif import EXIF_SPREAD, focal_of, is_part
 from patchproof.photo.limits import MOST_BYTES, limited, limited_memory
-from patchproof.strict import Refused
+from patchproof.strict import Refused, listed
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 _ORIENTATION = 0x0112
@@ -37,18 +38,26 @@ _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     8: lambda a: np.rot90(a),
 }
 _STRIP_PX = 4_000_000
+# What people copy along with photographs and nobody reads here.
+_OTHERS = (
+    (".mov .mp4 .m4v .avi .mkv .webm .3gp .mts", "videos, which are not looked at (take still photographs)"),
+    (".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .pef .srw", "raw files, which are not looked at (save them as JPEG)"),
+)
+_TOO_DEEP = "folders in folders, which are not looked into (one folder for each session)"
 
 
 @dataclass(frozen=True)
 class Photo:
     """An upright photograph: uint8 H×W×3 sRGB, focal length in its own pixels or None, the standard deviation of its
-    logarithm, and whether EXIF has one that does not fit this picture.
+    logarithm, whether EXIF has one that does not fit this picture, and whether it is a crop or a screenshot as far as
+    file and EXIF say.
     """
 
     srgb: np.ndarray
     focal_px: float | None
     focal_spread: float = EXIF_SPREAD
     cropped: bool = False
+    part: bool = False
 
 
 def read_photo(path: str | Path) -> Photo:
@@ -59,9 +68,9 @@ def read_photo(path: str | Path) -> Photo:
     _allow_heic(path)
     try:
         with limited_memory():
-            srgb, orientation, focal = limited(_stored, path)
+            srgb, orientation, focal, part = limited(_stored, path)
             # of the picture as Pillow had it nothing is left by now
-            return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal)
+            return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal, part)
     except CannotJudge:
         raise
     except Exception as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...), all alike here
@@ -70,8 +79,8 @@ def read_photo(path: str | Path) -> Photo:
         raise _unreadable(_why(path, error)) from error
 
 
-def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, bool]]:
-    """(uint8 sRGB H×W×3 as stored, EXIF orientation, what EXIF says of the focal length)."""
+def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, bool], bool]:
+    """(uint8 sRGB H×W×3 as stored, EXIF orientation, what EXIF says of the focal length, whether it is a part)."""
     from PIL import Image
 
     if (size := path.stat().st_size) > MOST_BYTES:
@@ -84,7 +93,8 @@ def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, boo
             if pixels > LARGEST_PX:
                 raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX)
             focal, orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
-            return _pixels(image), orientation if isinstance(orientation, int) else 1, focal
+            part = is_part(image, path.name)
+            return _pixels(image), orientation if isinstance(orientation, int) else 1, focal, part
 
 
 def list_photos(folder: str | Path) -> list[Path]:
@@ -97,7 +107,7 @@ def list_photos(folder: str | Path) -> list[Path]:
     paths = pictures_in(folder)
     if not paths:
         expected = f"photographs ({', '.join(sorted(SUFFIXES)[:6])}, ...) in {folder}"
-        raise Refused(expected, "none", "copy the photographs there")
+        raise Refused(expected, "; ".join(["none", *not_looked_at(folder)]), "copy the photographs there")
     return paths
 
 
@@ -105,6 +115,29 @@ def pictures_in(folder: Path) -> list[Path]:
     """The files of a folder that are pictures by their suffix, none hidden, in the order of their names."""
     files = (p for p in folder.iterdir() if is_file(p) and not p.name.startswith("."))
     return sorted((p for p in files if p.suffix.lower() in SUFFIXES), key=lambda p: p.name)
+
+
+def not_looked_at(folder: Path, without: Path | None = None) -> list[str]:
+    """What lies in a folder and the folders in it that looks like evidence and is not read, in a sentence for each
+    kind: videos and raw files without a picture of the same name, and pictures in folders deeper than that. The folder
+    `without` is left out.
+    """
+    lost: dict[str, list[str]] = {}
+    for parent, folders, files in os.walk(folder):
+        inside = Path(parent).relative_to(folder)
+        paths = [Path(name) for name in sorted(files) if not name.startswith(".")]
+        stems = {path.stem for path in paths if path.suffix.lower() in SUFFIXES}
+        if len(inside.parts) > 1:
+            folders.clear()
+            if stems:
+                lost.setdefault(_TOO_DEEP, []).append(printable(str(inside)))
+            continue
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(parent, f).resolve() != without)
+        for path in paths:
+            kinds = (kind for suffixes, kind in _OTHERS if path.suffix.lower() in suffixes.split())
+            if path.stem not in stems and (kind := next(kinds, None)):
+                lost.setdefault(kind, []).append(printable(str(inside / path)))
+    return [f"{kind}: {listed(names)}" for kind, names in lost.items()]
 
 
 def printable(name: str) -> str:

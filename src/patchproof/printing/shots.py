@@ -17,16 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.claims import CONFIDENCE, independent_difference
-from patchproof.evidence.verdict import asked_rate, kept_chance
+from patchproof.evidence.verdict import EACH, MOST_PHOTOS, asked_rate, kept_chance, places, sessions_needed
 from patchproof.sessions import evenly
-from patchproof.settings import SceneSettings
+from patchproof.settings import SceneSettings, behind
 from patchproof.sheets.manifest import Promise
 
 POWER = 0.90
-MOST_PHOTOS = 150  # nobody takes more
 WAYS = ((40, 1), (40, 2), (40, 4), (40, 8), (80, 8))  # photographs, sessions
-EACH = 10  # photographs of a session, where their number is asked for
-KEPT = 0.80  # chance of `kept` that is enough
 STEADY = 12  # so many counts in a row must do: floors of intervals are whole photographs, so that some n just miss
 
 
@@ -59,10 +56,9 @@ def plan_shots(promise: Promise) -> ShotPlan:
     best = promise.best_control
     rates = (promise.rate, promise.controls[best].rate)
     better, worse = rates[::sign]
-    enough = (s for s in range(1, MOST_PHOTOS // EACH + 1) if kept_chance(promise, (EACH,) * s) >= KEPT)
     return ShotPlan(
         ways=tuple(_way(promise, *way) for way in WAYS),
-        sessions=next(enough, None),
+        sessions=sessions_needed(promise),
         control=best,
         paired=fewest(lambda n: paired_power(better, worse, n) >= POWER),
         unpaired=fewest(lambda n: unpaired_power(better, worse, n) >= POWER),
@@ -116,7 +112,8 @@ def unpaired_power(better: float, worse: float, n: int) -> float:
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """What to photograph, as (heading, lines)."""
     plan = plan_shots(promise)
-    return (("How many photographs", _how_many(promise, plan)), ("From where", _from_where(settings)))
+    what = f"Promised before {behind(settings.model_dump())}. The design is {promise.headline}"
+    return (("How many photographs", (what, *_how_many(promise, plan))), ("From where", _from_where(settings)))
 
 
 def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
@@ -130,7 +127,7 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         f"A verdict asks the photographs to prove a rate of {asked_rate(promise):.0%}. What they will show if the "
         "promise holds, and the chance that it is enough: "
         + "; ".join(
-            f"{way.photos} in {_places(way.sessions)}: {way.allowed[0]} to {way.allowed[1]} ({way.chance:.0%})"
+            f"{way.photos} in {places(way.sessions)}: {way.allowed[0]} to {way.allowed[1]} ({way.chance:.0%})"
             for way in plan.ways
         )
         + "."
@@ -139,7 +136,7 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         lines.append("The promise is too weak to be proved by any reasonable number of photographs.")
     else:
         lines.append(
-            f"Take at least {EACH} photographs in each of {_places(plan.sessions)}, with other light in each, and keep "
+            f"Take at least {EACH} photographs in each of {places(plan.sessions)}, with other light in each, and keep "
             "those of each place in a folder of their own."
         )
     if plan.paired is None and plan.unpaired is None:
@@ -161,10 +158,6 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         "every control that you photograph."
     )
     return tuple(lines)
-
-
-def _places(count: int) -> str:
-    return "1 place" if count == 1 else f"{count} places"
 
 
 def _from_where(settings: SceneSettings) -> tuple[str, ...]:

@@ -5,20 +5,21 @@ In: a promise, an evaluation or a report. Out: lines of text.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+from patchproof.report.words import headline_of, remarks, worth_sentence
 
-def promise_lines(promise: Any) -> list[str]:
-    """The promised rate and how it compares with each control."""
+
+def promise_lines(promise: Any, background: str = "") -> list[str]:
+    """The promised rate, what stood behind the object, and how it compares with each control."""
     low, high = promise.interval
     target = promise.target
     lines = [
         promise.headline,
         f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
         f"in {promise.sessions} sessions "
-        f"[{low:.1%}, {high:.1%}] by {promise.models[0].name}",
+        f"[{low:.1%}, {high:.1%}] by {promise.models[0].name}{background and f', before {background}'}",
     ]
     lines += [
         f"  also {model.name}: {model.rate:.1%} [{model.interval[0]:.1%}, {model.interval[1]:.1%}]"
@@ -38,9 +39,14 @@ def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def verdict_lines(report: Any) -> list[str]:
-    """The verdict and the counts behind it."""
+    """What the patch is worth, the verdict, and the counts behind them."""
     summary = report.summary
-    lines = [f"verdict: {summary.verdict} (effect: {summary.effect})"]
+    plain = summary.model_dump()
+    lines = [f"{headline_of(plain)}. {worth_sentence(plain)}"]
+    lines.append(f"verdict: {summary.verdict} (effect: {summary.effect}). {summary.reason}".strip())
+    lines += [summary.next_step] if summary.next_step else []
+    if summary.background:
+        lines.append(f"promised before {summary.background}")
     lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
     if summary.sessions:
         lines.append(f"sessions: {len(summary.sessions)} ({summary.sessions_known_from})")
@@ -62,8 +68,13 @@ def verdict_lines(report: Any) -> list[str]:
     if summary.culprit is not None:
         share = summary.ledger[summary.culprit].share
         lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
-    codes = Counter(photo.code for photo in report.photos if photo.code)
-    return lines + [f"  {code}: {count}" for code, count in sorted(codes.items())]
+    rows = remarks([{"file": photo.file, **_remark(photo)} for photo in report.photos])
+    lines += [f"  {code}: {count} ({files}): {advice}" for code, advice, count, files in rows]
+    return lines + [f"  left out: {sentence}" for sentence in summary.left_out]
+
+
+def _remark(photo: Any) -> dict[str, Any]:
+    return {"code": photo.code, "advice": photo.remark and photo.remark.advice}
 
 
 def estimated_lines(estimated: Any) -> list[str]:

@@ -8,23 +8,17 @@ input gives the same bytes.
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from patchproof.goal import Goal
 from patchproof.output import make_folder, write_whole
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import page
 from patchproof.report.photo_table import photos_csv
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
+from patchproof.report.words import VERDICTS, headline_of, remarks, worth_sentence
 
-_WORDS = {
-    "kept": ("Promise kept", "The photographs prove a rate near the one that was promised before printing."),
-    "broken": ("Promise broken", "The photographs show {} than was promised before printing."),
-    "cannot_tell": ("Cannot tell", "The photographs neither break the promise nor prove it."),
-}
 _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
     "not_shown": "That the patch itself makes a difference was not shown: it did not clearly beat every control.",
@@ -61,11 +55,10 @@ def render(
     """The page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
-    plots, primary, deceived = [scale_plot(judged)], None, False
+    plots, primary = [scale_plot(judged)], None
     if promise:
-        primary, deceived = promise["models"][0]["name"], Goal(promise["target"]["goal"]).sign < 0
+        primary = promise["models"][0]["name"]
         plots[:0] = [recognition_plot(judged, primary, name, label, promise["conditions"]) for name, label in _PLOTS]
-    headline, plain = _WORDS[summary["verdict"]]
     pictures = [encoded.get(photo["file"], {}) for photo in photos]
     return page(
         "page.html.j2",
@@ -74,8 +67,10 @@ def render(
         manifest=manifest,
         promise=promise,
         primary=primary,
-        headline=headline,
-        plain=plain.format("more recognition" if deceived else "less"),
+        headline=headline_of(summary),
+        worth=worth_sentence(summary),
+        word=(summary["worth"] or {}).get("word", "not_shown"),
+        verdict=VERDICTS[summary["verdict"]],
         effect=_EFFECTS["estimated" if _is_estimated(summary) else summary["effect"]],
         bars=_bars(summary, promise, report["controls"]),
         controls=report["controls"],
@@ -87,8 +82,7 @@ def render(
             {"photo": photo, "pictures": {kind: data_uri(content) for kind, content in kinds.items()}}
             for photo, kinds in zip(photos, pictures, strict=True)
         ],
-        # the most frequent first, of equally frequent ones by name
-        codes=Counter(sorted(photo["code"] for photo in photos if photo["code"])).most_common(),
+        remarks=remarks(photos),
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],
