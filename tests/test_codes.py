@@ -51,6 +51,31 @@ def test_figures_at_both_sides_of_their_thresholds(code, good, bad):
     assert cannot.figure is not None and cannot.threshold is not None
 
 
+@pytest.mark.parametrize(
+    ("tilt_deg", "figures", "advice"),
+    [
+        (63.0, {"corner_uncertainty_mm": 3.2}, "more squarely"),  # 1.45 mm seen straight
+        (63.0, {"corner_uncertainty_mm": 3.4}, "come closer"),
+        (63.0, {"px_per_mm": 0.116}, "more squarely"),  # 24.1 px seen straight
+        (63.0, {"px_per_mm": 0.115}, "come closer"),
+        (10.0, {"corner_uncertainty_mm": 1.6}, "come closer"),
+    ],
+)
+def test_what_is_too_small_for_its_tilt_alone_is_to_be_looked_at_more_squarely(tilt_deg, figures, advice):
+    cannot = trouble(tilt_deg=tilt_deg, **figures)
+    assert cannot.code == "too_small" and advice in cannot.advice
+
+
+def test_a_piece_that_is_made_to_bend_is_not_to_be_pressed_flat(monkeypatch):
+    assert "press the sheet flat" in trouble(residual_mm=2.0).advice
+    bent = make_manifest()
+    bent = surface_of(bent.changed(settings=bent.settings | {"patch": {"bend": True}}))
+    assert bent.bent and not SURFACE.bent
+    monkeypatch.setattr(f"{__name__}.SURFACE", bent)
+    for figures in ({"residual_mm": 2.0}, {"bend_mm": 0.3} | FLAT, {"design_shift_mm": 0.8}):
+        assert "flat" not in trouble(**figures).advice and trouble(**figures).code == "curled"
+
+
 def test_a_marker_off_the_plane_and_a_corner_that_is_not_seen_are_said():
     borders = Borders(np.zeros((4, 2)), 1.0, 4.0, True)
     found = MarkersInView(dict.fromkeys(PIECE_IDS, borders), (), ())

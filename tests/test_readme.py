@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from patchproof.claims import student_mean
+from patchproof.optimizer.run import load_run
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
 from test_imports import GROUND, MAY_IMPORT
@@ -58,6 +59,12 @@ def test_commands(here, monkeypatch, capsys):
         program, *arguments = shlex.split(line)
         assert program == "patchproof"
         assert command(*arguments) == 0, capsys.readouterr().err
+    # something to gain: what a full optimization gains stands in the prose and the notebook
+    assert load_run("run").promise.controls["bare"].rate < 0.6
+    gain = re.search(r"`better than its best control \((\w+)\): ([\d.]+)% beside ([\d.]+)%", README.read_text("utf-8"))
+    assert gain and float(gain[2]) > float(gain[3]) + 20
+    (row,) = (line for line in NOTEBOOK.read_text("utf-8").splitlines() if line.startswith("| README's own scene"))
+    assert f"| {gain[2]} % [" in row and f"{gain[1]} {gain[3]} %" in row
 
 
 def test_every_scene_is_one_and_every_option_exists(capsys):

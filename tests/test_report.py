@@ -17,9 +17,12 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from patchproof.claims import Estimate
 from patchproof.evidence.results import KEYS, Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
 from patchproof.report.images import delta_map, save_pictures
 from patchproof.report.photo_table import photos_csv
+from patchproof.report.results import Results, write_results
+from patchproof.report.tables import Drawing, Table
 from patchproof.report.write import write_report
 from test_photo_synthetic import make_manifest
 from test_verify_run import promise
@@ -177,7 +180,7 @@ def test_difference_maps_have_one_scale_and_show_what_was_not_measured():
 
 
 PROBE = """<script>addEventListener("load", () => {  // before the frame's own: by now every fetch has ended
-const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg"));
+const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg, .scroll > *"));
 const wide = all.filter(e => e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName);
 const small = all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length;
 const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth)).length;
@@ -231,3 +234,57 @@ def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(tmp_path):
     seen = seen_in_browser(page, 390, tmp_path)
     assert seen["width"] > 390 and seen["wide"] == ["DIV"] and seen["broken"] == 1
     assert len(seen["errors"]) == 1 and len(seen["fetched"]) == 1
+
+
+class Alternatives(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.texts = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.texts.append(dict(attrs)["alt"])
+
+
+def results_page(folder):
+    """A study's page with two figures of one title and a wide table."""
+    head = ("object", *(f"setting {i}" for i in range(12)))
+    table = Table("cells", "Every cell", head, tuple(("mug", *[Estimate(0.5, 0.4, 0.6, 100)] * 12) for _ in range(40)))
+    figures = [Drawing(name, "Rates", lambda figure: figure.subplots().plot([1, 2])) for name in "ab"]
+    write_results(folder, Results("study", "toy", "Toys.", "40 cells", {}, [table], figures, {}, {}))
+    return folder / "toy.html"
+
+
+def test_every_picture_has_words_of_its_own(tmp_path):
+    kinds = pictures()["p0.jpg"]
+    save_pictures(tmp_path / "pictures", "p1.jpg", kinds)
+    for page, count in ((written(tmp_path), 10), (results_page(tmp_path), 2)):
+        tags = Alternatives()
+        tags.feed(page.read_text())
+        assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
+    text = (tmp_path / "report.html").read_text()
+    named = re.findall(r'<div role="img" aria-label="([^"]+)"><svg', text)
+    assert len(named) == len(set(named)) == text.count("<svg") == 4
+
+
+def test_a_studys_page_begins_with_its_figure_and_its_wide_table_scrolls_on_a_phone(tmp_path):
+    page = results_page(tmp_path)
+    text = page.read_text()
+    assert text.index("<img") < text.index("<table")
+    seen = seen_in_browser(page, 390, tmp_path)
+    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == [] and seen["broken"] == 0
+
+
+def test_a_report_of_fifty_photographs_prints_on_a_few_pages(tmp_path):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here to print the page")
+    report = some_report()
+    photos = [report.photos[0].changed(file=f"{i}.jpg", sha256=f"{i:064x}") for i in range(50)]
+    manifest = make_manifest(promise()).model_dump(mode="json")
+    page = write_report(report.changed(photos=tuple(photos)).model_dump(mode="json"), manifest, tmp_path)
+    flags = f"--headless --no-sandbox --disable-gpu --no-first-run --user-data-dir={tmp_path / 'user'}"
+    out = tmp_path / "printed.pdf"
+    subprocess.run([browser, *flags.split(), f"--print-to-pdf={out}", page.as_uri()], capture_output=True, timeout=60)
+    pages = len(re.findall(rb"/Type\s*/Page\b", out.read_bytes()))
+    assert 2 <= pages <= 6

@@ -55,10 +55,13 @@ def render(
     """The page's HTML; `encoded` are JPEG or PNG bytes by photo and kind."""
     promise, summary, photos = manifest.get("promise"), report["summary"], report["photos"]
     judged = [photo for photo in photos if photo["status"] != "rejected"]
-    plots, primary = [scale_plot(judged)], None
+    plots, primary = [(scale_plot(judged), "chart of the print's scale")], None
     if promise:
         primary = promise["models"][0]["name"]
-        plots[:0] = [recognition_plot(judged, primary, name, label, promise["conditions"]) for name, label in _PLOTS]
+        plots[:0] = [
+            (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
+            for name, label in _PLOTS
+        ]
     pictures = [encoded.get(photo["file"], {}) for photo in photos]
     return page(
         "page.html.j2",
@@ -76,7 +79,7 @@ def render(
         controls=report["controls"],
         ledger=ledger,
         waterfall=ledger_plot(ledger) if ledger else "",
-        plots=[svg for svg in plots if svg],
+        plots=[(svg, about) for svg, about in plots if svg],
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=[
             {"photo": photo, "pictures": {kind: data_uri(content) for kind, content in kinds.items()}}
