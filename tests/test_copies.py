@@ -44,8 +44,8 @@ def seen(name, azimuth=10.0, distance=550.0, elevation=5.0, roll=0.0, light=0.8,
 @pytest.mark.parametrize(
     ("same", "other"),
     [
-        ({"azimuth": 11.0}, {"azimuth": 16.0}),
-        ({"roll": 1.0}, {"roll": 2.0}),
+        ({"azimuth": 11.0}, {"azimuth": 14.0}),
+        ({"roll": 1.0}, {"roll": 1.5}),
         ({"elevation": 6.0}, {"azimuth": -10.0}),  # as much from the other side
         ({"distance": 559.0}, {"distance": 565.0}),
         ({"light": 0.83}, {"light": 0.85}),

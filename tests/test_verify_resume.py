@@ -202,8 +202,8 @@ def test_a_folder_of_somebody_else_is_not_resumed(folder, sheet, tmp_path):
 def test_names_of_any_length_and_bytes_are_reported(folder, sheet, tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()
-    for name in (b"\xff" * 9, b"x" * 245):
-        (photos / os.fsdecode(name + b".jpg")).write_bytes((folder / "b0.jpg").read_bytes())
+    for name, source in ((b"\xff" * 9, "b0.jpg"), (b"x" * 245, "b1.jpg")):
+        (photos / os.fsdecode(name + b".jpg")).write_bytes((folder / source).read_bytes())
     report = verify_photos(photos, sheet, tmp_path / "report")
     assert sorted(p.file for p in report.photos) == ["\\udcff" * 9 + ".jpg", "x" * 245 + ".jpg"]
     assert {p.code for p in report.photos} == {None} and len(list((tmp_path / "report" / "pictures").iterdir())) >= 4

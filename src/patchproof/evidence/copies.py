@@ -24,7 +24,7 @@ COPY = "copy"
 # taken for another (2 are with a SHAPE of 0.02).
 SCALE, TILT, LIGHT = 0.02, 0.02, 0.05  # of pixels per mm, the tilt's cosine, the light of white paper
 AIM = 0.01  # of the picture's longer side
-SHAPE = 0.015  # of the design's longer side, by which its corners lie elsewhere about its middle
+SHAPE = 0.01  # of the design's longer side, by which its corners lie elsewhere about its middle
 
 
 def without_copies(photos: Sequence[MeasuredPhoto], session: Sequence[int], rect_mm: Rect) -> list[MeasuredPhoto]:
