@@ -47,12 +47,12 @@ USELESS = promise_with(0.015, 0.0, -0.01, 0.03)  # keeps what it promises
 @pytest.mark.parametrize(
     ("promise", "recognized", "verdict", "headline", "word"),
     [
-        (HELPFUL, 36, "kept", "Helps", "helps"),
+        (HELPFUL, 36, "kept", "Helps beside simulated controls", "helps"),
         (USELESS, 0, "kept", "No better than the bare object", "no_better"),
         (HARMFUL, 8, "cannot_tell", "Worse than the bare object", "worse"),
         (HELPFUL, 2, "broken", "Worse than the bare object", "worse"),
         (HELPFUL, 20, "broken", "Not shown to help", "not_shown"),  # 50 % beside 40 %
-        (promise_with(0.1, 0.6, -0.6, -0.4, "deceive"), 4, "kept", "Deceives", "helps"),
+        (promise_with(0.1, 0.6, -0.6, -0.4, "deceive"), 4, "kept", "Deceives beside simulated controls", "helps"),
         (promise_with(0.9, 0.6, 0.2, 0.4, "deceive"), 36, "cannot_tell", "Worse than the bare object", "worse"),
     ],
 )

@@ -28,7 +28,7 @@ def headline_of(summary: Mapping[str, Any]) -> str:
         return "Cannot tell whether it helps"
     does, against = _HELPS[worth["goal"]], control_words(worth["control"])
     return {
-        "helps": f"{does.capitalize()}s",
+        "helps": f"{does.capitalize()}s" + ("" if worth["photographed"] else " beside simulated controls"),
         "no_better": f"No better than {against}",
         "worse": f"Worse than {against}",
         "not_shown": f"Not shown to {does}",
