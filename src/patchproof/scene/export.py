@@ -1,9 +1,10 @@
-"""The object with its textures as one GLB file that other programs open.
+"""The object with its textures, and the piece on it where there is one, as one GLB file that other programs open.
 
-In: a mesh and one uint8 sRGB texture per material. Out: glTF 2.0, in meters as its specification wants (the mesh is in
-millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes it; nothing in it depends on the time, so
-the same textures give the same bytes. Surfaces are matte, and seen from both sides as the renderer here sees them.
-Left out on purpose: the piece, lights and cameras. Material names are kept and may repeat; geometries are numbered.
+In: a mesh, one uint8 sRGB texture per material, and where the piece lies with its picture. Out: glTF 2.0, in meters as
+its specification wants (the mesh is in millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes
+it; nothing in it depends on the time, so the same textures give the same bytes. Surfaces are matte, and seen from both
+sides as the renderer here sees them. Left out on purpose: lights and cameras. Material names are kept and may repeat;
+geometries are numbered.
 """
 
 from __future__ import annotations
@@ -15,12 +16,19 @@ import numpy as np
 
 from patchproof.color import codes_of
 from patchproof.mesh.mesh import Mesh
+from patchproof.scene.placement import Placement
 
 _M_FROM_MM = 1e-3
 
 
-def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path) -> None:
-    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file.
+def write_glb(
+    mesh: Mesh,
+    textures: Sequence[np.ndarray],
+    path: str | Path,
+    piece: tuple[Placement, np.ndarray] | None = None,
+) -> None:
+    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file;
+    `piece` is where it lies and its picture, uint8 H×W×3 up to the cut line.
 
     Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
     """
@@ -32,15 +40,14 @@ def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path) -> N
         faces = np.flatnonzero(mesh.face_material == index)
         if len(faces):
             scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
+    if piece is not None:
+        scene.add_geometry(_paper(*piece), geom_name="piece")
     Path(path).write_bytes(export_glb(scene, include_normals=True))
 
 
 def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     """Some faces as a trimesh, corners that agree in everything made one vertex."""
     import trimesh
-    from PIL import Image
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
 
     arrays = [
         mesh.vertices[mesh.faces[faces]] * _M_FROM_MM,
@@ -51,11 +58,34 @@ def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     corners = np.concatenate([np.asarray(array, float).reshape(3 * len(faces), -1) for array in arrays], axis=1)
     corners, index = np.unique(corners, axis=0, return_inverse=True)
     position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
-    material = PBRMaterial(
-        name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
-    )
-    visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    visual = _textured(uv, name, texture)
     if (color != 1).any():
         # trimesh writes bytes, whatever it is given
         visual.vertex_attributes["color"] = codes_of(np.insert(color, 3, 1.0, axis=1))
     return trimesh.Trimesh(position, index.reshape(-1, 3), vertex_normals=normal, visual=visual, process=False)
+
+
+def _paper(placement: Placement, picture: np.ndarray):
+    """The piece as a trimesh."""
+    import trimesh
+
+    visual = _textured(placement.piece_mm / placement.size_mm, "piece", picture)
+    return trimesh.Trimesh(
+        placement.vertices_mm * _M_FROM_MM,
+        placement.faces,
+        vertex_normals=placement.normals,
+        visual=visual,
+        process=False,
+    )
+
+
+def _textured(uv: np.ndarray, name: str, texture: np.ndarray):
+    """A matte texture over coordinates V×2 with v down."""
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    material = PBRMaterial(
+        name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    return TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)

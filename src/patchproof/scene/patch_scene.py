@@ -219,11 +219,10 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
 def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
     conditions = scene.draw("select", SCALE_VIEWS, 0)
-    poses = camera_poses(scene, card.center_mm, conditions.pose)
-    matrix, scales = scene.matrix_px(scene.photo_px), []
-    for pose in poses:
+    center_mm, matrix, scales = card.center_mm, scene.matrix_px(scene.photo_px), []
+    for pose in camera_poses(scene, center_mm, conditions.pose):
         eye = -pose[:3, :3].T @ pose[:3, 3]
-        if (eye - card.center_mm) @ card.normal <= 0:
+        if (eye - center_mm) @ card.normal <= 0:
             continue
         homography = geometry.plane_homography(matrix, pose, card.world_from_piece)
         mean, tilt = geometry.local_scale(homography, np.array(card.size_mm) / 2)

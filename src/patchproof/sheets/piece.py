@@ -96,15 +96,20 @@ def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
     """The marker to print: what is needed (never under 8 mm), else the largest that leaves the design its share, in
     whole 0.1 mm.
     """
-    wanted, least = max(needed_mm, SMALLEST_MARKER_MM), _corner_mm(SMALLEST_MARKER_MM) / LARGEST_CORNER
+    wanted, least = max(needed_mm, SMALLEST_MARKER_MM), smallest_piece_mm()
     if min(piece_mm) < least:
         raise Refused(
-            f"a piece of at least {math.ceil(least)} mm, beside {SMALLEST_MARKER_MM:g} mm markers",
+            f"a piece of at least {least} mm, beside {SMALLEST_MARKER_MM:g} mm markers",
             f"{piece_mm[0]:g} × {piece_mm[1]:g} mm",
             "make the patch larger",
         )
     fitting = (LARGEST_CORNER * min(piece_mm) - SCISSORS_MM) * MODULES / (MODULES + 2)
     return wanted if fitting >= wanted else math.floor(fitting * 10 + 1e-6) / 10
+
+
+def smallest_piece_mm() -> int:
+    """The shorter side that four of the smallest markers ask for, in whole millimeters."""
+    return math.ceil(_corner_mm(SMALLEST_MARKER_MM) / LARGEST_CORNER)
 
 
 def lay_out_piece(
