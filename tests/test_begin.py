@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import json
 import re
+import sys
 
 import numpy as np
 import pytest
 import trimesh
 
+from patchproof import cli
 from patchproof.begin.guess import footing, guess_up, label_of, length_of
 from patchproof.begin.new import new_scene
 from patchproof.begin.preview import OBJECT, PAGE, preview_scene
@@ -29,6 +31,7 @@ from patchproof.scene.fitting import largest
 from patchproof.scene.scene import load_scene, make_scene
 from patchproof.settings import load_scene_settings
 from patchproof.strict import Refused
+from test_report import seen_in_browser
 
 LABELS = ["coffee mug", "cup", "garbage truck, dustcart", "tow truck, tow car, wrecker", "mailbox, letter box"]
 QUICK = {"camera": {"photo_px": [400, 300]}, "background": {"color": [0.5, 0.5, 0.5]}}
@@ -289,3 +292,27 @@ def test_a_piece_without_a_place_is_left_off_where_it_would_not_lie(tmp_path):
     assert any(line.startswith('place: "auto": optimize searches') for line in preview.lines)
     html = (tmp_path / "out" / PAGE).read_text(encoding="utf-8").partition("<script>")[0]
     assert "piece hangs here" not in html and "piece: not placed" in preview.lines
+
+
+def test_a_browser_shows_the_page_on_a_phone_and_asks_nobody(shown, tmp_path):
+    _, folder = shown
+    seen = seen_in_browser(folder / "out" / PAGE, 390, tmp_path)
+    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == []
+    assert seen["broken"] == 0 and seen["small"] == 0 and seen["errors"] == []
+    assert [address for address in seen["fetched"] if not address.startswith("blob:")] == []
+
+
+def test_the_command_line_looks_and_says_where(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["patchproof", "new", "primitive:carton", "--length-mm", "300"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 0 and "next: patchproof preview scene.toml" in capsys.readouterr().out
+    text = (tmp_path / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(text.replace("width_mm = ", "width_mm = 9"))
+    monkeypatch.setattr(sys, "argv", ["patchproof", "preview", "scene.toml"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    said = capsys.readouterr()
+    assert stop.value.code == 1 and "page: patchproof-preview/preview.html" in said.out
+    assert said.err.splitlines()[-1].startswith("Expected a piece no larger than the object's side")

@@ -172,9 +172,11 @@ def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
 def _maps(scene: PatchScene) -> list[dict[str, str]]:
     """The piece's gap and stretch, each a picture with the words at the ends of its scale."""
     laid = scene.placement
+    shape = "{:g} / {:g}".format(*laid.size_mm)
     maps = [
         {
             "title": "gap to the surface",
+            "shape": shape,
             "picture": data_uri(png(gap_colors(laid))),
             "low": "0 mm",
             "high": f"{gap_top_mm(laid):.2g} mm: too much",
@@ -184,6 +186,7 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
         maps.append(
             {
                 "title": "stretch of the paper",
+                "shape": shape,
                 "picture": data_uri(png(stretch_colors(laid))),
                 "low": "0 %",
                 "high": f"{STRETCH_LIMIT:.0%}: refused",

@@ -122,6 +122,8 @@ def _half_mm(scene: MeshScene) -> float:
 
 
 def _picture(stage: Stage, side: Side, half_mm: float) -> np.ndarray:
-    scene = needs_mesh(stage.scene)
-    colors = gap_colors(scene.placement) if isinstance(scene, PatchScene) else None
-    return straight_picture(stage, side_frame(scene.mesh, side), np.array([half_mm, half_mm]), PICTURE_PX, colors)
+    scene, colors = needs_mesh(stage.scene), None
+    frame = side_frame(scene.mesh, side)
+    if isinstance(scene, PatchScene) and (scene.placement.normals @ frame.normal).max() > 1e-6:
+        colors = gap_colors(scene.placement)
+    return straight_picture(stage, frame, np.array([half_mm, half_mm]), PICTURE_PX, colors)

@@ -8,7 +8,6 @@ an `OpenScene`, whose piece has no place yet; or a `TextureScene`, where the obj
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -219,15 +218,15 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
 def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
     conditions = scene.draw("select", SCALE_VIEWS, 0)
-    center_mm, matrix, scales = card.center_mm, scene.matrix_px(scene.photo_px), []
-    for pose in camera_poses(scene, center_mm, conditions.pose):
-        eye = -pose[:3, :3].T @ pose[:3, 3]
-        if (eye - center_mm) @ card.normal <= 0:
-            continue
-        homography = geometry.plane_homography(matrix, pose, card.world_from_piece)
-        mean, tilt = geometry.local_scale(homography, np.array(card.size_mm) / 2)
-        scales.append(mean * math.sqrt(math.cos(math.radians(tilt))))
-    return np.array(scales)
+    center_mm, matrix = card.center_mm, scene.matrix_px(scene.photo_px)
+    poses = camera_poses(scene, center_mm, conditions.pose)
+    eyes = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    poses = poses[(eyes - center_mm) @ card.normal > 0]
+    if not len(poses):
+        return np.zeros(0)
+    planes = np.stack([geometry.plane_homography(matrix, pose, card.world_from_piece) for pose in poses])
+    mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
+    return mean * np.sqrt(np.cos(np.radians(tilt_deg)))
 
 
 def _unreadable_warning(share: float, marker_mm: float) -> tuple[str, ...]:
