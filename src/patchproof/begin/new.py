@@ -25,7 +25,7 @@ from patchproof.output import check_file, write_whole
 from patchproof.scene.fitting import largest, lies_well
 from patchproof.scene.image_scene import label_rows
 from patchproof.scene.patch_scene import OpenScene
-from patchproof.scene.placement import side_frame
+from patchproof.scene.placement import Frame, side_frame
 from patchproof.scene.places import Ground
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
@@ -38,6 +38,7 @@ _SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
 _LARGEST_MM = (165.0, 175.0)  # of a piece on A4, with the chart and the rulers around it
 _LONGER = 1.6  # a piece's longer side over its shorter one at most
 _FRONT = 1.25  # times as large has to be what is preferred to the front, or to a flat card
+_ENOUGH = 0.5  # of the largest piece that any side is asked for: a flat card as large is not bent for more
 _HEAD = ("# Written by patchproof new. All keys and their ranges: patchproof keys.", "# Millimeters and degrees.", "")
 _TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
 
@@ -53,7 +54,7 @@ class _Hang:
     @property
     def worth(self) -> float:
         """Its area, that of a flat card on the front counting more."""
-        return self.size_mm[0] * self.size_mm[1] * (1 if self.bend else _FRONT) * (_FRONT if self.side == "+z" else 1)
+        return _area(self.size_mm) * (1 if self.bend else _FRONT) * (_FRONT if self.side == "+z" else 1)
 
 
 def new_scene(
@@ -145,7 +146,11 @@ def _on(hang: _Hang) -> str:
 
 def _place(mesh: Mesh, length_mm: float) -> _Hang:
     """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
-    hangs = [hang for side in _TRIED for hang in _on_side(mesh, side)]
+    sides = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
+    flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
+    if any(_area(hang.size_mm) >= _ENOUGH * max(map(_area, sides.values())) for hang in flat):
+        return max(flat, key=lambda hang: hang.worth)  # bending takes seconds to try
+    hangs = flat + [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, True))]
     if hangs:
         return max(hangs, key=lambda hang: hang.worth)
     least = smallest_piece_mm()
@@ -155,17 +160,21 @@ def _place(mesh: Mesh, length_mm: float) -> _Hang:
     return _Hang(None, (least, least), False)
 
 
-def _on_side(mesh: Mesh, side: Side) -> list[_Hang]:
-    frame, hangs = side_frame(mesh, side), []
+def _wanted(frame: Frame) -> tuple[float, float]:
+    """The largest piece that a side is asked for."""
     width, height = (_SIDE_SHARE * extent for extent in frame.extent_mm)
-    size = min(width, _LONGER * height, _LARGEST_MM[0]), min(height, _LONGER * width, _LARGEST_MM[1])
-    for bend in (False, True):
-        found = largest(size, lambda trial, bend=bend: lies_well(mesh, frame, trial, 0.0, bend), smallest_piece_mm())
-        if found is not None:
-            hangs.append(_Hang(side, found, bend))
-            if not bend and min(found) >= 0.95 * min(size):
-                break
-    return hangs
+    return min(width, _LONGER * height, _LARGEST_MM[0]), min(height, _LONGER * width, _LARGEST_MM[1])
+
+
+def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> _Hang | None:
+    """The largest piece of that shape that lies well in the middle of a side."""
+    frame = side_frame(mesh, side)
+    found = largest(size_mm, lambda trial: lies_well(mesh, frame, trial, 0.0, bend), smallest_piece_mm())
+    return None if found is None else _Hang(side, found, bend)
+
+
+def _area(size_mm: tuple[float, float]) -> float:
+    return size_mm[0] * size_mm[1]
 
 
 def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:

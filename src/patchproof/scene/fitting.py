@@ -16,7 +16,7 @@ from patchproof.scene.bend import place_bent
 from patchproof.scene.placement import WARN_GAP_SHARE, WARN_OVERHANG_SHARE, Frame, Placement, place_card
 from patchproof.strict import Refused
 
-_HALVINGS = 6  # to 2 % of the piece that was asked for
+_HALVINGS = 5  # to 3 % of the piece that was asked for
 
 
 def lies_well(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float, bend: bool) -> bool:
