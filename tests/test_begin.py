@@ -37,7 +37,7 @@ LABELS = ["coffee mug", "cup", "garbage truck, dustcart", "tow truck, tow car, w
 QUICK = {"camera": {"photo_px": [400, 300]}, "background": {"color": [0.5, 0.5, 0.5]}}
 
 
-def box(width=300, **patch):
+def box(width=300, photo_px=(400, 300), **patch):
     """A box 300 mm wide, 200 high and 100 deep, made in Python, with a piece on its front."""
     return make_scene(
         {
@@ -45,6 +45,7 @@ def box(width=300, **patch):
             "patch": {"width_mm": 90, "height_mm": 90, "side": "+z", **patch},
             "target": {"label": "carton", "models": ["builtin"]},
             **QUICK,
+            "camera": {"photo_px": photo_px},
         },
         trimesh.creation.box((width, 200, 100)),
     )
@@ -316,3 +317,31 @@ def test_the_command_line_looks_and_says_where(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr()
     assert stop.value.code == 1 and "page: patchproof-preview/preview.html" in said.out
     assert said.err.splitlines()[-1].startswith("Expected a piece no larger than the object's side")
+
+
+@pytest.mark.parametrize(
+    ("patch", "advice"),
+    [
+        ({"height_mm": 900}, r"90 × \d\d\d mm lies well there$"),
+        ({"offset_mm": [400, 0]}, r"lies well with offset_mm = \[88, 0\]$"),
+        (
+            {"side": "+x", "width_mm": 120},
+            r"; 100 × 90 mm lies well there; 120 × 90 mm lies well with side = \"\+z\"$",
+        ),
+        ({"side": "+x", "width_mm": 350, "height_mm": 350}, r"; 100 × 200 mm lies well there$"),
+        ({"side": "+x", "width_mm": 900, "height_mm": 12}, "or choose a larger side$"),
+    ],
+)
+def test_a_refused_piece_is_told_what_would_fit(patch, advice):
+    with pytest.raises(Refused) as refused:
+        box(**patch)
+    assert re.search(advice, str(refused.value).rstrip(".")), refused.value
+
+
+def test_markers_say_what_asks_for_their_size():
+    sharp = {"photo_px": (1600, 1200)}
+    (note,) = [note for note in box(width_mm=45, height_mm=45, **sharp).warnings if "unreadable" in note]
+    needed, least = re.search(r"camera.photo_px ask for ([\d.]+) mm, and those for a piece of (\d+) mm", note).groups()
+    enough = box(width_mm=int(least), height_mm=int(least), **sharp)
+    assert not [note for note in enough.warnings if "unreadable" in note]
+    assert float(needed) == pytest.approx(enough.piece.marker_mm, abs=0.06)

@@ -32,6 +32,11 @@ class Refused(ValueError):
         expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
         super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
 
+    def advised(self, advice: str) -> Refused:
+        """The same with more to do."""
+        expected, got, do = self._parts
+        return Refused(expected, got, f"{do.rstrip('.')}{advice}")
+
     def __reduce__(self):
         # exceptions are rebuilt from their message when they come back from another process; this one has three parts
         return Refused, self._parts

@@ -38,7 +38,7 @@ _SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
 _LARGEST_MM = (165.0, 175.0)  # of a piece on A4, with the chart and the rulers around it
 _LONGER = 1.6  # a piece's longer side over its shorter one at most
 _FRONT = 1.25  # times as large has to be what is preferred to the front, or to a flat card
-_ENOUGH = 0.5  # of the largest piece that any side is asked for: a flat card as large is not bent for more
+_ENOUGH = 0.8  # of the largest piece that any side is asked for: a flat card as large is not bent for more
 _HEAD = ("# Written by patchproof new. All keys and their ranges: patchproof keys.", "# Millimeters and degrees.", "")
 _TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
 

@@ -14,19 +14,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from patchproof.begin.sides import SIDE_NAMES, extent_mm, gap_colors, gap_top_mm, side_of, side_views, stretch_colors
 from patchproof.begin.views import Look, looks
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.color import codes_of
+from patchproof.mesh.export import write_glb
+from patchproof.mesh.mesh import Material, Part
 from patchproof.output import new_folder, write_whole
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
 from patchproof.report.page import page, viewer
 from patchproof.scene.bend import STRETCH_LIMIT
-from patchproof.scene.export import write_glb
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import OpenScene, PatchScene
 from patchproof.scene.scene import Scene, build_scene
@@ -211,20 +211,17 @@ def _write_object(stage: Stage, path: Path) -> None:
         raise ValueError("a scene of pictures has no object to turn")
     mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
     textures = [_reduced(m.texture_srgb) for m in mesh.materials if m.texture_srgb is not None]
-    piece = (scene.placement, _gray_piece(stage, scene)) if isinstance(scene, PatchScene) else None
+    piece = _gray_piece(stage, scene) if isinstance(scene, PatchScene) else None
     write_whole(path, lambda part: write_glb(mesh, textures, part, piece))
 
 
-def _gray_piece(stage: Stage, scene: PatchScene) -> np.ndarray:
-    """The printed piece with a gray design, uint8 H×W×3."""
-    scale = _DESIGN_PX / max(scene.piece.size_mm)
+def _gray_piece(stage: Stage, scene: PatchScene) -> Part:
+    """The printed piece with a gray design where it lies."""
+    laid, scale = scene.placement, _DESIGN_PX / max(scene.piece.size_mm)
     width, height = (max(8, round(side * scale)) for side in scene.piece.size_mm)
     shown = stage.look.shown(torch.full((3, height, width), 0.5))
-    return _codes(shown.srgb)
-
-
-def _codes(srgb: Tensor) -> np.ndarray:
-    return codes_of(srgb).cpu().numpy()
+    material = Material("piece", (1.0, 1.0, 1.0), codes_of(shown.srgb).cpu().numpy())
+    return Part(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
 
 
 def _reduced(texture: np.ndarray) -> np.ndarray:

@@ -21,13 +21,14 @@ from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.fitting import advice
 from patchproof.scene.interface import SCALE_VIEWS, PieceScene
 from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
 from patchproof.scene.placement import Placement, patch_frame, place_card, view_frame
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.texture import texture_canvas
 from patchproof.settings import SceneSettings, SearchSettings, identifying
-from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id, smallest_piece_mm
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, Side, expand
@@ -202,7 +203,10 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     settings, mesh = scene.settings, scene.mesh
     frame = patch_frame(mesh, settings.patch)
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
-    placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
+    try:
+        placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
+    except Refused as refused:
+        raise refused.advised(advice(mesh, patch, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
@@ -211,7 +215,12 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
+    notes = (
+        *mesh.warnings,
+        *scene.backgrounds.notes,
+        *placement.warnings,
+        *_unreadable_warning(unreadable, marker_mm, float(needed_mm)),
+    )
     return piece, placement, unreadable, notes
 
 
@@ -229,7 +238,11 @@ def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     return mean * np.sqrt(np.cos(np.radians(tilt_deg)))
 
 
-def _unreadable_warning(share: float, marker_mm: float) -> tuple[str, ...]:
+def _unreadable_warning(share: float, marker_mm: float, needed_mm: float) -> tuple[str, ...]:
     if share <= 1 - READABLE_SHARE:
         return ()
-    return (f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views",)
+    return (
+        f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views: "
+        f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+        f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
+    )

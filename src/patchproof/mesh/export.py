@@ -1,6 +1,6 @@
 """The object with its textures, and the piece on it where there is one, as one GLB file that other programs open.
 
-In: a mesh, one uint8 sRGB texture per material, and where the piece lies with its picture. Out: glTF 2.0, in meters as
+In: a mesh, one uint8 sRGB texture per material, and the piece as a textured part. Out: glTF 2.0, in meters as
 its specification wants (the mesh is in millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes
 it; nothing in it depends on the time, so the same textures give the same bytes. Surfaces are matte, and seen from both
 sides as the renderer here sees them. Left out on purpose: lights and cameras. Material names are kept and may repeat;
@@ -15,20 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.color import codes_of
-from patchproof.mesh.mesh import Mesh
-from patchproof.scene.placement import Placement
+from patchproof.mesh.mesh import Mesh, Part
 
 _M_FROM_MM = 1e-3
 
 
-def write_glb(
-    mesh: Mesh,
-    textures: Sequence[np.ndarray],
-    path: str | Path,
-    piece: tuple[Placement, np.ndarray] | None = None,
-) -> None:
+def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piece: Part | None = None) -> None:
     """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file;
-    `piece` is where it lies and its picture, uint8 H×W×3 up to the cut line.
+    `piece` hangs on it, with a texture of its own.
 
     Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
     """
@@ -41,7 +35,7 @@ def write_glb(
         if len(faces):
             scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
     if piece is not None:
-        scene.add_geometry(_paper(*piece), geom_name="piece")
+        scene.add_geometry(_part(piece), geom_name="piece")
     Path(path).write_bytes(export_glb(scene, include_normals=True))
 
 
@@ -65,18 +59,15 @@ def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     return trimesh.Trimesh(position, index.reshape(-1, 3), vertex_normals=normal, visual=visual, process=False)
 
 
-def _paper(placement: Placement, picture: np.ndarray):
-    """The piece as a trimesh."""
+def _part(part: Part):
+    """A part with a texture as a trimesh."""
     import trimesh
 
-    visual = _textured(placement.piece_mm / placement.size_mm, "piece", picture)
-    return trimesh.Trimesh(
-        placement.vertices_mm * _M_FROM_MM,
-        placement.faces,
-        vertex_normals=placement.normals,
-        visual=visual,
-        process=False,
-    )
+    if part.uv is None or part.material.texture_srgb is None:
+        raise ValueError("a part without a texture")
+    visual = _textured(part.uv, part.material.name, part.material.texture_srgb)
+    position = part.vertices * _M_FROM_MM
+    return trimesh.Trimesh(position, part.faces, vertex_normals=part.normals, visual=visual, process=False)
 
 
 def _textured(uv: np.ndarray, name: str, texture: np.ndarray):
