@@ -146,7 +146,7 @@ def _on(hang: _Hang) -> str:
 
 def _place(mesh: Mesh, length_mm: float) -> _Hang:
     """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
-    sides = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
+    sides: dict[Side, tuple[float, float]] = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
     flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
     if any(_area(hang.size_mm) >= _ENOUGH * max(map(_area, sides.values())) for hang in flat):
         return max(flat, key=lambda hang: hang.worth)  # bending takes seconds to try

@@ -96,10 +96,10 @@ def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
     """The marker to print: what is needed (never under 8 mm), else the largest that leaves the design its share, in
     whole 0.1 mm.
     """
-    wanted, least = max(needed_mm, SMALLEST_MARKER_MM), smallest_piece_mm()
+    wanted, least = max(needed_mm, SMALLEST_MARKER_MM), _corner_mm(SMALLEST_MARKER_MM) / LARGEST_CORNER
     if min(piece_mm) < least:
         raise Refused(
-            f"a piece of at least {least} mm, beside {SMALLEST_MARKER_MM:g} mm markers",
+            f"a piece of at least {math.ceil(least)} mm, beside {SMALLEST_MARKER_MM:g} mm markers",
             f"{piece_mm[0]:g} × {piece_mm[1]:g} mm",
             "make the patch larger",
         )
