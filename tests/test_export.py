@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from patchproof.mesh.export import write_glb
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.scene.export import write_glb
 from patchproof.scene.texture import texture_canvas
 from patchproof.settings import PatchSettings
 
@@ -102,7 +102,7 @@ def test_a_textured_object_survives_whole(data, tmp_path):
 def test_the_same_bytes_in_every_process(tmp_path):
     code = (
         "import sys, numpy as np; from patchproof.mesh.load_mesh import load_mesh;"
-        "from patchproof.scene.export import write_glb; m = load_mesh('primitive:box_truck', 300);"
+        "from patchproof.mesh.export import write_glb; m = load_mesh('primitive:box_truck', 300);"
         "write_glb(m, [np.full((2, 3, 3), i, np.uint8) for i in range(len(m.materials))], sys.argv[1])"
     )
     made = []

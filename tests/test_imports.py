@@ -51,6 +51,7 @@ MAY_IMPORT = {
     "printing": WORLD | {"optimizer", "evidence"},
     "reprints": WORLD | {"optimizer", "evidence", "printing"},
     "journey": COMMANDS,
+    "begin": COMMANDS,
     "plan": COMMANDS | {"journey"},
     "study": WORLD | {"optimizer", "report"},
     "harden": GROUND | {"photo", "scene", "classifier", "report", "study"},
@@ -58,7 +59,7 @@ MAY_IMPORT = {
     "validation": STUDIES,
     "training": WORLD,
     "bench": STUDIES | {"training", "harden", "experiments"},
-    "cli": STUDIES | {"harden", "bench", "training", "experiments", "validation"},
+    "cli": STUDIES | {"begin", "harden", "bench", "training", "experiments", "validation"},
     "__init__": COMMANDS | {"journey"},
     "__main__": {"cli"},
 }

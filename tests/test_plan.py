@@ -30,7 +30,7 @@ from patchproof.scene.photo_scene import BasePhoto, PhotoScene
 from patchproof.scene.scene import build_scene, load_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import lay_out_piece
-from patchproof.strict import validated
+from patchproof.strict import Refused, validated
 from test_conditions import SETTINGS
 
 
@@ -283,3 +283,17 @@ def test_the_verb_prints_and_writes_and_does_not_overwrite(scene_file, tmp_path,
     with pytest.raises(SystemExit) as done:
         cli.main()
     assert done.value.code == 1 and "which exists" in capsys.readouterr().err
+
+
+def test_geometry_is_said_before_anything_is_measured(scene_file, monkeypatch, capsys):
+    def measured(*arguments, **options):
+        raise Refused("a plan", "an end", "look at what was said before")
+
+    monkeypatch.setattr("patchproof.plan.plan.measured_plan", measured)
+    monkeypatch.setattr(sys, "argv", ["patchproof", "plan", str(scene_file)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    said = capsys.readouterr()
+    assert stop.value.code == 1 and "look at what was said before" in said.err
+    heads = [line for line in said.out.splitlines() if not line.startswith("  ")]
+    assert [head.partition(":")[0] for head in heads] == ["scene.toml", "surface", "resolution", "markers"]

@@ -8,6 +8,7 @@ import torch
 import trimesh
 from PIL import Image
 
+from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, Part, from_parts
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate_run
@@ -17,7 +18,6 @@ from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.conditions import with_values
-from patchproof.scene.export import write_glb
 from patchproof.scene.scene import load_scene
 from test_journey import command
 

@@ -111,11 +111,18 @@ def local_scale(homography, point) -> tuple[float, float]:
 
     px_per_mm is their geometric mean; tilt is arccos of their ratio: exact for a far camera, approximate near by.
     """
+    px_per_mm, tilt_deg = local_scales(np.asarray(homography)[None], point)[0].tolist()
+    return px_per_mm, tilt_deg
+
+
+def local_scales(homographies: np.ndarray, point) -> np.ndarray:
+    """N×2: `local_scale` of homographies N×3×3."""
     x, y = point
-    u, v, w = homography @ np.array([x, y, 1.0])
-    jacobian = (homography[:2, :2] - np.outer([u / w, v / w], homography[2, :2])) / w
-    large, small = np.linalg.svd(jacobian, compute_uv=False)
-    return float(np.sqrt(large * small)), float(np.degrees(np.arccos(np.clip(small / large, 0, 1))))
+    at = homographies @ np.array([x, y, 1.0])
+    pixel, w = at[:, :2] / at[:, 2:], at[:, 2, None, None]
+    jacobians = (homographies[:, :2, :2] - pixel[:, :, None] * homographies[:, None, 2, :2]) / w
+    large, small = np.linalg.svd(jacobians, compute_uv=False).T
+    return np.stack([np.sqrt(large * small), np.degrees(np.arccos(np.clip(small / large, 0, 1)))], 1)
 
 
 def plane_pose(homography, matrix_px) -> np.ndarray:

@@ -32,6 +32,11 @@ class Refused(ValueError):
         expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
         super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
 
+    def advised(self, advice: str) -> Refused:
+        """The same with more to do."""
+        expected, got, do = self._parts
+        return Refused(expected, got, f"{do.rstrip('.')}{advice}")
+
     def __reduce__(self):
         # exceptions are rebuilt from their message when they come back from another process; this one has three parts
         return Refused, self._parts
@@ -94,17 +99,22 @@ class Strict(BaseModel):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
     path = Path(path)
     if not os.path.isfile(path):  # of a path that no system takes, 300 letters or a NUL, this is false, too
         raise Refused("a TOML file", f"no file at {path}", "check the path")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parsed_toml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
+
+
+def parsed_toml(text: str) -> dict[str, Any]:
+    """TOML as a dictionary; a ValueError where it is none."""
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+    return tomllib.loads(text)
 
 
 def validated(model: type[Model], data: Any, where: str) -> Model:

@@ -18,6 +18,27 @@ def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | 
     return tuple(dict.fromkeys(_find(labels, word) for word in (label, *accept)))
 
 
+def find_words(labels: Sequence[str], text: str, whole: bool = False) -> int:
+    """The index of the label with these words: "mug" is "coffee mug", whose last word it is. `whole`: nothing but a
+    label's own name or last words will do. Refused where several or none have them.
+    """
+    words, names = _folded(text).split(), [[_folded(name).split() for name in (e, *e.split(","))] for e in labels]
+    ranks = (
+        lambda name: name == words,
+        lambda name: name[-len(words) :] == words,
+        lambda name: not whole and set(words) <= set(name),
+    )
+    for rank in ranks:
+        matches = [i for i, own in enumerate(names) if words and any(map(rank, own))]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            shown = ", ".join(f'"{labels[i].split(",")[0]}"' for i in matches[:6])
+            more = ", ..." if len(matches) > 6 else ""
+            raise Refused("words of one label", f'"{text}", which is in {len(matches)}', f"choose {shown}{more}")
+    raise Refused("a label that the network knows", f'"{text}"', _nearest(labels, text))
+
+
 def _find(labels: Sequence[str], label: str | int) -> int:
     if isinstance(label, int):
         if not 0 <= label < len(labels):

@@ -1,4 +1,4 @@
-"""From a scene to a verdict: demo, plan, optimize, evaluate, sheet, reprint, verify."""
+"""From a scene to a verdict: demo, optimize, evaluate, sheet, reprint, verify."""
 
 from __future__ import annotations
 
@@ -39,27 +39,6 @@ def demo(
     with progress() as bar:
         summary = run_demo(out, overwrite=overwrite, on_stage=bar)
     say(*summary)
-
-
-def plan(
-    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
-    out: Annotated[Path | None, typer.Option(help="Write the plan as JSON, too.")] = None,
-    no_timing: Annotated[bool, typer.Option("--no-timing", help="Leave out the cost of a step.")] = False,
-    overwrite: Overwrite = False,
-) -> None:
-    """What is modeled, what is not, and why."""
-    from patchproof.output import check_file, write_whole
-    from patchproof.plan.lines import plan_lines
-    from patchproof.plan.plan import plan_scene
-
-    if out is not None:
-        check_file(out, overwrite)
-    with progress() as bar:
-        planned = plan_scene(scene, timing=not no_timing, on_stage=bar)
-    warn(planned.warnings)
-    say(*plan_lines(planned))
-    if out is not None:
-        write_whole(out, planned.model_dump_json(indent=1) + "\n")
 
 
 def optimize(

@@ -28,6 +28,12 @@ def build(name: str, seed: int = 0) -> Mesh:
     return from_parts(made, float(np.ptp(corners, axis=0).max()))
 
 
+def longest_mm(name: str) -> float:
+    """The longest extent of one object as it is made, in whole millimeters."""
+    corners = np.concatenate([part.vertices for part in parts(name)])
+    return float(round(np.ptp(corners, axis=0).max()))
+
+
 def parts(name: str, seed: int = 0) -> list[Part]:
     """The closed parts of one object in millimeters, standing on y = 0; three vertices of its own for every face."""
     if name not in _OBJECTS:

@@ -5,13 +5,18 @@ from __future__ import annotations
 from patchproof.optimizer.places import place_lines
 from patchproof.plan.cost import Cost
 from patchproof.plan.errors import TermError
-from patchproof.plan.plan import Markers, Plan, Resolution, Surface
+from patchproof.plan.plan import Geometry, Markers, Plan, Resolution, Surface
 from patchproof.plan.samples import sample_lines
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 
 
 def plan_lines(plan: Plan) -> list[str]:
-    """A plan for the terminal."""
+    """A whole plan for the terminal."""
+    return [*geometry_lines(plan), *measured_lines(plan)]
+
+
+def geometry_lines(plan: Geometry) -> list[str]:
+    """What a plan knows before it has measured anything."""
     lines = [f"{plan.scene}: {plan.target}, {plan.kind}, seen by {', '.join(plan.models)}"]
     if plan.place is not None:
         lines += ["place", *(f"  {line}" for line in place_lines(plan.place))]
@@ -19,7 +24,12 @@ def plan_lines(plan: Plan) -> list[str]:
     lines += ["resolution", *_resolution_lines(plan.resolution)]
     if plan.markers is not None:
         lines += ["markers", *_marker_lines(plan.markers)]
-    lines += _term_lines(plan)
+    return lines
+
+
+def measured_lines(plan: Plan) -> list[str]:
+    """What a plan measured."""
+    lines = _term_lines(plan)
     lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)", *sample_lines(plan.samples)]
     lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
     return lines if plan.cost is None else [*lines, *_cost_lines(plan.cost)]

@@ -78,8 +78,8 @@ class Draft(Strict):
     rate: float
 
 
-class Plan(Strict):
-    """Everything that `plan` found out."""
+class Geometry(Strict):
+    """What needs no design: known in seconds, unless a place is searched for."""
 
     scene: str
     kind: str
@@ -89,12 +89,17 @@ class Plan(Strict):
     surface: Surface
     resolution: Resolution
     markers: Markers | None
+    warnings: tuple[str, ...]
+
+
+class Plan(Geometry):
+    """Everything that `plan` found out."""
+
     draft: Draft
     terms: Terms
     samples: tuple[Sample, ...]
     omitted: tuple[str, ...]
     cost: Cost | None
-    warnings: tuple[str, ...]
 
 
 def plan_scene(
@@ -106,18 +111,24 @@ def plan_scene(
     on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Plan:
     """Plan a scene, its terms over `views` views; without `timing`, all but the cost, which differs from run to run."""
+    geometry, problem = plan_geometry(scene_path, device=device, on_stage=on_stage)
+    return measured_plan(geometry, problem, timing=timing, views=views, on_stage=on_stage)
+
+
+def plan_geometry(
+    scene_path: str | Path,
+    *,
+    device: str = "cpu",
+    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> tuple[Geometry, Problem]:
+    """How the piece of a scene lies and what views show of it, and the problem that a plan goes on with."""
     scene, place = load_scene(scene_path), None
     if isinstance(scene, OpenScene):
         place = choose_place(scene, device=device, on_pass=partial(on_stage, "place"))
         scene = scene.at(place.at, place.spin_deg)
-    problem = set_problem(scene, device)
-    other, sentence = scene.other_surface()
-    design, draft = _draft(problem, on_stage)
-    conditions = scene.draw("select", views)
-    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(on_stage, "terms"))
-    cost = measure_cost(problem, design, partial(on_stage, "cost")) if timing else None
-    target = scene.settings.target
-    return Plan(
+    problem, target = set_problem(scene, device), scene.settings.target
+    _, sentence = scene.other_surface()
+    geometry = Geometry(
         scene=Path(scene_path).name,
         kind=scene.description(),
         target=f"{target.goal} {target.label}",
@@ -126,12 +137,32 @@ def plan_scene(
         surface=Surface(**scene.lies(), other=sentence),
         resolution=resolution_plan(problem),
         markers=marker_plan(needs_piece(scene)) if scene.HAS_PIECE else None,
+        warnings=scene.warnings,
+    )
+    return geometry, problem
+
+
+def measured_plan(
+    geometry: Geometry,
+    problem: Problem,
+    *,
+    timing: bool = True,
+    views: int = TERM_VIEWS,
+    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> Plan:
+    """The rest of a plan: a draft of the design, the terms and the cost."""
+    scene = problem.scene
+    other, _ = scene.other_surface()
+    design, draft = _draft(problem, on_stage)
+    conditions = scene.draw("select", views)
+    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(on_stage, "terms"))
+    return Plan(
+        **dict(geometry),
         draft=draft,
         terms=terms,
         samples=sample_plan(draft.rate, terms.threshold),
         omitted=scene.OMITTED,
-        cost=cost,
-        warnings=scene.warnings,
+        cost=measure_cost(problem, design, partial(on_stage, "cost")) if timing else None,
     )
 
 

@@ -12,17 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from patchproof.channel.effects import Light, Pose
 from patchproof.color import photo_codes_of, srgb_from_linear
 from patchproof.geometry import rect_corners
-from patchproof.render.stage import set_stage
-from patchproof.render.views import see
+from patchproof.render.photograph import shade
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import Stage, set_stage
+from patchproof.render.views import relit, see
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import patch_frame
+from patchproof.scene.placement import Frame, patch_frame
+from patchproof.scene.scene import needs_mesh
 from patchproof.settings import BackgroundSettings
 from patchproof.sheets.plan_page import Hung
 from patchproof.sheets.template import Template
@@ -56,7 +59,7 @@ def hang(scene: PatchScene, template: Template) -> Hung:
             seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
             names.append((tuple(corners.mean(0)), tile.name))
     return Hung(
-        picture=_picture(scene, half),
+        picture=straight_picture(set_stage(scene), scene.frame, half),
         picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
         object_mm=(*low, *(high - low)),
         outline_mm=tuple(map(tuple, outline)),
@@ -65,26 +68,47 @@ def hang(scene: PatchScene, template: Template) -> Hung:
     )
 
 
-def _picture(scene: MeshScene, half_mm: np.ndarray) -> np.ndarray:
-    """uint8 H×W×3: the object in even light on white, spanning ± half_mm."""
+def straight_picture(
+    stage: Stage, frame: Frame, half_mm: np.ndarray, picture_px: int = PICTURE_PX, on_piece: np.ndarray | None = None
+) -> np.ndarray:
+    """uint8 H×W×3: the object of a stage in even light on white, seen along a frame's normal, spanning ± half_mm.
+
+    `on_piece`: uint8 h×w×3 colors over the piece of a scene that has one; they are shown as they are, without light.
+    """
+    scene = needs_mesh(stage.scene)
     distance = AWAY * scene.length_mm
-    px_per_mm = PICTURE_PX / (2 * half_mm.max())
+    px_per_mm = picture_px / (2 * half_mm.max())
     width, height = (int(v) for v in np.maximum(np.rint(2 * half_mm * px_per_mm), 16))
     fov = float(np.degrees(2 * np.arctan(half_mm.min() / distance)))
-    view, camera = {"fov_deg": fov, "look_at": "object"}, {"photo_px": (width, height), "file": None}
-    settings = scene.settings.changed(view=view, camera=camera)
+    view = {"fov_deg": fov, "look_at": "object"}
+    settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
-    plain = replace(scene, settings=settings, backgrounds=white, camera=None)
-    conditions = Conditions(
-        pose=Pose(distance_mm=np.array([distance])),
+    plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
+    shown = None if on_piece is None else PiecePicture(torch.tensor(on_piece, dtype=torch.float32) / 255)
+    with torch.no_grad():
+        views = see(plain, shown, _even(distance, 0.55, 0.45), (width, height), supersample=2)
+        light = views.bare.clone()
+        if shown is not None:
+            covered = views.on_piece.pixel[views.on_piece.share[:, 0] > 0]
+            if len(covered):
+                light[covered] = _by_rows(shade(relit(views, _even(distance, 1.0, 0.0)), shown))[covered]
+    picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
+    return photo_codes_of(picture)
+
+
+def _by_rows(pictures: Tensor) -> Tensor:
+    """1×3×H×W as H·W × 3."""
+    return pictures[0].permute(1, 2, 0).reshape(-1, 3)
+
+
+def _even(distance_mm: float, ambient: float, directional: float) -> Conditions:
+    """One view straight from the front, lit from everywhere and from the upper left."""
+    return Conditions(
+        pose=Pose(distance_mm=np.array([distance_mm])),
         light=Light(
-            ambient=np.array([0.55]),
-            directional=np.array([0.45]),
+            ambient=np.array([ambient]),
+            directional=np.array([directional]),
             light_azimuth_deg=np.array([-30.0]),
             light_elevation_deg=np.array([45.0]),
         ),
     )
-    with torch.no_grad():
-        light = see(set_stage(plain), None, conditions, (width, height), supersample=2).bare
-    picture = srgb_from_linear(light.clamp(0, 1)).reshape(height, width, 3).cpu().numpy()
-    return photo_codes_of(picture)

@@ -66,8 +66,12 @@ def _paths(folder: Path, file: str) -> list[Path]:
 
 def data_uri(content: bytes) -> str:
     """The bytes of a JPEG or PNG as something that `<img src>` takes."""
-    kind = "png" if content.startswith(_PNG) else "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return base64_uri(content, f"image/{'png' if content.startswith(_PNG) else 'jpeg'}")
+
+
+def base64_uri(content: bytes, kind: str) -> str:
+    """Bytes of that media type as an address that needs no file."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""One HTML page from a template of this folder; values in it are escaped, an unknown one is an error."""
+"""One HTML page from a template of this folder; values in it are escaped, an unknown one is an error.
+
+A page that turns a 3D object has Google's model-viewer inside, which this folder keeps as it was published, with its
+license beside it: a page that is opened as a file may not load modules or models from others.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,12 @@ def page(template: str, **values: object) -> str:
     environment.filters |= {"percent": _percent, "figure": _figure, "shown": shown}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
+
+
+def viewer() -> str:
+    """The script that knows `<model-viewer>`, without the line that names a file for debuggers."""
+    script = (Path(__file__).parent / "model-viewer-umd.min.js").read_text(encoding="utf-8")
+    return script.partition("//# sourceMappingURL=")[0]
 
 
 def _percent(share: float | None) -> str:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.exponential import Smooth, exponential_map, largest_stretch
+from patchproof.scene.exponential import Smooth, exponential_map, stretch_at
 from patchproof.scene.placement import (
     GRID,
     LIFT_MM,
@@ -218,8 +218,10 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
     pose, st = _spread(surface, frame, size_mm, spin_deg)
     vertices, normals = surface.points_and_normals(*st.T)
     paper = heights(surface.chart, vertices[faces], size_mm, GRID)
-    clear = paper - under
-    gaps = clear[np.isfinite(clear)] - LIFT_MM
+    # a cell's chords end short of a round surface's edge
+    clear = np.where(np.isfinite(paper), paper, surface.height(*at.T)) - under
+    gaps = clear[np.isfinite(clear) & np.isfinite(paper)] - LIFT_MM
+    stretches = stretch_at(surface, st, size_mm, _PIECE_NET)
     gap, overhang = float(gaps.max()), 1 - len(gaps) / int(np.isfinite(paper).sum())
     return Placement(
         family="exponential",
@@ -231,8 +233,10 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
         world_from_piece=pose,
         gap_mm=gap,
         gap_mean_mm=float(gaps.mean()),
+        gaps_mm=(clear - LIFT_MM).reshape(GRID, GRID),
         overhang_share=overhang,
-        stretch=largest_stretch(surface, st, size_mm, _PIECE_NET),
+        stretch=float(stretches.max()),
+        stretches=stretches,
         reason="",
         warnings=placement_warnings(gap, overhang, size_mm),
     )

@@ -73,13 +73,15 @@ def exponential_map(surface: Smooth, offsets_mm: np.ndarray, right: np.ndarray, 
     return at
 
 
-def largest_stretch(surface: Smooth, at: np.ndarray, size_mm: tuple[float, float], n: int) -> float:
-    """Largest relative change of length in any direction, where an n×n net of the sheet by rows lies `at` (s, t)."""
+def stretch_at(surface: Smooth, at: np.ndarray, size_mm: tuple[float, float], n: int) -> np.ndarray:
+    """n×n: the largest relative change of length in any direction at each point of an n×n net of the sheet by rows that
+    lies `at` (s, t).
+    """
     step = np.array(size_mm) / (n - 1)
     net = at.reshape(n, n, 2)
     by_row, by_column = (np.asarray(np.gradient(net, step[1 - axis], axis=axis, edge_order=2)) for axis in (0, 1))
     change = np.stack([by_column, by_row], -2).reshape(-1, 2, 2) @ np.stack(surface.tangents(*at.T), 1)
-    return float(np.abs(np.linalg.svd(change, compute_uv=False) - 1).max())
+    return np.abs(np.linalg.svd(change, compute_uv=False) - 1).max(1).reshape(n, n)
 
 
 def _bending(surface: Smooth, at: np.ndarray, speed: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing_extensions import Self
 
 from patchproof.channel.effects import Effect
 from patchproof.channel.lens import Camera
-from patchproof.geometry import apply_homography, local_scale
+from patchproof.geometry import apply_homography, local_scales
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.scene.placement import Placement
 from patchproof.scene.resolution import design_grid
@@ -211,7 +211,7 @@ class PieceScene(Scene):
     def scales_and_tilts(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×2: pixels per millimeter at the piece's middle, and its tilt in degrees."""
         middle = np.array(self.piece.size_mm) / 2
-        return np.array([local_scale(each, middle) for each in self.piece_homographies(conditions, size_px)])
+        return local_scales(self.piece_homographies(conditions, size_px), middle)
 
     def design_px(self, network_px: int) -> tuple[int, int]:
         """(width, height) of the design: no more pixels than the closest view at the network's size can show."""

@@ -8,7 +8,6 @@ an `OpenScene`, whose piece has no place yet; or a `TextureScene`, where the obj
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,13 +21,14 @@ from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.fitting import advice
 from patchproof.scene.interface import SCALE_VIEWS, PieceScene
 from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
 from patchproof.scene.placement import Placement, patch_frame, place_card, view_frame
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.texture import texture_canvas
 from patchproof.settings import SceneSettings, SearchSettings, identifying
-from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id, smallest_piece_mm
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
 from patchproof.strict import Refused, Side, expand
@@ -203,7 +203,10 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     settings, mesh = scene.settings, scene.mesh
     frame = patch_frame(mesh, settings.patch)
     patch, place = settings.patch, place_bent if settings.patch.bend else place_card
-    placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
+    try:
+        placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
+    except Refused as refused:
+        raise refused.advised(advice(mesh, patch, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
@@ -212,26 +215,34 @@ def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings, *_unreadable_warning(unreadable, marker_mm))
+    notes = (
+        *mesh.warnings,
+        *scene.backgrounds.notes,
+        *placement.warnings,
+        *_unreadable_warning(unreadable, marker_mm, float(needed_mm)),
+    )
     return piece, placement, unreadable, notes
 
 
 def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     """px per mm at the card's middle, along the foreshortened direction, over views that face it."""
     conditions = scene.draw("select", SCALE_VIEWS, 0)
-    poses = camera_poses(scene, card.center_mm, conditions.pose)
-    matrix, scales = scene.matrix_px(scene.photo_px), []
-    for pose in poses:
-        eye = -pose[:3, :3].T @ pose[:3, 3]
-        if (eye - card.center_mm) @ card.normal <= 0:
-            continue
-        homography = geometry.plane_homography(matrix, pose, card.world_from_piece)
-        mean, tilt = geometry.local_scale(homography, np.array(card.size_mm) / 2)
-        scales.append(mean * math.sqrt(math.cos(math.radians(tilt))))
-    return np.array(scales)
+    center_mm, matrix = card.center_mm, scene.matrix_px(scene.photo_px)
+    poses = camera_poses(scene, center_mm, conditions.pose)
+    eyes = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    poses = poses[(eyes - center_mm) @ card.normal > 0]
+    if not len(poses):
+        return np.zeros(0)
+    planes = np.stack([geometry.plane_homography(matrix, pose, card.world_from_piece) for pose in poses])
+    mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
+    return mean * np.sqrt(np.cos(np.radians(tilt_deg)))
 
 
-def _unreadable_warning(share: float, marker_mm: float) -> tuple[str, ...]:
+def _unreadable_warning(share: float, marker_mm: float, needed_mm: float) -> tuple[str, ...]:
     if share <= 1 - READABLE_SHARE:
         return ()
-    return (f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views",)
+    return (
+        f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views: "
+        f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+        f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
+    )

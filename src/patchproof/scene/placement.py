@@ -45,8 +45,10 @@ class Placement:
     world_from_piece: np.ndarray  # 4×4, z into the object: the card's frame, or the bent piece's tangent at its middle
     gap_mm: float  # largest distance from the piece to the surface where there is surface
     gap_mean_mm: float
+    gaps_mm: np.ndarray  # GRID×GRID by rows from the top: from the piece to the surface, NaN where there is none
     overhang_share: float  # of the piece's area with no object under it
     stretch: float  # largest relative change of length on the surface against the sheet
+    stretches: np.ndarray  # N×N by rows from the top: the same at each point of the piece
     reason: str
     warnings: tuple[str, ...] = ()
 
@@ -166,8 +168,10 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
         world_from_piece=pose,
         gap_mm=gap,
         gap_mean_mm=float(gaps.mean()),
+        gaps_mm=(top - surface).reshape(GRID, GRID),
         overhang_share=overhang,
         stretch=0.0,
+        stretches=np.zeros((2, 2)),
         reason=f"a flat card stands at most {gap:.1f} mm off the surface",
         warnings=placement_warnings(gap, overhang, size_mm),
     )

@@ -66,7 +66,7 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
             f"{np.count_nonzero(missing)} of {len(missing)} faces have no texture coordinates of use: they are"
             " unwrapped (xatlas) and keep their colors"
         )
-    mesh = _whole_colors(mesh, chosen, texels)
+    mesh = whole_colors(mesh, chosen, texels)
     masks = _masks(mesh, chosen)
     if patch.mask is not None:
         image = _read_mask(Path(expand(patch.mask, base)))
@@ -144,8 +144,10 @@ def _stretched(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(image.resize((width, height), Image.Resampling.BOX)) >= 128
 
 
-def _whole_colors(mesh: Mesh, chosen: np.ndarray, texels: int) -> Mesh:
-    """`mesh` with each material's color in its texture; one-colored ones get `texels`² where they may change."""
+def whole_colors(mesh: Mesh, chosen: np.ndarray, texels: int = TEXELS) -> Mesh:
+    """`mesh` with each material's color in its texture; one-colored ones get `texels`² where the `chosen` of its faces
+    F may change.
+    """
 
     def whole(index: int, material: Material) -> Material:
         table = codes_of(srgb_from_linear((LIGHT_OF_CODE[:, None] * material.base_color_linear).clip(0, 1)))

@@ -107,6 +107,11 @@ def marker_size_mm(needed_mm: float, piece_mm: tuple[float, float]) -> float:
     return wanted if fitting >= wanted else math.floor(fitting * 10 + 1e-6) / 10
 
 
+def smallest_piece_mm(marker_mm: float = SMALLEST_MARKER_MM) -> int:
+    """The shorter side that four markers of a size ask for, in whole millimeters."""
+    return math.ceil(_corner_mm(marker_mm) / LARGEST_CORNER)
+
+
 def lay_out_piece(
     piece_mm: tuple[float, float], marker_mm: float, sheet_id: str, kind: str, bends: bool = False
 ) -> Piece:

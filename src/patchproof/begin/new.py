@@ -1,0 +1,280 @@
+"""`new`: a commented scene file for an object that somebody has as a mesh, as photographs or as images.
+
+In: a mesh (a file, or `primitive:NAME`), a folder of photographs with a blank sheet's manifest in or beside it, or a
+folder of images with a CSV of labels. Out: a TOML file that loads, and lines that say what was guessed. Distances
+follow the object's length, the piece is the largest that lies well on one of its sides. A file that could not be
+optimized is never written.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from patchproof.begin.guess import Up, guess_up, label_of, length_of
+from patchproof.begin.sides import SIDE_NAMES
+from patchproof.classifier.labels import find_labels
+from patchproof.classifier.load import load_classifier
+from patchproof.input import is_file, is_folder
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.mesh import Mesh
+from patchproof.output import check_file, write_whole
+from patchproof.scene.fitting import largest, lies_well
+from patchproof.scene.image_scene import label_rows
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.placement import Frame, side_frame
+from patchproof.scene.places import Ground
+from patchproof.scene.scene import build_scene
+from patchproof.settings import SceneSettings
+from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.piece import smallest_piece_mm
+from patchproof.strict import Refused, Side, parsed_toml, validated
+
+NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm
+_SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
+_LARGEST_MM = (165.0, 175.0)  # of a piece on A4, with the chart and the rulers around it
+_LONGER = 1.6  # a piece's longer side over its shorter one at most
+_FRONT = 1.25  # times as large has to be what is preferred to the front, or to a flat card
+_ENOUGH = 0.8  # of the largest piece that any side is asked for: a flat card as large is not bent for more
+_HEAD = ("# Written by patchproof new. All keys and their ranges: patchproof keys.", "# Millimeters and degrees.", "")
+_TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
+
+
+@dataclass(frozen=True)
+class _Hang:
+    """Where the piece goes: a side's middle, or wherever the search finds; how large it is, and whether it bends."""
+
+    side: Side | None
+    size_mm: tuple[float, float]
+    bend: bool
+
+    @property
+    def worth(self) -> float:
+        """Its area, that of a flat card on the front counting more."""
+        return _area(self.size_mm) * (1 if self.bend else _FRONT) * (_FRONT if self.side == "+z" else 1)
+
+
+def new_scene(
+    thing: str,
+    out: str | Path,
+    *,
+    label: str | None = None,
+    length_mm: float | None = None,
+    models: Sequence[str] = ("builtin",),
+    overwrite: bool = False,
+) -> list[str]:
+    """Write the scene file `out` for a mesh or a folder; returns what was guessed and warned of."""
+    out = Path(out)
+    check_file(out, overwrite)
+    base = out.resolve().parent
+    if thing.startswith("primitive:") or not is_folder(Path(thing)):
+        text, lines = _of_mesh(thing, base, label, length_mm, models)
+    elif length_mm is not None:
+        raise Refused("a mesh with --length-mm", f"the folder {thing}", "leave it out: pictures have no length")
+    else:
+        text, lines = _of_folder(Path(thing), base, label, models)
+    warnings = _checked(text, base)
+    write_whole(out, text)
+    return [*lines, *(f"warning: {warning}" for warning in warnings)]
+
+
+def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None, models) -> tuple[str, list[str]]:
+    named = label_of(_labels(models, base), label, thing)
+    path = Path(thing)
+    if thing.startswith("primitive:"):
+        from patchproof.mesh import primitives
+
+        up, said = Up("y", "primitives are"), "the primitive's own"
+        own_mm = primitives.longest_mm(thing.partition(":")[2])
+    else:
+        up, said, own_mm = guess_up(path), "by the file's units, meters: measure it", None
+    if length_mm is None:
+        length_mm = own_mm or length_of(path)
+    else:
+        said = "as given"
+    mesh = load_mesh(thing, length_mm, up.axis)
+    hang = _place(mesh, length_mm)
+    mesh_name = thing if thing.startswith("primitive:") else _path(path, base)
+    near, far = (_rounded(times * length_mm) for times in (NEAR, FAR))
+    lies = "paper follows the surface" if hang.bend else "a flat card lies close enough"
+    text = "\n".join(
+        [
+            *_HEAD,
+            "[object]",
+            f"mesh = {_quoted(mesh_name)}",
+            _line(f"length_mm = {length_mm:g}", f"its longest extent, {said}"),
+            _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
+            *([f"# It may lie oddly: {up.odd}. Look at the preview's ground line."] if up.odd else []),
+            "",
+            "[patch]",
+            *_size(*hang.size_mm),
+            _line(f'side = "{hang.side}"', f'{SIDE_NAMES[hang.side]}; place = "auto" searches the whole object')
+            if hang.side
+            else _line('place = "auto"', "no side's middle takes it: optimize searches the whole object"),
+            *([] if hang.side else [_line('side = "+z"', "front: what azimuth 0 faces")]),
+            _line(f"bend = {str(hang.bend).lower()}", lies),
+            "",
+            *_target(named, models, base),
+            "",
+            "[view]",
+            _line(f"distance_mm = [{near:g}, {far:g}]", f"to the object's middle: {NEAR} to {FAR} times its length"),
+            _line("azimuth_deg = [-60, 60]", "of the camera about the vertical; 0 faces the piece"),
+            _line("elevation_deg = [2, 27]", "above the horizontal"),
+            "",
+            "# [background]",
+            _line('# images = "places"', "a folder of photographs of places; procedural rooms without"),
+            "",
+        ]
+    )
+    width, height = hang.size_mm
+    lines = [
+        f'up: "{up.axis}", {up.reason}' + (f"; {up.odd}: look at the preview" if up.odd else ""),
+        f"length: {length_mm:g} mm, {said}",
+        f"piece: {width:g} × {height:g} mm, {_on(hang)}",
+        f'label: "{named}" ({models[0]})',
+    ]
+    return text, lines
+
+
+def _on(hang: _Hang) -> str:
+    where = "wherever the search finds" if hang.side is None else f"on its {SIDE_NAMES[hang.side]} ({hang.side})"
+    return f"{'bent, ' if hang.bend else ''}{where}"
+
+
+def _place(mesh: Mesh, length_mm: float) -> _Hang:
+    """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
+    sides: dict[Side, tuple[float, float]] = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
+    flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
+    if any(_area(hang.size_mm) >= _ENOUGH * max(map(_area, sides.values())) for hang in flat):
+        return max(flat, key=lambda hang: hang.worth)  # bending takes seconds to try
+    hangs = flat + [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, True))]
+    if hangs:
+        return max(hangs, key=lambda hang: hang.worth)
+    least = smallest_piece_mm()
+    if least > length_mm:
+        do = "check --length-mm: markers of 8 mm need that much"
+        raise Refused(f"an object with room for a piece of {least:g} mm", f"one of {length_mm:g} mm", do)
+    return _Hang(None, (least, least), False)
+
+
+def _wanted(frame: Frame) -> tuple[float, float]:
+    """The largest piece that a side is asked for."""
+    width, height = (_SIDE_SHARE * extent for extent in frame.extent_mm)
+    return min(width, _LONGER * height, _LARGEST_MM[0]), min(height, _LONGER * width, _LARGEST_MM[1])
+
+
+def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> _Hang | None:
+    """The largest piece of that shape that lies well in the middle of a side."""
+    frame = side_frame(mesh, side)
+    found = largest(size_mm, lambda trial: lies_well(mesh, frame, trial, 0.0, bend), smallest_piece_mm())
+    return None if found is None else _Hang(side, found, bend)
+
+
+def _area(size_mm: tuple[float, float]) -> float:
+    return size_mm[0] * size_mm[1]
+
+
+def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:
+    tables = sorted(folder.glob("*.csv"))
+    manifests = [
+        path for path in sorted([*folder.glob("*.json"), *folder.resolve().parent.glob("*.json")]) if _blank(path)
+    ]
+    if not tables and not manifests:
+        expected = "a CSV of labels among images, or a blank sheet's JSON in or beside the folder of photographs"
+        raise Refused(expected, f"neither for {folder}", "put one there, or name a mesh")
+    if not tables:
+        named = label_of(_labels(models, base), label, folder.resolve().name)
+        sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")
+        lines = [
+            "[object]",
+            f"photos = {_quoted(_path(folder, base))}",
+            sheet,
+            "",
+            _line("[patch]", "as the blank's"),
+            "",
+        ]
+        text = "\n".join([*_HEAD, *lines, *_target(named, models, base), ""])
+        return text, [
+            f"photographs: {folder}, with the blank of {manifests[0].name}",
+            f'label: "{named}" ({models[0]})',
+        ]
+    table = next((path for path in tables if path.stem == "labels"), tables[0])
+    counts = Counter(named for name, named in label_rows(table) if is_file(folder / name))
+    if not counts:
+        raise Refused(f"images that {table.name} names in {folder}", "none", "write their file names there")
+    named = label_of(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
+    lines = ["[object]", f"images = {_quoted(_path(folder, base))}", f"labels = {_quoted(_path(table, base))}", ""]
+    lines += ["[patch]", *_size(100, 100), "", *_target(named, models, base), "", "[view]"]
+    lines += [_line("patch_share = [0.2, 0.3]", "the piece's longer side over the picture's shorter one"), ""]
+    text = "\n".join([*_HEAD, *lines])
+    return text, [f"images: {folder}, labels of {table.name}", f'label: "{named}" ({models[0]})']
+
+
+def _blank(path: Path) -> bool:
+    """Whether a JSON file is the manifest of a blank sheet."""
+    try:
+        return load_manifest(path).kind == "blank"
+    except Refused:
+        return False
+
+
+def _labels(models: Sequence[str], base: Path) -> tuple[str, ...]:
+    """The first network's list."""
+    if not models:
+        raise Refused("a network", "none", "leave --models out, or name one")
+    return load_classifier(_model(models[0], base), base).labels
+
+
+def _target(named: str | int, models: Sequence[str], base: Path) -> list[str]:
+    written = [_model(name, base) for name in models]
+    for name in written[1:]:
+        find_labels(load_classifier(name, base).labels, named)
+    label = named if isinstance(named, int) else _quoted(named)
+    return [
+        "[target]",
+        _line(f"label = {label}", "an index, or a name in the network's list"),
+        f"models = [{', '.join(map(_quoted, written))}]",
+        _line('goal = "assist"', '"deceive" measures robustness'),
+    ]
+
+
+def _size(width_mm: float, height_mm: float) -> list[str]:
+    return [_line(f"width_mm = {width_mm:g}", "of the piece that is cut out"), f"height_mm = {height_mm:g}"]
+
+
+def _line(setting: str, comment: str) -> str:
+    return f"{setting:<29} # {comment}"
+
+
+def _model(name: str, base: Path) -> str:
+    """A network's name as a scene in `base` says it; on the command line paths start where one is."""
+    kind, colon, rest = name.partition(":")
+    return f"file:{_path(Path(rest), base)}" if colon and kind == "file" and "${" not in rest else name
+
+
+def _path(path: Path, base: Path) -> str:
+    """Relative to the scene's folder where it lies in it, else whole."""
+    whole = path.resolve()
+    return (whole.relative_to(base) if whole.is_relative_to(base) else whole).as_posix()
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; JSON's escapes are TOML's."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _rounded(value_mm: float) -> float:
+    """To two figures."""
+    return float(f"{value_mm:.2g}")
+
+
+def _checked(text: str, base: Path) -> tuple[str, ...]:
+    """The warnings of the scene that the text describes; refused where it cannot be loaded or has no place."""
+    settings = validated(SceneSettings, parsed_toml(text), "the new scene")
+    scene = build_scene(settings, base)
+    if isinstance(scene, OpenScene):
+        Ground(scene).spots(1)
+    return scene.warnings

@@ -1,0 +1,82 @@
+"""The object with its textures, and the piece on it where there is one, as one GLB file that other programs open.
+
+In: a mesh, one uint8 sRGB texture per material, and the piece as a textured part. Out: glTF 2.0, in meters as
+its specification wants (the mesh is in millimeters), y up, textures as lossless PNG inside, repeating. trimesh writes
+it; nothing in it depends on the time, so the same textures give the same bytes. Surfaces are matte, and seen from both
+sides as the renderer here sees them. Left out on purpose: lights and cameras. Material names are kept and may repeat;
+geometries are numbered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.color import codes_of
+from patchproof.mesh.mesh import Mesh, Part
+
+_M_FROM_MM = 1e-3
+
+
+def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piece: Part | None = None) -> None:
+    """Write `mesh` with `textures` (uint8 H×W×3, one per material, in place of the material's own) to a .glb file;
+    `piece` hangs on it, with a texture of its own.
+
+    Textures stand for the whole color: base colors are not written; corner colors other than 1 are, in 8 bits of light.
+    """
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    scene = trimesh.Scene()
+    for index, (material, texture) in enumerate(zip(mesh.materials, textures, strict=True)):
+        faces = np.flatnonzero(mesh.face_material == index)
+        if len(faces):
+            scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
+    if piece is not None:
+        scene.add_geometry(_part(piece), geom_name="piece")
+    Path(path).write_bytes(export_glb(scene, include_normals=True))
+
+
+def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
+    """Some faces as a trimesh, corners that agree in everything made one vertex."""
+    import trimesh
+
+    arrays = [
+        mesh.vertices[mesh.faces[faces]] * _M_FROM_MM,
+        mesh.corner_normal[faces],
+        mesh.corner_uv[faces],
+        mesh.corner_color_linear[faces],
+    ]
+    corners = np.concatenate([np.asarray(array, float).reshape(3 * len(faces), -1) for array in arrays], axis=1)
+    corners, index = np.unique(corners, axis=0, return_inverse=True)
+    position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
+    visual = _textured(uv, name, texture)
+    if (color != 1).any():
+        # trimesh writes bytes, whatever it is given
+        visual.vertex_attributes["color"] = codes_of(np.insert(color, 3, 1.0, axis=1))
+    return trimesh.Trimesh(position, index.reshape(-1, 3), vertex_normals=normal, visual=visual, process=False)
+
+
+def _part(part: Part):
+    """A part with a texture as a trimesh."""
+    import trimesh
+
+    if part.uv is None or part.material.texture_srgb is None:
+        raise ValueError("a part without a texture")
+    visual = _textured(part.uv, part.material.name, part.material.texture_srgb)
+    position = part.vertices * _M_FROM_MM
+    return trimesh.Trimesh(position, part.faces, vertex_normals=part.normals, visual=visual, process=False)
+
+
+def _textured(uv: np.ndarray, name: str, texture: np.ndarray):
+    """A matte texture over coordinates V×2 with v down."""
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    material = PBRMaterial(
+        name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    return TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)

@@ -1,0 +1,88 @@
+"""How large a piece may be where it is to hang.
+
+In: a mesh, a place and the piece that was asked for. Out: the largest piece of the same shape that lies there, the
+nearest place for the one that was asked for, and whether a piece lies well: within the gap and the overhang that are
+not warned of. What fits is found by halving: a
+smaller piece is taken to fit where a larger one does, which holds but for holes under its middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from patchproof.mesh.mesh import Mesh
+from patchproof.scene.bend import place_bent
+from patchproof.scene.placement import WARN_GAP_SHARE, WARN_OVERHANG_SHARE, Frame, patch_frame, place_card, side_frame
+from patchproof.settings import PatchSettings
+from patchproof.strict import Refused, Side
+
+_STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
+_TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes some 5 and 200 ms
+_HALVINGS = 5  # to 3 % of the piece that was asked for
+
+
+def advice(mesh: Mesh, patch: PatchSettings, least_mm: float) -> str:
+    """What would lie well instead of a piece that was refused, as the keys of a scene file say it; empty where nothing
+    was found. Places are tried on the same side from the nearest on, then in the middles of the others.
+    """
+    frame, size_mm, how = patch_frame(mesh, patch), patch.size_mm, (patch.spin_deg, patch.bend)
+    width, height = np.minimum(size_mm, frame.extent_mm).tolist()
+    smaller = largest((width, height), lambda trial: lies_well(mesh, frame, trial, *how), least_mm)
+    place = _nearest(mesh, patch)
+    found = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
+    found += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
+    return "".join(f"; {text}" for text in found)
+
+
+def _nearest(mesh: Mesh, patch: PatchSettings) -> str | None:
+    """The nearest place where the piece lies well, as a scene file's key says it."""
+
+    def fits(frame: Frame) -> bool:
+        return lies_well(mesh, frame, patch.size_mm, patch.spin_deg, patch.bend)
+
+    middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
+    step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
+    (across, along), asked = (int(extent // (2 * step)) for extent in middle.extent_mm), np.array(patch.offset_mm)
+    every = [(x * step, y * step) for x in range(-across, across + 1) for y in range(-along, along + 1)]
+    every.sort(key=lambda offset: (float(np.hypot(*(offset - asked))), offset))
+    for x, y in every[: _TRIES_BENT if patch.bend else _TRIES_FLAT]:
+        if fits(replace(middle, origin_mm=middle.origin_mm + x * middle.right + y * middle.up)):
+            return f"offset_mm = [{x:g}, {y:g}]"
+    sides = sorted(get_args(Side), key=lambda side: (side == patch.side, side[1] == "y"))  # top and bottom last
+    side = next((side for side in sides if fits(side_frame(mesh, side))), None)
+    return None if side is None else f'side = "{side}"'
+
+
+def lies_well(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float, bend: bool) -> bool:
+    """Whether a piece lies there without a warning."""
+    try:
+        laid = (place_bent if bend else place_card)(mesh, frame, size_mm, spin_deg)
+    except Refused:
+        return False
+    return laid.gap_mm <= WARN_GAP_SHARE * min(size_mm) and laid.overhang_share <= WARN_OVERHANG_SHARE
+
+
+def largest(
+    size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], bool], least_mm: float
+) -> tuple[float, float] | None:
+    """The largest piece of this shape that fits, in whole millimeters, its shorter side at least `least_mm`; None
+    where not even that does.
+    """
+    low, high = least_mm / min(size_mm), 1.0
+    if low > 1 or not fits(_scaled(size_mm, low)):
+        return None
+    if fits(_scaled(size_mm, high)):
+        return _scaled(size_mm, high)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(_scaled(size_mm, middle)) else (low, middle)
+    return _scaled(size_mm, low)
+
+
+def _scaled(size_mm: tuple[float, float], scale: float) -> tuple[float, float]:
+    width, height = (float(np.floor(side * scale + 1e-6)) for side in size_mm)
+    return width, height
