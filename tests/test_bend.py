@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, Part, from_parts
+from patchproof.mesh.surface import Chart, crop, edge_points, heights, net
 from patchproof.scene.bend import STRETCH_LIMIT, place_bent
-from patchproof.scene.exponential import Smooth, exponential_map, stretch_at
 from patchproof.scene.placement import LIFT_MM, patch_frame
-from patchproof.scene.surface import Chart, crop, edge_points, heights, net
 from patchproof.settings import PatchSettings
 from patchproof.strict import Refused
 

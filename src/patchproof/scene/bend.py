@@ -14,8 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.exponential import Smooth, exponential_map, stretch_at
+from patchproof.mesh.surface import Chart, crop, edge_points, heights, net, surface_at
 from patchproof.scene.placement import (
     GRID,
     LIFT_MM,
@@ -27,7 +28,6 @@ from patchproof.scene.placement import (
     refuse_larger_than_side,
     spun,
 )
-from patchproof.scene.surface import Chart, crop, edge_points, heights, net, surface_at
 from patchproof.strict import Refused
 
 # Mean gap, as a share of the shorter edge, up to which a simpler family lies on the surface: 0.6 mm on 60 mm.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.surface import Chart, heights
+from patchproof.mesh.surface import Chart, heights
 from patchproof.settings import PatchSettings, SceneSettings
 from patchproof.strict import Refused, Side
 

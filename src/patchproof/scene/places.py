@@ -16,6 +16,7 @@ from typing import get_args
 
 import numpy as np
 
+from patchproof.mesh.surface import Chart, crop, heights, net
 from patchproof.scene.bend import place_bent
 from patchproof.scene.mesh_scene import camera_poses
 from patchproof.scene.patch_scene import At, OpenScene
@@ -29,7 +30,6 @@ from patchproof.scene.placement import (
     spun,
     surface_frame,
 )
-from patchproof.scene.surface import Chart, crop, heights, net
 from patchproof.scene.texture import named_faces
 from patchproof.strict import Refused, Side
 

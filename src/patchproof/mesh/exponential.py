@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import polynomial
 
-from patchproof.scene.surface import Chart
+from patchproof.mesh.surface import Chart
 
 _STEPS = 24  # Runge-Kutta steps of a geodesic; its length is off by less than 1e-6 even over a radian
 
