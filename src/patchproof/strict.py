@@ -12,15 +12,14 @@ import difflib
 import math
 import os
 import re
-import sys
+import tomllib
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
-from typing_extensions import Self
 
 
 class Refused(ValueError):
@@ -94,10 +93,6 @@ class Strict(BaseModel):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
     path = Path(path)
     if not os.path.isfile(path):  # of a path that no system takes, 300 letters or a NUL, this is false, too
         raise Refused("a TOML file", f"no file at {path}", "check the path")
