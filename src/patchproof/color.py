@@ -41,7 +41,7 @@ def srgb_from_linear(linear: Values) -> Values:
     return xp.sign(linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
 
 
-def clamped(values: Values) -> Values:
+def clamped(values):
     """Values clipped to [0, 1], with a gradient of 1 at 0 and 1 themselves: `torch.clamp` has had 0 there since 2.14,
     and a pixel of full black or white would never move again.
     """

@@ -75,7 +75,7 @@ def load_timm(name: str) -> Classifier:
 @contextmanager
 def _offline_at_once() -> Iterator[None]:
     """Where timm's hub cannot be reached, only what was downloaded before is used; it would retry for over a minute."""
-    constants = importlib.import_module("huggingface_hub.constants")
+    constants: Any = importlib.import_module("huggingface_hub.constants")
     hub, before = urlsplit(constants.ENDPOINT), constants.HF_HUB_OFFLINE
     try:
         if not getproxies():  # else the way there is the proxy's to know
