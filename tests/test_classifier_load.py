@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from patchproof.classifier import Classifier, load_classifier
+from patchproof.classifier import Classifier, load_classifier, zoo
 from patchproof.classifier.builtin import SmallNetwork, folded
 from patchproof.classifier.check import check_network
 from patchproof.classifier.network import weights_sha256
@@ -102,8 +102,15 @@ def test_a_variable_that_is_not_set_and_a_file_that_is_not_there(tmp_path, monke
 def test_missing_or_broken_libraries_are_named_with_the_command(tmp_path, monkeypatch):
     for name in ("torchvision", "timm"):
         monkeypatch.setitem(sys.modules, name, None)  # what import does where it is not installed
-        with pytest.raises(Refused, match=rf'the library {name} .*pip install "patchproof\[models\]"'):
+        with pytest.raises(Refused, match=rf'the library {name} .*pip install "patchproof\[models\]".*CPU index'):
             load_classifier(f"{name}:resnet50", tmp_path)
+
+    def built_for_another_torch(name):
+        raise RuntimeError("operator torchvision::nms does not exist")
+
+    monkeypatch.setattr(zoo.importlib, "import_module", built_for_another_torch)
+    with pytest.raises(Refused, match=r"nms does not exist\): remove torchvision and .* from where torch is from"):
+        load_classifier("torchvision:resnet50", tmp_path)
 
 
 def fake_torchvision(monkeypatch, network, broken=False) -> None:
@@ -161,12 +168,17 @@ def test_timm_is_wrapped_with_its_own_figures(tmp_path, monkeypatch):
         data=data,
         is_model=lambda name: name == "vit",
         list_models=lambda: ["vit"],
-        create_model=lambda name, pretrained: network,
+        create_model=lambda name, pretrained: offline.append(hub.HF_HUB_OFFLINE) or network,
     )
     monkeypatch.setitem(sys.modules, "timm", fake)
+    hub = types.SimpleNamespace(ENDPOINT="https://localhost:9", HF_HUB_OFFLINE=False)  # nobody listens there
+    monkeypatch.setitem(sys.modules, "huggingface_hub.constants", hub)
+    monkeypatch.setattr(zoo, "getproxies", dict)
+    offline = []
     classifier = load_classifier("timm:vit", tmp_path)
     photos = torch.rand(2, 3, 16, 16)
     torch.testing.assert_close(classifier.logits(photos), network(photos * 4 - 2))
+    assert offline == [True] and not hub.HF_HUB_OFFLINE  # no second try where there is no way to the hub
     with pytest.raises(Refused, match=r'"zzz": choose one of timm\.list_models'):
         load_classifier("timm:zzz", tmp_path)
     subset = None

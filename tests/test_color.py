@@ -7,6 +7,7 @@ import torch
 from patchproof.color import (
     LUMINANCE,
     ciede2000,
+    clamped,
     codes_of,
     lab_from_linear,
     lab_from_srgb,
@@ -138,3 +139,13 @@ def test_codes_are_the_nearest_and_the_two_ways_differ_in_halves_alone():
     assert np.array_equal(codes_of(torch.tensor(values)).numpy(), codes_of(values))
     every = np.arange(256)
     assert np.array_equal(codes_of(every / 255), every) and np.array_equal(photo_codes_of(every / 255), every)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.float32, torch.float64])
+def test_clamped_values_have_a_gradient_at_black_and_white(kind):
+    values = torch.tensor([-0.1, 0.0, 0.3, 1.0, 1.1], dtype=kind, requires_grad=True)
+    clipped = clamped(values)
+    assert clipped.dtype == kind and torch.equal(clipped, torch.tensor([0, 0, 0.3, 1, 1], dtype=kind))
+    clipped.sum().backward()
+    assert values.grad is not None and values.grad.tolist() == [0, 1, 1, 1, 0]  # torch's own: 0 at both ends since 2.14
+    assert clamped(np.array([-0.1, 0.5, 1.1])).tolist() == [0, 0.5, 1]

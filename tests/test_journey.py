@@ -254,10 +254,13 @@ def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
     assert sides[1] / sides[0] == pytest.approx(0.9, rel=0.02)
 
 
-def test_evaluate_writes_fresh_rates(journey):
+def test_evaluate_writes_fresh_rates(journey, capsys):
     assert command("evaluate", journey / "run", "--n", 40) == 0
     result = json.loads((journey / "run" / "evaluate.json").read_text())
     assert result["n"] == 40 and set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "gray", "noise"}
+    assert command("evaluate", journey / "run", "--n", 4) == 1  # not without --overwrite
+    assert "which exists: add --overwrite" in capsys.readouterr().err
+    assert json.loads((journey / "run" / "evaluate.json").read_text()) == result
 
 
 def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):
@@ -267,7 +270,7 @@ def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):
         assert (tmp_path / "photos" / path.name).read_bytes() == path.read_bytes()
     written = []
     for jobs in (1, 2):
-        assert command("evaluate", run, "--n", 20, "--jobs", jobs) == 0
+        assert command("evaluate", run, "--n", 20, "--jobs", jobs, "--overwrite") == 0
         written.append((run / "evaluate.json").read_bytes())
     assert written[0] == written[1]
 

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shlex
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -18,11 +19,6 @@ from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
 from test_imports import GROUND, MAY_IMPORT
 from test_journey import command
-
-try:
-    import tomllib
-except ModuleNotFoundError:
-    import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
 README, NOTEBOOK, CONTRIBUTING = (

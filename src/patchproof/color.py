@@ -41,6 +41,14 @@ def srgb_from_linear(linear: Values) -> Values:
     return xp.sign(linear) * xp.where(size <= 0.0031308, 12.92 * size, curved)
 
 
+def clamped(values):
+    """Values clipped to [0, 1], with a gradient of 1 at 0 and 1 themselves: `torch.clamp` has had 0 there since 2.14,
+    and a pixel of full black or white would never move again.
+    """
+    xp = _library(values)
+    return xp.where(values < 0, 0.0, xp.where(values > 1, 1.0, values))
+
+
 def codes_of(srgb):
     """The nearest uint8 code values of sRGB, clipped to [0, 1]; halves go to even codes."""
     xp = _library(srgb)
@@ -114,8 +122,8 @@ def ciede2000(lab_a, lab_b):
 
 
 def _hue(xp, b, a):
-    """Hue angle in [0, 2π)."""
-    angle = xp.arctan2(b, a)
+    """Hue angle in [0, 2π); 0 of gray, where the angle's gradient is NaN in some releases of torch."""
+    angle = xp.arctan2(b, a + ((a == 0) & (b == 0)))
     return xp.where(angle < 0, angle + 2 * math.pi, angle)
 
 

@@ -6,10 +6,10 @@ better from worse: none of them asks for a goal by name. The loss of each stands
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
 
-class Goal(str, Enum):
+class Goal(StrEnum):
     """`sign` is +1 where recognizing the target is what is wanted, -1 where it is to be prevented."""
 
     sign: int
@@ -21,6 +21,3 @@ class Goal(str, Enum):
         member = str.__new__(cls, word)
         member._value_, member.sign = word, sign
         return member
-
-    def __str__(self) -> str:
-        return self.value

@@ -7,6 +7,7 @@ folder loses nothing.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import shutil
@@ -36,15 +37,19 @@ def new_folder(out: str | Path, own: tuple[str, ...], overwrite: bool = False) -
         shutil.rmtree(part, ignore_errors=True)
 
 
-def check_folder(out: Path, own: tuple[str, ...], overwrite: bool = False) -> None:
-    """Refuse a folder with files in it unless they may be overwritten and are all this command's own."""
+def check_folder(out: Path, own: tuple[str, ...], overwrite: bool = False, unfinished: bool = False) -> None:
+    """Refuse a folder with files in it unless they may be overwritten and are all this command's own; of `unfinished`
+    ones it is said how to go on.
+    """
     if os.path.isfile(out):
         raise Refused("a folder to write to", f"the file {out}", "choose another --out")
     names = sorted(path.name for path in out.iterdir()) if os.path.isdir(out) else []
     names = [name for name in names if not fnmatch(name, ".*.part")]  # what a killed command did not get to name
     if names and not overwrite:
-        got = f"{out} with {len(names)} files"
-        raise Refused("an empty or new folder", got, "choose another --out or add --overwrite")
+        got, do = f"{out} with {len(names)} files", "choose another --out or add --overwrite"
+        if unfinished:
+            got, do = f"{out}, which is unfinished", "go on with --resume, or start anew with --overwrite"
+        raise Refused("an empty or new folder", got, do)
     strange = [name for name in names if not any(fnmatch(name, pattern) for pattern in own)]
     if strange:
         expected = f"a folder with this command's own output only ({', '.join(own)})"
@@ -55,6 +60,16 @@ def check_file(path: Path, overwrite: bool = False) -> None:
     """Refuse a file that exists unless it may be overwritten."""
     if os.path.exists(path) and not overwrite:
         raise Refused("a new file", f"{path}, which exists", "choose another --out or add --overwrite")
+
+
+def disk_is_full(error: BaseException | None) -> bool:
+    """Whether an error, or one that led to it, is of a full disk or quota; safetensors has it in its words alone."""
+    while error is not None:
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        if full or any(f"(os error {number})" in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def make_folder(path: Path) -> None:

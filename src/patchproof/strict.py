@@ -12,15 +12,14 @@ import difflib
 import math
 import os
 import re
-import sys
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
-from typing_extensions import Self
 
 
 class Refused(ValueError):
@@ -103,18 +102,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     if not os.path.isfile(path):  # of a path that no system takes, 300 letters or a NUL, this is false, too
         raise Refused("a TOML file", f"no file at {path}", "check the path")
     try:
-        return parsed_toml(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
-
-
-def parsed_toml(text: str) -> dict[str, Any]:
-    """TOML as a dictionary; a ValueError where it is none."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
-    return tomllib.loads(text)
 
 
 def validated(model: type[Model], data: Any, where: str) -> Model:

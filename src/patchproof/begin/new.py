@@ -9,6 +9,7 @@ optimized is never written.
 from __future__ import annotations
 
 import json
+import tomllib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.piece import smallest_piece_mm
-from patchproof.strict import Refused, Side, parsed_toml, validated
+from patchproof.strict import Refused, Side, validated
 
 NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm
 _SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
@@ -273,7 +274,7 @@ def _rounded(value_mm: float) -> float:
 
 def _checked(text: str, base: Path) -> tuple[str, ...]:
     """The warnings of the scene that the text describes; refused where it cannot be loaded or has no place."""
-    settings = validated(SceneSettings, parsed_toml(text), "the new scene")
+    settings = validated(SceneSettings, tomllib.loads(text), "the new scene")
     scene = build_scene(settings, base)
     if isinstance(scene, OpenScene):
         Ground(scene).spots(1)

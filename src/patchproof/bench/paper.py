@@ -56,7 +56,10 @@ class Sheet:
     def mm(self, px: np.ndarray) -> np.ndarray:
         """Which point N×2 of the paper is seen at pixels N×2; NaN where none is."""
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        ray = cv2.undistortPoints(px.reshape(-1, 1, 2), self.matrix_px, self.terms, criteria=stop).reshape(-1, 2)
+        bent = px.reshape(-1, 1, 2), self.matrix_px, self.terms
+        before_5 = getattr(cv2, "undistortPointsIter", None)  # what OpenCV 4 calls it with a criterion
+        straight = before_5(*bent, None, None, stop) if before_5 else cv2.undistortPoints(*bent, criteria=stop)
+        ray = straight.reshape(-1, 2)
         rotation, k = self.camera_from_piece[:3, :3], self.curvature
         ray = np.column_stack([ray, np.ones(len(ray))]) @ rotation
         eye = -rotation.T @ self.camera_from_piece[:3, 3] - [PIECE_MM / 2, 0, 0]

@@ -18,6 +18,7 @@ from torch import Tensor
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.tone import codes_of_light
+from patchproof.color import clamped
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4
@@ -85,7 +86,7 @@ def gains(sensor: Sensor, like: Tensor) -> Tensor:
 
 def encoded(linear: Tensor, camera: Camera | None = None) -> Tensor:
     """Clipped light as code values in [0, 1]."""
-    return codes_of_light(linear.clamp(0, 1), camera)
+    return codes_of_light(clamped(linear), camera)
 
 
 def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tensor:
@@ -159,4 +160,4 @@ def compressed(picture: Tensor, quality: Tensor) -> Tensor:
 
     height, width = picture.shape[-2:]
     padded = torch.nn.functional.pad(picture, (0, -width % 16, 0, -height % 16), mode="replicate")
-    return jpeg_codec_differentiable(padded, quality)[..., :height, :width].clamp(0, 1)
+    return clamped(jpeg_codec_differentiable(padded, quality)[..., :height, :width])

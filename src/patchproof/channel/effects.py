@@ -17,10 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from typing_extensions import Self
 
 from patchproof.color import tinted_white
 from patchproof.settings import SceneSettings

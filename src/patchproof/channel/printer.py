@@ -23,7 +23,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.color import lab_from_srgb
+from patchproof.color import clamped, lab_from_srgb
 from patchproof.input import is_file, read_json
 from patchproof.strict import Finite, Refused, Strict, nearest, shipped, validated
 
@@ -109,7 +109,7 @@ def vary(seen_linear: Tensor, change: Tensor) -> Tensor:
     gain, density, black = change.to(seen_linear).split(1, -1)
     light = seen_linear * (1 - 4 * gain * (1 - seen_linear))
     light = light * light.clamp_min(1e-3) ** density  # the floor keeps the slope finite at black
-    return (light + black * (1 - light)).clamp(0, 1)
+    return clamped(light + black * (1 - light))
 
 
 def misregistered(seen_srgb: Tensor, shift_px: Tensor) -> Tensor:
@@ -201,7 +201,7 @@ def _bordered(table: Tensor) -> Tensor:
 
 def _look_up(table: Tensor, srgb: Tensor) -> Tensor:
     colors = srgb if srgb.dtype == torch.float64 else srgb.float()  # half precision cannot address 33 nodes finely
-    levels = 255 * colors.clamp(0, 1)
+    levels = 255 * clamped(colors)
     position = torch.where(levels <= 248, levels / 8, 31 + (levels - 248) / 7)  # the last step is 7 wide
     grid = (2 * (position + 1) / (SIZE + 1) - 1).movedim(1, -1).flip(-1)  # grid_sample wants (x, y, z) = (b, g, r)
     sample = torch.nn.functional.grid_sample

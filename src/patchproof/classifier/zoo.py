@@ -9,8 +9,12 @@ Their resize-then-crop is left out on purpose: here every network sees the whole
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import getproxies
 
 import torch
 from torch import Tensor, nn
@@ -56,7 +60,8 @@ def load_timm(name: str) -> Classifier:
     if not timm.is_model(name):
         do = nearest_names(name, timm.list_models(), "choose one of timm.list_models()")
         raise Refused("a timm model", f'"{name}"', do)
-    network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
+    with _offline_at_once():
+        network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
     subset = timm.data.infer_imagenet_subset(network)
     if not subset:
         do = "use one trained on ImageNet, or write a module:package.factory with its labels"
@@ -65,6 +70,22 @@ def load_timm(name: str) -> Classifier:
     labels = [info.index_to_description(index) for index in range(network.num_classes)]
     normalized = Normalized(network, view["mean"], view["std"])
     return classifier_of(normalized, int(view["input_size"][-1]), labels, f"timm:{name}")
+
+
+@contextmanager
+def _offline_at_once() -> Iterator[None]:
+    """Where timm's hub cannot be reached, only what was downloaded before is used; it would retry for over a minute."""
+    constants: Any = importlib.import_module("huggingface_hub.constants")
+    hub, before = urlsplit(constants.ENDPOINT), constants.HF_HUB_OFFLINE
+    try:
+        if not getproxies():  # else the way there is the proxy's to know
+            socket.create_connection((hub.hostname, hub.port or 443), timeout=5).close()
+    except OSError:
+        constants.HF_HUB_OFFLINE = True
+    try:
+        yield
+    finally:
+        constants.HF_HUB_OFFLINE = before
 
 
 def _downloaded(name: str, load: Callable[[], Any]) -> Any:
@@ -81,5 +102,8 @@ def _library(name: str):
     except Exception as error:  # a build for another torch raises RuntimeError, not ImportError
         missing = isinstance(error, ModuleNotFoundError) and error.name == name
         got = "none" if missing else f"one that cannot be imported ({error})"
-        do = 'run pip install "patchproof[models]"'
+        # a CPU torch with the registry's torchvision, built for CUDA: "torchvision::nms does not exist"
+        do = "remove torchvision and install it from where torch is from: PyTorch's CPU index has CPU builds of both"
+        if missing:
+            do = 'run pip install "patchproof[models]", beside a CPU torch after torchvision from PyTorch\'s CPU index'
         raise Refused(f"the library {name} for {name}:NAME", got, do) from error

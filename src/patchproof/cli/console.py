@@ -5,10 +5,14 @@ Summaries go to standard output; warnings, failures and progress to standard err
 
 from __future__ import annotations
 
+import shlex
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -21,9 +25,17 @@ Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, i
 Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
 
+LINE_EVERY_S = 30.0  # where progress is not seen by a person at a terminal
+
+
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar with time left on standard error: call it with a stage's name, what is done, and the total."""
+    """A bar with time left on standard error: call it with a stage's name, what is done, and the total. A file or pipe
+    in place of a terminal gets a line now and then.
+    """
+    if not sys.stderr.isatty():
+        yield _line_now_and_then()
+        return
     from rich import progress as rich
     from rich.console import Console
 
@@ -38,6 +50,40 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
             progress.update(tasks[stage], completed=done, total=total)
 
         yield advance
+
+
+def _line_now_and_then() -> Callable[[str, int, int], None]:
+    last = time.monotonic()
+
+    def advance(stage: str, done: int, total: int) -> None:
+        nonlocal last
+        if done >= total or time.monotonic() - last >= LINE_EVERY_S:
+            last = time.monotonic()
+            print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
+
+    return advance
+
+
+def stoppable(verb: Callable[..., None]) -> Callable[..., None]:
+    """A verb that, stopped by Ctrl-C, says what is kept and how to go on, and exits with 130."""
+
+    @wraps(verb)
+    def carry_out(**given: Any) -> None:
+        try:
+            verb(**given)
+        except KeyboardInterrupt:
+            print(_stopped(given), file=sys.stderr)
+            raise typer.Exit(130) from None
+
+    return carry_out
+
+
+def _stopped(given: dict[str, Any]) -> str:
+    out = given.get("out")
+    if "resume" not in given or not Path(out or "").is_dir():
+        return "Stopped: nothing was written."
+    again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
+    return f"Stopped: {out} keeps what was finished. Go on with: {shlex.join(['patchproof', *again, '--resume'])}"
 
 
 def say(*lines: str) -> None:

@@ -68,16 +68,25 @@ class ListsStudies(TyperCommand):
 
 def study(
     name: Annotated[str, typer.Argument(help="One of the studies below.")],
-    config: Annotated[Path, typer.Option(help="What to vary: a TOML file.")],
-    out: Annotated[Path, typer.Option(help="Folder for tables, figures and the page.")],
+    config: Annotated[Path | None, typer.Option(help="What to vary: a TOML file.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for tables, figures and the page.")] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="Print its keys, as patchproof keys NAME does.")] = False,
+    example: Annotated[bool, typer.Option("--example", help="Print a config to start from.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     jobs: Jobs = 1,
     cluster: Cluster = None,
 ) -> None:
     """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
+    from patchproof.cli.keys import example_config, keys_page
     from patchproof.study.study import Work, run_study
 
+    if keys or example:
+        print(keys_page(name) if keys else example_config(name), end="")
+        return
+    if config is None or out is None:
+        missing = "--config" if config is None else "--out"
+        raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
     with progress() as bar:
         work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("cells", done, total))
         finished = run_study(name, config, out, work)

@@ -46,6 +46,9 @@ def optimize(
     out: Annotated[Path, typer.Option(help="Folder for the run.")],
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
     overwrite: Overwrite = False,
+    draft: Annotated[bool, typer.Option("--draft", help="A first look: few steps, promised from few views.")] = False,
+    steps: Annotated[int | None, typer.Option(min=1, help="In place of the scene's own.")] = None,
+    promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
     require: Annotated[
@@ -55,20 +58,24 @@ def optimize(
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.place_files import read_place
     from patchproof.optimizer.places import place_lines
-    from patchproof.optimizer.run import optimize_scene
+    from patchproof.optimizer.run import DRAFT_STEPS, DRAFT_VIEWS, optimize_scene
     from patchproof.report.summary import promise_lines
+    from patchproof.scene.scene import load_scene
     from patchproof.settings import behind
 
     if require not in (None, "better"):
         raise typer.BadParameter('takes "better" only', param_hint="--require")
+    if draft:
+        steps, promise = steps or DRAFT_STEPS, promise or DRAFT_VIEWS
     with progress() as bar:
         run = optimize_scene(
-            scene,
+            scene if steps is None else load_scene(scene, seed, steps),
             out,
             seed=seed,
             device=device,
             resume=resume,
             overwrite=overwrite,
+            promise_views=promise,
             on_scene=lambda loaded: warn(loaded.warnings),
             on_place=lambda done, total: bar("place", done, total),
             on_step=lambda step, total: bar("optimize", step.state.number, total),
@@ -88,6 +95,7 @@ def evaluate(
     device: Device = "cpu",
     jobs: Jobs = 1,
     cluster: Cluster = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers."""
     from patchproof.optimizer.evaluate import evaluate_run
@@ -102,13 +110,14 @@ def evaluate(
             device=device,
             jobs=jobs,
             cluster=cluster,
+            overwrite=overwrite,
             on_view=lambda done, total: bar("evaluate", done, total),
         )
     say(*evaluation_lines(result), f"written: {run / 'evaluate.json'}")
 
 
 def sheet(
-    out: Annotated[Path, typer.Option(help="The PDF; its manifest is written beside it.")],
+    out: Annotated[Path | None, typer.Option(help="The PDF; its manifest is written beside it.")] = None,
     runs: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
@@ -117,6 +126,7 @@ def sheet(
     control: Annotated[Control | None, typer.Option(help="The sheet of a control in place of the design's.")] = None,
     copies: Annotated[int, typer.Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
     check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
+    templates: Annotated[bool, typer.Option("--list", help="Say which templates there are.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write the page: design, markers, chart and rulers at true size."""
@@ -125,8 +135,13 @@ def sheet(
     from patchproof.printing.sheet import blank_page, sheet_of, sheet_of_several
     from patchproof.settings import behind
     from patchproof.sheets.shop import shop_lines
+    from patchproof.sheets.template import template_lines
     from patchproof.sheets.write import check_sheet, manifest_paths
 
+    if templates:
+        return say(*template_lines())
+    if out is None:
+        raise typer.BadParameter("name the PDF to write", param_hint="--out")
     runs = runs or []
     if copies > 1 and len(runs) != 1:
         raise typer.BadParameter("copies are of one run's sheet", param_hint="--copies")
@@ -267,8 +282,6 @@ def verify(
     say(*verdict_lines(report), f"report: {out / 'report.html'}")
     nothing = report.summary.judged == 0 and report.summary.measured == 0
     if nothing:
-        print(
-            "Expected photographs that can be judged or measured, got none: see the codes in the report.",
-            file=sys.stderr,
-        )
+        see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
+        print(see, file=sys.stderr)
     raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)

@@ -60,6 +60,44 @@ def keys_page(name: str | None = None) -> str:
     return _document(name, *known[name], {})
 
 
+# what an example has where a key, or one of several, is required: files that a user has, or could make
+_EXAMPLES = {
+    "scenes": ("scene.toml",),
+    "scene": "scene.toml",
+    "runs": ("run",),
+    "run": "run",
+    "networks": ("builtin",),
+    "models": ("builtin",),
+    "classes": ("mug", "carton"),
+    "renders": ("scene.toml",),  # or images with labels
+    "images": "images",
+    "labels": "labels.csv",
+    "photos": ("photos",),
+    "kind": "charuco",
+}
+
+
+def example_config(name: str) -> str:
+    """A study's config to start from: what it requires, and all else at its default, commented out."""
+    from patchproof.study.study import load_study
+
+    study = load_study(name)
+    lines = [f"# {study.about}", f"# patchproof study {name} --config {name}.toml --out {name}"]
+    for path, model in tables(study.settings):
+        required = not path or study.settings.model_fields[path.strip("[]").partition(".")[0]].is_required()
+        if path:
+            lines += ["", f"{'' if required else '# '}{path.replace(']', '.mine]') if required else path}"]
+        for key, field in model.model_fields.items():
+            if any(True for _ in _models_in(get_type_hints(model)[key])):
+                continue  # a table of its own
+            live = required and (field.is_required() or (key == "renders" and field.default == ()))
+            meaning = meanings(model).get(key, "")
+            value = _toml(_EXAMPLES[key]) if live else _default(field).strip("`")
+            value = value if value not in ("none", "required") else "..."
+            lines.append(f"{'' if live else '# '}{key} = {value}{'  # ' if meaning else ''}{meaning}")
+    return "\n".join(lines) + "\n"
+
+
 @lru_cache
 def meanings(model: type[Strict]) -> dict[str, str]:
     """By key the comment that says what it means; a key without one is missing."""

@@ -103,9 +103,11 @@ def gather_evidence(
 
 def _left_out(photos: str | Path, controls: str | Path | None) -> list[str]:
     """What lies beside photographs and controls and is not looked at."""
-    apart = None if controls is None else Path(controls)
-    lost = not_looked_at(Path(photos), apart and apart.resolve())
-    return lost + [f"{printable(apart.name)}: {sentence}" for sentence in (not_looked_at(apart) if apart else ())]
+    if controls is None:
+        return not_looked_at(Path(photos), None)
+    apart = Path(controls)
+    of_controls = [f"{printable(apart.name)}: {sentence}" for sentence in not_looked_at(apart)]
+    return not_looked_at(Path(photos), apart.resolve()) + of_controls
 
 
 def _forecast(

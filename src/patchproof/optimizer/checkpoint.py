@@ -77,4 +77,4 @@ def _tensor(file: Any, name: str, like: torch.Tensor) -> torch.Tensor:
     tensor = file.get_tensor(name)
     if tensor.dtype != like.dtype or not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"{name} with other values")
-    return tensor
+    return tensor.clone()  # the file's own memory is mapped, and Windows does not replace a file that is

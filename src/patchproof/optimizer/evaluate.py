@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from patchproof.classifier.network import Classifier
+from patchproof.input import is_file
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, shown_with_controls
 from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined, responses
@@ -35,15 +36,20 @@ def evaluate_run(
     device: str = "cpu",
     jobs: int = 1,
     cluster: str | None = None,
+    overwrite: bool = False,
     on_view: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Rates of the run's design and its controls on n fresh conditions; written to RUN/evaluate.json and returned.
+    """Rates of the run's design and its controls on n fresh conditions; written to RUN/evaluate.json and returned, an
+    earlier one only with `overwrite`.
 
     `models` are names, or classifiers in memory, which other processes cannot have.
     """
     folder, networks = Path(run_folder).resolve(), None if models is None else tuple(models)
     if (jobs > 1 or cluster is not None) and any(isinstance(network, Classifier) for network in networks or ()):
         raise Refused("networks that other processes load by name", "one in memory", "leave jobs and cluster out")
+    if is_file(folder / "evaluate.json") and not overwrite:
+        do = "add --overwrite, or rename it to keep it"
+        raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
     with open_workers(jobs, cluster) as workers:
         run, problem = _opened(folder, networks, device)
         parts = in_parts(run.scene.draw("evaluate", n, seed))

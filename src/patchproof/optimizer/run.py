@@ -50,6 +50,7 @@ _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 OWN = (CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
 
 NotNegativeInt = Annotated[int, Field(ge=0)]
+DRAFT_STEPS, DRAFT_VIEWS = 40, 40  # a first look: ten sessions, and an interval about three times as wide
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
 
@@ -75,6 +76,7 @@ def optimize_scene(
     resume: bool = False,
     overwrite: bool = False,
     controls: Sequence[str] = CONTROLS,
+    promise_views: int | None = None,
     on_step: Callable[[Step, int], None] = lambda step, total: None,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
@@ -84,11 +86,15 @@ def optimize_scene(
 
     `models` (names, or classifiers in memory) and `loss` replace the scene's networks and its goal's loss; `seed`
     replaces the file's; `resume` goes on from the checkpoint, at the place that was chosen. A page names the best of
-    `controls`, one at least. `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
+    `controls`, one at least. A promise of fewer `promise_views` than usual (two sessions at least) is a draft's.
+    `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
     """
     out = Path(out)
+    views = PROMISE_VIEWS if promise_views is None else promise_views
+    if views < 2 * PER_SESSION:
+        raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{views}", "promise of more")
     if not resume:
-        check_folder(out, OWN, overwrite)
+        check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / _RUN))
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     place = None
     if isinstance(scene, OpenScene):
@@ -105,7 +111,7 @@ def optimize_scene(
     state = resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
     problem.subject.save(design, out)
-    promise = _promise(problem, design, controls, on_promise)
+    promise = _promise(problem, design, controls, views, on_promise)
     if scene.given_glb is not None:
         write_whole(out / _GIVEN, scene.given_glb)
     details = _details(problem, promise, out, device)
@@ -210,17 +216,18 @@ def _doubt(moved: float, gradient: float | None) -> None:
 
 
 def _promise(
-    problem: Problem, design: np.ndarray, controls: Sequence[str], on_promise: Callable[[int, int], None]
+    problem: Problem, design: np.ndarray, controls: Sequence[str], views: int, on_promise: Callable[[int, int], None]
 ) -> Promise:
     done = 0
 
     def progress(n: int) -> None:
         nonlocal done
         done += n
-        on_promise(done, PROMISE_VIEWS)
+        on_promise(done, views)
 
-    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=PER_SESSION)
-    return make_promise(problem, design, conditions, controls, progress, PER_SESSION)
+    conditions = problem.scene.draw("promise", views, per_session=PER_SESSION)
+    promise = make_promise(problem, design, conditions, controls, progress, PER_SESSION)
+    return promise.changed(draft=views < PROMISE_VIEWS)
 
 
 def _log_line(step: Step) -> dict[str, Any]:

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 from PIL import Image
 from torch import Tensor
-from typing_extensions import Self
 
 from patchproof.channel.printer import Printer
 from patchproof.input import opened_picture

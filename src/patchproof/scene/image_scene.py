@@ -18,9 +18,9 @@ import csv
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
-from typing_extensions import Self
 
 from patchproof.input import is_file
 from patchproof.photo.cannot import CannotJudge

@@ -23,10 +23,13 @@ from patchproof.settings import SceneSettings, load_scene_settings
 from patchproof.strict import Refused, validated
 
 
-def load_scene(path: str | Path, seed: int | None = None) -> Scene:
-    """The scene of a file; `seed` replaces the file's own."""
+def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:
+    """The scene of a file; `seed` and the `steps` of its optimization replace the file's own."""
     path = Path(path)
-    return build_scene(load_scene_settings(path), path.resolve().parent, seed)
+    settings = load_scene_settings(path)
+    if steps is not None:
+        settings = settings.changed(optimize={"steps": steps})
+    return build_scene(settings, path.resolve().parent, seed)
 
 
 def make_scene(

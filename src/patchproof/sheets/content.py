@@ -53,6 +53,8 @@ class PrintedPiece:
         size, kind = size_text(self.piece.size_mm), self.kind
         if self.promise is not None and self.promise.worth != "better":
             kind = f"{kind}, {self.promise.worth} than {self.promise.best_control}"
+        if self.promise is not None and self.promise.draft:
+            kind = f"draft {kind}"
         return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size}
 
     def pictures(self, rect_mm: RectMm) -> tuple[tuple[RectMm, np.ndarray], ...]:

@@ -148,7 +148,7 @@ class ConditionClaim(Strict):
 class Promise(Strict):
     """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
     of one session. Promises from before sessions drew everything anew for each condition. `places` has a number for
-    each session's place where some share one.
+    each session's place where some share one. A `draft` was made of few conditions, to try things out.
     """
 
     target: Target
@@ -158,6 +158,7 @@ class Promise(Strict):
     n: Count
     per_session: Count = 1
     places: tuple[Annotated[int, Field(ge=0, le=10**6)], ...] = ()
+    draft: bool = False
     controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
 
@@ -192,9 +193,10 @@ class Promise(Strict):
         control = self.controls[self.best_control]
         low, high = (100 * end for end in control.difference_interval)
         advice = "" if self.worth == "better" else " Try another place, size or seed before printing it."
+        draft = f"Draft of {self.n} views, no more than a hint: " if self.draft else ""
         return (
-            f"{self.worth} than its best control ({self.best_control}): {self.rate:.1%} beside {control.rate:.1%} "
-            f"recognized, {100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}].{advice}"
+            f"{draft}{self.worth} than its best control ({self.best_control}): {self.rate:.1%} beside "
+            f"{control.rate:.1%} recognized, {100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}].{advice}"
         )
 
 

@@ -157,6 +157,15 @@ def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
     return path, read_toml(path)
 
 
+def template_lines() -> list[str]:
+    """Each shipped template's name and what its first comment says it is."""
+    names = template_names()
+    files = [shipped("print_templates", f"{name}.toml") for name in names]
+    heads = [file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for file in files]
+    width = max(map(len, names))
+    return [f"{name:<{width}}  {head.partition('. ')[0].rstrip('.')}" for name, head in zip(names, heads, strict=True)]
+
+
 def template_names(table: str | None = None) -> list[str]:
     """The shipped templates' names; with `table`, of those that have it."""
     paths = shipped("print_templates").glob("*.toml")

@@ -155,7 +155,8 @@ def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work:
     """Run a study with settings at hand."""
     out = Path(out)
     if not work.resume:
-        check_folder(out, _own(study), work.overwrite)
+        unfinished = (out / "cells").is_dir() and not (out / f"{study.name}.html").is_file()
+        check_folder(out, _own(study), work.overwrite, unfinished)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
     with open_workers(work.jobs, work.cluster) as workers:
