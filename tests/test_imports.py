@@ -52,6 +52,7 @@ MAY_IMPORT = {
     "reprints": WORLD | {"optimizer", "evidence", "printing"},
     "journey": COMMANDS,
     "begin": COMMANDS,
+    "capture": GROUND | {"sheets", "photo", "evidence", "optimizer", "printing", "reprints", "report", "journey"},
     "plan": COMMANDS | {"journey"},
     "study": WORLD | {"optimizer", "report"},
     "harden": GROUND | {"photo", "scene", "classifier", "report", "study"},
@@ -59,7 +60,7 @@ MAY_IMPORT = {
     "validation": STUDIES,
     "training": WORLD,
     "bench": STUDIES | {"training", "harden", "experiments"},
-    "cli": STUDIES | {"begin", "harden", "bench", "training", "experiments", "validation"},
+    "cli": STUDIES | {"capture", "begin", "harden", "bench", "training", "experiments", "validation"},
     "__init__": COMMANDS | {"journey"},
     "__main__": {"cli"},
 }

@@ -113,13 +113,14 @@ class Workers:
 
 
 @contextmanager
-def open_workers(jobs: int = 1, cluster: str | None = None) -> Iterator[Workers]:
-    """`jobs` local processes (1: this one, with its own threads), or the Dask cluster whose scheduler is at `cluster`.
+def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False) -> Iterator[Workers]:
+    """`jobs` local processes (1: this one, with its own threads, or one `apart`), or the Dask cluster whose scheduler
+    is at `cluster`.
 
     Local processes are spawned: a script that calls this with jobs > 1 needs the `if __name__ == "__main__"` guard.
     """
     if cluster is None:
-        workers = Workers(partial(_processes, jobs), 2 * jobs) if jobs > 1 else Workers(_Here, 1)
+        workers = Workers(partial(_processes, jobs), 2 * jobs) if jobs > 1 or apart else Workers(_Here, 1)
         try:
             yield workers
         finally:

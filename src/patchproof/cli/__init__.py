@@ -15,6 +15,7 @@ import typer
 
 from patchproof.cli.begin import new, plan, preview
 from patchproof.cli.calibrate import camera, printer
+from patchproof.cli.capture import capture
 from patchproof.cli.console import stoppable
 from patchproof.cli.experiments import ListsStudies, bench, harden, keys, study
 from patchproof.cli.journey import demo, evaluate, optimize, reprint, sheet, verify
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
-for _verb in (demo, new, preview, plan, optimize, evaluate, sheet, reprint, verify):
+for _verb in (demo, new, preview, plan, optimize, evaluate, sheet, reprint, capture, verify):
     app.command()(stoppable(_verb))
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):

@@ -39,7 +39,7 @@ class PromisedRanges:
 
     def violated(self, entry: PhotoEntry, trust_angles: bool) -> CannotJudge | None:
         """The first figure of the photo that the promise does not cover."""
-        figures = _figures(entry, self.side_px)
+        figures = figures_of(entry, self.side_px)
         for name, (low, high) in self.limits.items():
             value = figures.get(name)
             if value is None or (name != "px_per_mm" and not trust_angles):
@@ -82,12 +82,12 @@ def matched_rate(
     entries: Iterable[PhotoEntry], conditions: Sequence[ConditionClaim], side_px: float | None = None
 ) -> float | None:
     """Mean over photos of the rate at their nearest promised conditions; None where nothing can be compared."""
-    rates = [_rate_near(_figures(entry, side_px), conditions) for entry in entries]
+    rates = [_rate_near(figures_of(entry, side_px), conditions) for entry in entries]
     rates = [rate for rate in rates if rate is not None]
     return float(np.mean(rates)) if rates else None
 
 
-def _figures(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
+def figures_of(entry: PhotoEntry, side_px: float | None) -> dict[str, float]:
     """The known ones of the figures that conditions have, pixels as a photograph of that shorter side shows them."""
     geometry, azimuth_deg = entry.geometry, entry.pose and entry.pose.azimuth_deg
     if geometry is None:

@@ -87,7 +87,7 @@ def gather_evidence(
             recognized = {file: prediction.recognized for file, prediction in judged.items()}
             estimated = estimate_effect(shots, manifest, task.surface, options.printer, judges, recognized)
             if forecast is not None:
-                own = [_forecast(again, forecast, path, photo) for path, photo in zip(paths, own, strict=True)]
+                own = [with_forecast(again, forecast, path, photo) for path, photo in zip(paths, own, strict=True)]
     shown: dict[str, dict[str, PhotoEntry]] = {}
     left_out = _left_out(photos, options.controls)
     for item, result in zip(items, results, strict=True):
@@ -97,7 +97,7 @@ def gather_evidence(
             if first is not entry:
                 left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
     controls = {name: list(entries.values()) for name, entries in shown.items()}
-    report = _report(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
+    report = report_of(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
     return report.changed(summary=report.summary.changed(estimated=estimated, left_out=tuple(left_out)))
 
 
@@ -110,7 +110,7 @@ def _left_out(photos: str | Path, controls: str | Path | None) -> list[str]:
     return not_looked_at(Path(photos), apart.resolve()) + of_controls
 
 
-def _forecast(
+def with_forecast(
     again: Callable[[tuple[Path, MeasuredPhoto]], Shot | None],
     forecast: Callable[[Shot], float | None],
     path: Path,
@@ -138,15 +138,15 @@ def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
     return inside
 
 
-def _report(
+def report_of(
     manifest: Manifest,
     judges: Judges | None,
     photos: Sequence[MeasuredPhoto],
     grouping: Grouping,
     controls: Mapping[str, Sequence[PhotoEntry]],
-    ledger: Ledger | None,
-    ruler_mm: tuple[float, float] | None,
-    side_px: float | None,
+    ledger: Ledger | None = None,
+    ruler_mm: tuple[float, float] | None = None,
+    side_px: float | None = None,
 ) -> Report:
     """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]

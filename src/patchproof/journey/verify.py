@@ -9,6 +9,7 @@ others are named.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from patchproof.channel.lens import load_camera
@@ -61,19 +62,16 @@ def verify_photos(
     its own. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are new, or
     differ, are measured.
     """
-    out, manifest, base = Path(out), load_manifest(sheet), Path(sheet).resolve().parent
+    out, manifest = Path(out), load_manifest(sheet)
     _check_out(out, resume, overwrite)
-    networks = [load_classifier(network, base) for network in _networks(manifest, models)]
-    forecast = None if run is None else retaker(run if isinstance(run, Run) else load_run(run), manifest)
-    options = Options(
-        models=networks,
-        printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
-        camera=None if camera is None else load_camera(camera),
+    options = replace(
+        options_of(sheet, manifest, models, camera),
         scan_dpi=scan_dpi,
         ruler_mm=ruler_mm,
         controls=controls,
         ledger_photos=ledger_photos,
     )
+    forecast = None if run is None else retaker(run if isinstance(run, Run) else load_run(run), manifest)
     report = gather_evidence(
         photos,
         manifest,
@@ -93,13 +91,25 @@ def verify_photos(
         "ledger_photos": ledger_photos,
     }
     hashes = {"manifest": file_sha256(Path(sheet))} | {
-        f"network {network.name}": network.sha256 for network in networks
+        f"network {network.name}": network.sha256 for network in options.models
     }
     report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
     _drop_pictures(out / "pictures", {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]})
     ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
     return report
+
+
+def options_of(
+    sheet: str | Path, manifest: Manifest, models: Sequence[str | Classifier] | None = None, camera: str | None = None
+) -> Options:
+    """What photographs of the sheet are judged with and measured against; see `verify_photos`."""
+    base = Path(sheet).resolve().parent
+    return Options(
+        models=[load_classifier(network, base) for network in _networks(manifest, models)],
+        printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
+        camera=None if camera is None else load_camera(camera),
+    )
 
 
 def _check_out(out: Path, resume: bool, overwrite: bool) -> None:

@@ -65,6 +65,16 @@ def plan_shots(promise: Promise) -> ShotPlan:
     )
 
 
+def sessions_line(sessions: int | None) -> str:
+    """So many sessions, as a sentence."""
+    if sessions is None:
+        return "The promise is too weak to be proved by any reasonable number of photographs."
+    return (
+        f"Take at least {EACH} photographs in each of {places(sessions)}, with other light in each, and keep "
+        "those of each place in a folder of their own."
+    )
+
+
 def _way(promise: Promise, photos: int, sessions: int) -> Way:
     parts = evenly(photos, sessions)
     return Way(photos, sessions, promise.spread.counts(parts), kept_chance(promise, parts))
@@ -132,13 +142,7 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         )
         + "."
     )
-    if plan.sessions is None:
-        lines.append("The promise is too weak to be proved by any reasonable number of photographs.")
-    else:
-        lines.append(
-            f"Take at least {EACH} photographs in each of {places(plan.sessions)}, with other light in each, and keep "
-            "those of each place in a folder of their own."
-        )
+    lines.append(sessions_line(plan.sessions))
     if plan.paired is None and plan.unpaired is None:
         lines.append(
             f"No {MOST_PHOTOS} photographs would show that the patch beats {plan.control}: it is not promised to, or "

@@ -1,4 +1,4 @@
-"""One HTML page from a template of this folder; values in it are escaped, an unknown one is an error.
+"""One HTML page from a template; values in it are escaped, an unknown one is an error.
 
 A page that turns a 3D object has Google's model-viewer inside, which this folder keeps as it was published, with its
 license beside it: a page that is opened as a file may not load modules or models from others.
@@ -12,11 +12,11 @@ from patchproof.claims import Estimate
 from patchproof.report.tables import shown
 
 
-def page(template: str, **values: object) -> str:
-    """The template with its values."""
+def page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
+    """The template of that folder, of this one if none is given, with its values."""
     import jinja2
 
-    loader, strict = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
+    loader, strict = jinja2.FileSystemLoader(folder), jinja2.StrictUndefined
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=strict
     )

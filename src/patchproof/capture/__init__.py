@@ -1,0 +1,1 @@
+"""Photographs from a phone's browser into a folder, each answered at once."""

@@ -1,0 +1,81 @@
+"""Which views the promise was made of, and which of them photographs show: azimuth × how large the piece is in the
+picture.
+
+In: the promise's conditions and the photographs' entries. Out: a `ViewMap` of counts. Cells are equal steps of azimuth
+and of distance (1 over pixels per millimeter); how many photographs a cell needs is its share of the conditions.
+Distance itself is not on the map: only cameras of known focal length tell it, and a network does not see it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from patchproof.evidence.ranges import figures_of
+from patchproof.evidence.results import PhotoEntry
+from patchproof.sheets.manifest import ConditionClaim
+
+_ROWS, _MOST_COLUMNS = 3, 5
+_LEAST_COLUMN_DEG = 12.0  # about what a phone held by hand is off
+
+
+@dataclass(frozen=True)
+class ViewMap:
+    """Edges of columns (degrees, from left to right) and rows (pixels per millimeter, from near to far), and by row
+    how many photographs there are and how many are needed; `elsewhere` more cannot be placed.
+    """
+
+    azimuth_deg: tuple[float, ...]
+    px_per_mm: tuple[float, ...]
+    photos: tuple[tuple[int, ...], ...]
+    wanted: tuple[tuple[int, ...], ...]
+    elsewhere: int
+
+    @property
+    def most_missing(self) -> tuple[int, int] | None:
+        """(row, column) of the cell that lacks the most photographs; None where none does."""
+        lack = np.subtract(self.wanted, self.photos)
+        row, column = np.unravel_index(int(lack.argmax()), lack.shape)
+        return (int(row), int(column)) if lack.max() > 0 else None
+
+
+def map_views(
+    conditions: Sequence[ConditionClaim], entries: Iterable[PhotoEntry], wanted: int, side_px: float | None
+) -> ViewMap | None:
+    """The map of counted photographs where `wanted` are needed in all; None where the conditions say no views.
+    Photographs beyond the edges, which the promise's margin lets in, count in the outermost cells.
+    """
+    views = np.array([(c.azimuth_deg, c.px_per_mm) for c in conditions if c.azimuth_deg is not None and c.px_per_mm])
+    if not len(views):
+        return None
+    (left, smallest), (right, largest) = views.min(0), views.max(0)
+    columns = int(np.clip((right - left) // _LEAST_COLUMN_DEG, 1, _MOST_COLUMNS))
+    azimuth_deg, distance = np.linspace(left, right, columns + 1), np.linspace(1 / largest, 1 / smallest, _ROWS + 1)
+
+    def counts(points: np.ndarray) -> np.ndarray:
+        table = np.zeros((_ROWS, columns), int)
+        row, column = _bins(1 / points[:, 1], distance), _bins(points[:, 0], azimuth_deg)
+        np.add.at(table, (row, column), 1)
+        return table
+
+    shown = [
+        (figures.get("azimuth_deg"), figures.get("px_per_mm")) for e in entries for figures in [figures_of(e, side_px)]
+    ]
+    placed = np.array([view for view in shown if None not in view]).reshape(-1, 2)
+    return ViewMap(
+        azimuth_deg=tuple(map(float, azimuth_deg)),
+        px_per_mm=tuple(float(1 / d) for d in distance),
+        photos=_rows(counts(placed)),
+        wanted=_rows(np.rint(wanted * counts(views) / len(views)).astype(int)),
+        elsewhere=len(shown) - len(placed),
+    )
+
+
+def _bins(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+
+
+def _rows(table: np.ndarray) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(map(int, row)) for row in table)
