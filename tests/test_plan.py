@@ -17,6 +17,7 @@ from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.plan import errors
 from patchproof.plan.cost import measure_cost
 from patchproof.plan.errors import measure_terms
 from patchproof.plan.lines import plan_lines
@@ -69,9 +70,10 @@ def errors_of(scene, other=None):
 
 
 def quick_plan(path) -> Plan:
-    """With a small selection set."""
+    """With a small selection set, rendered two views at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "SELECT_VIEWS", 4)
+        patch.setattr(errors, "_PIXELS_AT_ONCE", 2 * 600**2)
         return plan_scene(path, timing=False, views=3)
 
 
@@ -273,7 +275,8 @@ def test_the_parts_of_a_step_add_up(tmp_path):
 def test_the_verb_prints_and_writes_and_does_not_overwrite(scene_file, tmp_path, monkeypatch, capsys, plan):
     import patchproof.plan.plan as study
 
-    monkeypatch.setattr(study, "plan_scene", lambda path, timing, on_stage: plan)
+    monkeypatch.setattr(study, "plan_geometry", lambda path, on_stage: (plan, None))
+    monkeypatch.setattr(study, "measured_plan", lambda geometry, problem, timing, on_stage: plan)
     out = tmp_path / "plan.json"
     monkeypatch.setattr(sys, "argv", ["patchproof", "plan", str(scene_file), "--out", str(out), "--no-timing"])
     with pytest.raises(SystemExit) as done:

@@ -91,7 +91,7 @@ def optimize_scene(
     """
     out = Path(out)
     views = PROMISE_VIEWS if promise_views is None else promise_views
-    if views < 2 * PER_SESSION:
+    if promise_views is not None and views < 2 * PER_SESSION:
         raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{views}", "promise of more")
     if not resume:
         check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / _RUN))

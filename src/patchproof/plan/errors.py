@@ -159,9 +159,9 @@ def _squares(
     for rows in _chunks(len(base.conditions), side_px):
         views, parts = _views(base, base.conditions[rows], size_px), []
         for setup in (base, *setups):
-            conditions = setup.conditions[rows]
+            conditions, known = setup.conditions[rows], base.conditions[rows]
             same = setup.stage is base.stage and setup.supersample == base.supersample
-            same = same and (conditions.pose.printed_scale == base.conditions.pose.printed_scale).all()
+            same = same and (conditions.pose.printed_scale == known.pose.printed_scale).all()
             shown = relit(views, conditions) if same else _views(setup, conditions, size_px)
             parts.append(_pictures(problem, shown, setup.shown))
         stack.append(torch.stack(parts))
