@@ -73,7 +73,7 @@ def quick_plan(path) -> Plan:
     """With a small selection set, rendered two views at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "SELECT_VIEWS", 4)
-        patch.setattr(errors, "_PIXELS_AT_ONCE", 2 * 600**2)
+        patch.setattr(errors, "_chunks", lambda views, side_px: [slice(0, 2), slice(2, views)])
         return plan_scene(path, timing=False, views=3)
 
 
