@@ -93,9 +93,6 @@ def test_python(tmp_path, monkeypatch, capsys):
     assert names["report"].summary.photos == 6
 
 
-_SEEN = "in places of the evaluate split"
-
-
 def words(path: Path) -> str:
     """A page in one line."""
     return " ".join(path.read_text(encoding="utf-8").split())
@@ -209,11 +206,17 @@ def test_figures_of_forecasts_and_effects_are_the_stored_ones():
     assert float(effects["interval held"]) == 1 and int(effects["interval held_n"]) == 30
 
 
-def test_rates_in_new_places_are_the_stored_ones():
-    rows = rows_of("promises/places.csv")
-    within = [row["within"] == "True" for row in rows]
-    assert [float(row["low"]) <= float(row[_SEEN]) <= float(row["high"]) for row in rows] == within
-    assert f"interval in {sum(within)} of {len(rows)}," in words(NOTEBOOK)
+def test_sessions_and_rates_in_other_places_are_the_stored_ones():
+    both = [stored(f"promises/{name}.json")["tables"] for name in ("promises", "places")]
+    rendered = [table["rendered"]["rows"][-1] for table in both]
+    held, alone = (sum(round(row[i]["value"] * row[i]["n"]) for row in rendered) for i in (1, 4))
+    sessions = sum(row[1]["n"] for row in rendered)
+    assert f"{held} of {sessions} sessions of 20 lay in their intervals; by the former rule {alone}." in words(NOTEBOOK)
+    rates = [row for table in both for row in table["elsewhere"]["rows"]]
+    assert [row[4] <= row[6]["value"] <= row[5] for row in rates] == [row[7] for row in rates]
+    within = sum(row[7] for row in rates)
+    assert f"rate's 95 % interval in {within} of {len(rates)} runs;" in words(NOTEBOOK)
+    assert {row[6]["n"] for row in rates} == {800} and "rate in 800 places" in words(NOTEBOOK)
 
 
 def test_figures_of_peers_are_the_stored_ones():
