@@ -119,7 +119,7 @@ class _Desk:
     async def photo(self, request: Request) -> Response:
         """Receive one photograph and say what it shows."""
         length = request.headers.get("content-length", "")
-        refuse_size(int(length) if length.isdecimal() else 0)
+        refuse_size(int(length[:18]) if length.isdecimal() else 0)
         async with self._receiving:
             try:
                 path = await self._received(request)
