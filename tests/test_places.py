@@ -16,8 +16,8 @@ from patchproof.classifier.load import load_classifier
 from patchproof.optimizer import place_files, places, run
 from patchproof.optimizer.place_files import read_place, save_place
 from patchproof.optimizer.places import choose_place, default_passes, place_lines
-from patchproof.plan.lines import plan_lines
-from patchproof.plan.plan import plan_scene
+from patchproof.plan.lines import geometry_lines, measured_lines
+from patchproof.plan.plan import measured_plan, plan_geometry
 from patchproof.scene.placement import WARN_OVERHANG_SHARE
 from patchproof.scene.places import APART, Ground
 from patchproof.scene.scene import needs_piece, needs_texture
@@ -301,9 +301,9 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
 
 def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_search):
     monkeypatch.setattr("patchproof.plan.plan.SELECT_VIEWS", 8)
-    plan = plan_scene(scene_file(tmp_path), timing=False, views=2)
+    plan = measured_plan(*plan_geometry(scene_file(tmp_path)), timing=False, views=2)
     assert plan.place is not None and plan.surface.family == "card"
-    lines = plan_lines(plan)
+    lines = [*geometry_lines(plan), *measured_lines(plan)]
     assert f"chosen: at_mm = [{plan.place.at[0]:g}" in lines[lines.index("place") + 1]
 
 

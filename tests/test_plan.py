@@ -20,8 +20,8 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.plan import errors
 from patchproof.plan.cost import measure_cost
 from patchproof.plan.errors import measure_terms
-from patchproof.plan.lines import plan_lines
-from patchproof.plan.plan import Plan, marker_plan, plan_scene, resolution_plan
+from patchproof.plan.lines import geometry_lines, measured_lines
+from patchproof.plan.plan import Plan, marker_plan, measured_plan, plan_geometry, resolution_plan
 from patchproof.plan.samples import sample_plan
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.scene.conditions import draw
@@ -69,12 +69,16 @@ def errors_of(scene, other=None):
     return {error.name: error for error in terms.errors}, terms
 
 
+def plan_lines(plan: Plan) -> list[str]:
+    return [*geometry_lines(plan), *measured_lines(plan)]
+
+
 def quick_plan(path) -> Plan:
     """With a small selection set, rendered two views at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "SELECT_VIEWS", 4)
         patch.setattr(errors, "_chunks", lambda views, side_px: [slice(0, 2), slice(2, views)])
-        return plan_scene(path, timing=False, views=3)
+        return measured_plan(*plan_geometry(path), timing=False, views=3)
 
 
 @pytest.fixture(scope="module")

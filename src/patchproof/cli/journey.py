@@ -209,8 +209,8 @@ def reprint(
             raise typer.BadParameter(
                 "scans, controls, sessions and path tracing are of a run's sheet; name the run", param_hint="--run"
             )
-        say(f"{reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)} photographs: {out}")
-        return
+        reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
+        return say(f"{n} photographs: {out}")
     made = load_run(run)
     if scan_dpi is not None:
         truth = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)

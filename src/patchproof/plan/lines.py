@@ -10,11 +10,6 @@ from patchproof.plan.samples import sample_lines
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 
 
-def plan_lines(plan: Plan) -> list[str]:
-    """A whole plan for the terminal."""
-    return [*geometry_lines(plan), *measured_lines(plan)]
-
-
 def geometry_lines(plan: Geometry) -> list[str]:
     """What a plan knows before it has measured anything."""
     lines = [f"{plan.scene}: {plan.target}, {plan.kind}, seen by {', '.join(plan.models)}"]

@@ -102,19 +102,6 @@ class Plan(Geometry):
     cost: Cost | None
 
 
-def plan_scene(
-    scene_path: str | Path,
-    *,
-    timing: bool = True,
-    views: int = TERM_VIEWS,
-    device: str = "cpu",
-    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
-) -> Plan:
-    """Plan a scene, its terms over `views` views; without `timing`, all but the cost, which differs from run to run."""
-    geometry, problem = plan_geometry(scene_path, device=device, on_stage=on_stage)
-    return measured_plan(geometry, problem, timing=timing, views=views, on_stage=on_stage)
-
-
 def plan_geometry(
     scene_path: str | Path,
     *,

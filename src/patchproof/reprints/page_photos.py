@@ -104,7 +104,7 @@ def page_light(page: np.ndarray, shows: Shows) -> np.ndarray:
 
 def reprint_pages(
     pdf_path: str | Path, n: int, out: str | Path, how: Hanging, *, seed: int | None = None, overwrite: bool = False
-) -> int:
+) -> None:
     """Write n photographs of the pages of a PDF, in turn, lying flat: of pages that belong to no run, as blank ones,
     charts and boards. `how` names their printer (without a name: coated) and the print's size.
     """
@@ -115,15 +115,13 @@ def reprint_pages(
         return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
 
     with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
-        pages = [
-            cv2.resize(page_light(page_pixels(pdf_path, i + 1, PX_PER_MM * MM_PER_INCH), shows), None, None, *scale)
-            for scale in [how.print_scale]
-            for i in range(page_count(pdf_path))
-        ]
+        pages = []
+        for number in range(page_count(pdf_path)):
+            light = page_light(page_pixels(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), shows)
+            pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
         for i in range(n):
             shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
             (folder / f"photo_{i + 1:04d}.jpg").write_bytes(shot.file)
-    return n
 
 
 def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:

@@ -97,7 +97,14 @@ def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
         report = verify_photos(photos, folder / "sheet.json", folder / "report", models=networks)
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
     kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
-    problem, scene = set_problem(made.scene), made.scene
+    return kept | _without_paper(settings, made)
+
+
+def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
+    """What our own renderer's views show of the design, in sessions and elsewhere."""
+    if not settings.rendered and not settings.elsewhere:
+        return {}
+    problem, scene, kept = set_problem(made.scene), made.scene, {}
     show = partial(responses, problem, shown_with_controls(problem, made.design, ()))
     if settings.rendered:
         views = scene.draw("reprint", settings.rendered * settings.photos, per_session=settings.photos)
