@@ -2,6 +2,6 @@
 
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
-from patchproof.classifier.network import Classifier, center_square, confidence, recognized
+from patchproof.classifier.network import Classifier, center_square
 
-__all__ = ["Classifier", "center_square", "confidence", "find_labels", "load_classifier", "recognized"]
+__all__ = ["Classifier", "center_square", "find_labels", "load_classifier"]

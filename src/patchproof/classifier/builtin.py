@@ -1,6 +1,6 @@
 """The small network that comes with the package: twelve procedural objects, 96×96 pixels, about half a million weights.
 
-It is trained on renders of our own primitives (study/train_builtin.py; the recipe and the accuracy are in
+It is trained on renders of our own primitives (training/train_builtin.py; the recipe and the accuracy are in
 builtin.json), so that the demo needs no network and no download. It knows nothing of the real world: for real objects
 name a torchvision, timm or exported model. Convolutions and ReLUs only: BatchNorm is folded into the convolutions
 before saving, which is faster and leaves nothing that depends on the batch. Weights are stored as float16.
@@ -8,8 +8,10 @@ before saving, which is faster and leaves nothing that depends on the batch. Wei
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +33,8 @@ class SmallNetwork(nn.Module):
     def __init__(self, classes: int, batch_norm: bool = False):
         super().__init__()
         before = (3, *WIDTHS)
-        self.halve = nn.ModuleList(_conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
-        self.refine = nn.ModuleList(_conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
+        self.halve = nn.ModuleList(conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
+        self.refine = nn.ModuleList(conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
         self.classify = nn.Linear(WIDTHS[-1], classes)
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
@@ -44,31 +46,40 @@ class SmallNetwork(nn.Module):
         return self.classify(x.mean((2, 3)))
 
 
-def folded(trained: SmallNetwork) -> SmallNetwork:
+def folded(trained: nn.Module) -> nn.Module:
     """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
-    plain = SmallNetwork(trained.classify.out_features)
-    for ours, theirs in ((plain.halve, trained.halve), (plain.refine, trained.refine)):
-        for i, pair in enumerate(theirs):
-            conv_and_norm: list[Any] = list(pair.children())
-            ours[i] = torch.nn.utils.fuse_conv_bn_eval(*conv_and_norm)
-    plain.classify = trained.classify
-    return plain.eval()
+    plain = copy.deepcopy(trained).eval()
+    for parent in list(plain.modules()):
+        for name, child in list(parent.named_children()):
+            if isinstance(child, nn.Sequential):  # a convolution and its norm, as `conv` joins them
+                conv_and_norm: list[Any] = list(child.children())
+                parent.register_module(name, torch.nn.utils.fuse_conv_bn_eval(*conv_and_norm))
+    return plain
 
 
 def load_builtin(folder: Path = HERE) -> Classifier:
     """The network from `builtin.safetensors` with the classes of `builtin.json`."""
+    sha256, labels, network = stored_network(SmallNetwork, "builtin", folder)
+    return Classifier("builtin", sha256, INPUT_PX, labels, network)
+
+
+def stored_network(
+    kind: Callable[[int], nn.Module], name: str, folder: Path = HERE
+) -> tuple[str, tuple[str, ...], nn.Module]:
+    """SHA-256 of the weights NAME.safetensors, the classes of NAME.json, and the network of this kind with them."""
     from safetensors.torch import load
 
-    weights, card = folder / "builtin.safetensors", folder / "builtin.json"
+    weights, card = folder / f"{name}.safetensors", folder / f"{name}.json"
     if not weights.is_file() or not card.is_file():
         raise Refused("the built-in network's weights beside the program", "none", "install patchproof again")
     stored = weights.read_bytes()
     labels = tuple(json.loads(card.read_text(encoding="utf-8"))["classes"])
-    network = SmallNetwork(len(labels))
+    network = kind(len(labels))
     network.load_state_dict({key: tensor.float() for key, tensor in load(stored).items()})
-    return Classifier("builtin", hashlib.sha256(stored).hexdigest(), INPUT_PX, labels, network.eval())
+    return hashlib.sha256(stored).hexdigest(), labels, network.eval()
 
 
-def _conv(before: int, after: int, stride: int, batch_norm: bool) -> nn.Module:
-    conv = nn.Conv2d(before, after, 3, stride, padding=1, bias=not batch_norm)
-    return nn.Sequential(conv, nn.BatchNorm2d(after)) if batch_norm else conv
+def conv(before: int, after: int, stride: int, batch_norm: bool) -> nn.Module:
+    """A 3×3 convolution, with its norm while it is trained."""
+    plain = nn.Conv2d(before, after, 3, stride, padding=1, bias=not batch_norm)
+    return nn.Sequential(plain, nn.BatchNorm2d(after)) if batch_norm else plain

@@ -31,7 +31,7 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
     try:
         with torch.no_grad():
             logits, again, alone, swapped = (
-                classifier.network(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
+                classifier.answer(batch) for batch in (photos, photos.clone(), photos[1:2], photos.flip(1))
             )
     except Refused:
         raise
@@ -71,7 +71,7 @@ def _check_outputs(logits: Tensor, classes: int, name: str) -> None:
 def _check_gradient(classifier: Classifier, photos: Tensor, name: str) -> None:
     """The best logit's gradient reaches the pixels, finite and not zero."""
     photos = photos.clone().requires_grad_(True)
-    best = classifier.network(photos).max(1).values.sum()
+    best = classifier.answer(photos).max(1).values.sum()
     gradient = torch.autograd.grad(best, photos, allow_unused=True)[0] if best.requires_grad else None
     if gradient is None or not torch.isfinite(gradient).all() or not (gradient.abs().amax((1, 2, 3)) > 0).all():
         got = f"{name} with " + ("none" if gradient is None else "a zero or infinite one")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,14 +19,11 @@ from torch import Tensor
 from patchproof.strict import Refused
 
 
-def confidence(logits: Tensor, indices: Sequence[int]) -> Tensor:
-    """N summed softmax of the labels in `indices`; float64, so that 1 - 1e-9 is not 1."""
-    return torch.softmax(logits.double(), dim=1)[:, list(indices)].sum(1)
+class Odds(NamedTuple):
+    """The logarithms of N confidences and of what they lack to 1; float64, so that 1 - 1e-9 is not 1."""
 
-
-def recognized(logits: Tensor, indices: Sequence[int]) -> Tensor:
-    """N bool: the largest logit is one of `indices`."""
-    return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
+    log_confidence: Tensor
+    log_rest: Tensor
 
 
 @dataclass(frozen=True)
@@ -38,18 +36,41 @@ class Classifier:
     labels: tuple[str, ...]
     network: Callable[[Tensor], Tensor]
 
-    confidence = staticmethod(confidence)
-    recognized = staticmethod(recognized)
+    KIND: ClassVar[str] = "classifier"
 
-    def logits(self, photos_srgb: Tensor) -> Tensor:
+    def logits(self, photos_srgb: Tensor, boxes: Tensor | None = None) -> Tensor:
         """N×K logits of the photographs' centered squares; refused where they are no numbers, which would pass for an
-        answer: the largest of a row with NaN is the NaN.
+        answer: the largest of a row with NaN is the NaN. `boxes` N×4 tell where the object lies, as shares of the
+        square's side (left, top, right, bottom); only a detector looks at them.
         """
-        logits = self.network(center_square(photos_srgb, self.input_px))
+        logits = self.answer(center_square(photos_srgb, self.input_px), boxes)
         if not bool(torch.isfinite(logits).all()):
             do = "check its weights and its number format"
             raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
         return logits
+
+    def probabilities(self, logits: Tensor) -> Tensor:
+        """N×K softmax, float64."""
+        return torch.softmax(logits.double(), 1)
+
+    def odds(self, logits: Tensor, indices: Sequence[int]) -> Odds:
+        """Of the summed softmax of the labels in `indices`."""
+        log_p = torch.log_softmax(logits.double(), 1)
+        chosen = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
+        chosen[list(indices)] = True
+        return Odds(torch.logsumexp(log_p[:, chosen], 1), torch.logsumexp(log_p[:, ~chosen], 1))
+
+    def confidence(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
+        """N confidences in the labels of `indices`."""
+        return self.probabilities(logits)[:, list(indices)].sum(1)
+
+    def recognized(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
+        """N bool: the largest logit is one of `indices`."""
+        return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
+
+    def answer(self, squares: Tensor, boxes: Tensor | None = None) -> Tensor:
+        """N×K logits of squares of the network's own size, unchecked."""
+        return self.network(squares)
 
 
 def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:

@@ -7,6 +7,7 @@ on it in a `PatchScene` (see `patch_scene`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -17,6 +18,7 @@ from patchproof.channel import lens
 from patchproof.channel.effects import Pose
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds
+from patchproof.scene.boxes import box_of, outermost
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
 from patchproof.scene.placement import Frame, view_frame
@@ -108,6 +110,17 @@ class MeshScene(Scene):
         if self.camera is not None:
             return lens.matrix_px(self.camera, size_px)
         return geometry.intrinsics(self.settings.view.fov_deg, size_px)
+
+    def boxes(self, conditions: Conditions) -> np.ndarray:
+        """N×4 (left, top, right, bottom) of the object in each photograph's centered square, as shares of its side."""
+        side_px = min(self.photo_px)
+        size_px = side_px, side_px
+        matrix_px, poses = self.matrix_px(size_px), self.camera_from_world(conditions)
+        return np.stack([box_of(self._outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses]) / side_px
+
+    @cached_property
+    def _outermost_mm(self) -> np.ndarray:
+        return outermost(self.mesh.vertices)
 
     def cosines(self, azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
         """N cosines between the normal and directions, 0 from behind."""

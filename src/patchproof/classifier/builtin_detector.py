@@ -1,0 +1,68 @@
+"""The small detector that comes with the package: the twelve procedural objects, in boxes, 128×128 pixels.
+
+It is trained on the renders that the built-in classifier learned from (training/train_detector.py; the recipe and the
+accuracy are in builtin_detector.json), so that the whole journey runs before a detector, offline. Every cell of an 8×8
+grid names the object that it lies on and tells how far its four sides are (Tian et al., FCOS, ICCV 2019), from features
+of two sizes (Lin et al., feature pyramids, CVPR 2017).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from patchproof.classifier.builtin import DEVIATION, HERE, MEAN, WIDTHS, conv, stored_network
+from patchproof.classifier.detector import Detector
+
+INPUT_PX, CELL_PX = 128, 16
+HEAD = 96  # channels
+NEAR, FAR = -2.0, 2.5  # logarithms of the nearest and the farthest side, in cells: 2 and 195 pixels
+
+
+class SmallDetector(nn.Module):
+    """The built-in classifier's five halvings; cells of 16 pixels look at themselves and at those of 32 around."""
+
+    def __init__(self, classes: int, batch_norm: bool = False):
+        super().__init__()
+        before = (3, *WIDTHS)
+        self.halve = nn.ModuleList(conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
+        self.refine = nn.ModuleList(conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
+        self.join = nn.ModuleList(conv(width, HEAD, 1, batch_norm) for width in WIDTHS[-2:])
+        self.head = nn.ModuleList(conv(HEAD, HEAD, 1, batch_norm) for _ in range(2))
+        self.name, self.sides = nn.Conv2d(HEAD, classes, 1), nn.Conv2d(HEAD, 4, 1)
+        nn.init.constant_(self.name.bias, -4.0)  # most cells show no object: Lin et al., ICCV 2017
+
+    def forward(self, photos_srgb: Tensor) -> Tensor:
+        """N×3×128×128 sRGB in [0, 1] → a candidate for each of 64 cells, N×64×(4+K)."""
+        x = torch.relu(self.halve[0]((photos_srgb - MEAN) / DEVIATION))
+        sizes = []
+        for halve, refine in zip(self.halve[1:], self.refine, strict=True):
+            x = torch.relu(halve(x))
+            x = x + torch.relu(refine(x))
+            sizes.append(x)
+        fine, coarse = (join(size) for join, size in zip(self.join, sizes[-2:], strict=True))
+        x = torch.relu(fine + nn.functional.interpolate(coarse, scale_factor=2.0))
+        for layer in self.head:
+            x = x + torch.relu(layer(x))
+        return torch.cat([_boxes(self.sides(x)), self.name(x).flatten(2).mT], -1)
+
+
+def centers_px(rows: int, columns: int) -> Tensor:
+    """The middles of all cells, row by row, A×2 (x, y)."""
+    y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    return (torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * CELL_PX
+
+
+def _boxes(sides: Tensor) -> Tensor:
+    """N×A×4 from the logarithms N×4×h×w of the distances to the four sides."""
+    centers = centers_px(*sides.shape[-2:]).to(sides)
+    distances = sides.clamp(NEAR, FAR).exp().flatten(2).mT * CELL_PX
+    return torch.cat([centers - distances[..., :2], centers + distances[..., 2:]], -1)
+
+
+def load_builtin_detector(folder: Path = HERE) -> Detector:
+    """The detector from `builtin_detector.safetensors` with the classes of `builtin_detector.json`."""
+    sha256, labels, network = stored_network(SmallDetector, "builtin_detector", folder)
+    return Detector("builtin-detector", sha256, INPUT_PX, labels, network)

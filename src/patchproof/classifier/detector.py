@@ -1,0 +1,68 @@
+"""A detector as the rest of the project sees it: photographs and the object's box in, logits out, as of a classifier.
+
+In: what a network finds in the photographs' centered squares: candidate boxes with a score for each label, before
+suppression of those that overlap. Out: per photograph and label the logit of the best candidate that lies on the object
+(intersection over union of at least `LEAST_IOU` with its box), so that rates, losses, controls and promises of detectors
+are written in the words of classifiers: the object is recognized where that score reaches `least_score`, confidence is
+the score. Where the object's box is not known, any candidate in the square counts.
+Left out on purpose: suppression. It leaves the best candidate of an object, which alone decides here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from patchproof.classifier.network import Classifier, Odds
+
+LEAST_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
+NOTHING = -20.0  # the logit where no candidate lies on the object: a score of 2e-9
+
+
+@dataclass(frozen=True)
+class Detector(Classifier):
+    """A frozen detector; `network` takes N×3×S×S sRGB in [0, 1], S = `input_px`, and gives candidates N×A×(4+K): a box
+    (left, top, right, bottom) in the square's pixels, then the logits of its labels.
+    """
+
+    least_score: float = 0.5
+
+    KIND = "detector"
+
+    def probabilities(self, logits: Tensor) -> Tensor:
+        """N×K scores, each label's own."""
+        return torch.sigmoid(logits.double())
+
+    def odds(self, logits: Tensor, indices: Sequence[int]) -> Odds:
+        """The logarithms of the best score of the labels in `indices`, and of what is left to 1."""
+        best = logits[:, list(indices)].amax(1).double()
+        return Odds(torch.nn.functional.logsigmoid(best), torch.nn.functional.logsigmoid(-best))
+
+    def confidence(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
+        """N best scores of the labels in `indices`."""
+        return self.probabilities(logits)[:, list(indices)].amax(1)
+
+    def recognized(self, logits: Tensor, indices: Sequence[int]) -> Tensor:
+        """N bool: the object was found under one of these labels with a sufficient score."""
+        return self.confidence(logits, indices) >= self.least_score
+
+    def answer(self, squares: Tensor, boxes: Tensor | None = None) -> Tensor:
+        """N×K logits of the best candidates on the object, whose box is known as shares of the square."""
+        candidates = self.network(squares)
+        logits = candidates[..., 4:]
+        if boxes is not None:
+            overlap = iou(candidates[..., :4].detach(), boxes.to(squares) * self.input_px)
+            logits = logits.masked_fill((overlap < LEAST_IOU)[..., None], NOTHING)
+        return logits.amax(1)
+
+
+def iou(boxes: Tensor, truth: Tensor) -> Tensor:
+    """N×A intersections over unions of boxes N×A×4 with one box each, N×4."""
+    truth = truth[:, None]
+    low, high = torch.maximum(boxes[..., :2], truth[..., :2]), torch.minimum(boxes[..., 2:], truth[..., 2:])
+    shared = (high - low).clamp_min(0).prod(-1)
+    areas = [(each[..., 2:] - each[..., :2]).clamp_min(0).prod(-1) for each in (boxes, truth)]
+    return shared / (areas[0] + areas[1] - shared).clamp_min(1e-9)

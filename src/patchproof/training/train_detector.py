@@ -1,0 +1,185 @@
+"""How the built-in detector was made: `python -m patchproof.training.train_detector --out DIR`.
+
+In: nothing but seeds (pictures.py). Out: `builtin_detector.safetensors` and `builtin_detector.json` with the recipe,
+its seeds and the average precision on shapes, textures and backgrounds that training never saw. A third of the training
+pictures are mosaics of four, so that objects of all sizes come alone and in company.
+
+Cells in the middle half of an object's box answer for it. Their scores are to be the overlap of their box with the true
+one (Li et al., Generalized focal loss, NeurIPS 2020), their boxes follow the generalized IoU (Rezatofighi et al., CVPR
+2019).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.classifier.builtin import folded
+from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
+from patchproof.classifier.detector import iou
+from patchproof.classifier.precision import average_precision
+from patchproof.mesh import primitives
+from patchproof.scene import patterns
+from patchproof.training.card import by_class, stored, write_card
+from patchproof.training.pictures import HELD_OUT, Pictures, augmented, pictures
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides the weights, but for the machine's rounding."""
+
+    seed: int = 0
+    pictures_per_class: int = 1200
+    held_out_per_class: int = 100
+    epochs: int = 20
+    batch: int = 64
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.02
+    pasted: float = 0.3  # share of training pictures with a card pasted on
+    mosaics: float = 0.33  # share that is made of four
+    threads: int = 1
+
+
+def main() -> None:
+    """Render, train, measure, and write the network with its card."""
+    parser = argparse.ArgumentParser(description="Train the built-in detector from procedural renders.")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their card")
+    for field in dataclasses.fields(Recipe):
+        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
+    options = vars(parser.parse_args())
+    out, recipe = options.pop("out"), Recipe(**options)
+    torch.set_num_threads(recipe.threads)
+    started = time.time()
+    held_out = pictures(recipe.held_out_per_class, recipe.seed + HELD_OUT, INPUT_PX)
+    training = pictures(recipe.pictures_per_class, recipe.seed, INPUT_PX)
+    rendered = time.time()
+    for epoch, loss, trained in train(training, recipe):
+        shown = f", held out AP50 {precision(trained, held_out).mean():.3f}" if epoch % 4 == 3 else ""
+        print(
+            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{shown}, {time.time() - started:.0f} s", flush=True
+        )
+        if epoch + 1 == recipe.epochs:
+            seconds = {"render": round(rendered - started), "train": round(time.time() - rendered)}
+            write(out, folded(trained), recipe, held_out, seconds)
+
+
+def train(shown: Pictures, recipe: Recipe) -> Iterator[tuple[int, float, SmallDetector]]:
+    """After each epoch: its number, its mean loss, and the network as it is."""
+    torch.manual_seed(recipe.seed)
+    rng = np.random.default_rng([recipe.seed, 1])
+    network = SmallDetector(len(primitives.names()), batch_norm=True).train()
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    steps = recipe.epochs * (len(shown.images) // recipe.batch)
+    optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
+    cards = torch.from_numpy(np.stack([patterns.card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
+    for epoch in range(recipe.epochs):
+        losses, order = [], torch.randperm(len(shown.images))
+        for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
+            images, boxes = augmented(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
+            images, labels, boxes = with_mosaics(images, shown.labels[rows], boxes, recipe.mosaics, rng)
+            loss = loss_of(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            losses.append(loss.item())
+        yield epoch, float(np.mean(losses)), network
+
+
+def with_mosaics(
+    images: Tensor, labels: Tensor, boxes: Tensor, share: float, rng: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The pictures with up to four objects each: labels N×4 (-1: none) and boxes N×4×4; a share of them replaced by four
+    of the others at half their size.
+    """
+    n = len(images)
+    all_labels = torch.cat([labels[:, None], labels.new_full((n, 3), -1)], 1)
+    all_boxes = torch.cat([boxes[:, None], boxes.new_zeros(n, 3, 4)], 1)
+    mixed = images.clone()
+    small = torch.nn.functional.interpolate(images, scale_factor=0.5, mode="bilinear", antialias=True)
+    half = small.shape[-1]
+    for i in np.flatnonzero(rng.random(n) < share):
+        for place, other in enumerate(rng.choice(n, 4, replace=False)):
+            row, column = divmod(place, 2)
+            mixed[i, :, row * half : (row + 1) * half, column * half : (column + 1) * half] = small[other]
+            all_labels[i, place] = labels[other]
+            all_boxes[i, place] = (boxes[other] + torch.tensor([column, row, column, row])) / 2
+    return mixed, all_labels, all_boxes
+
+
+def loss_of(candidates: Tensor, labels: Tensor, boxes_px: Tensor) -> Tensor:
+    """Of candidates N×A×(4+K) before objects with labels N×M (-1: none) and boxes N×M×4: names and boxes together."""
+    boxes, logits = candidates.split([4, candidates.shape[-1] - 4], -1)
+    answers_for = owners(labels, boxes_px)
+    view, cell = torch.nonzero(answers_for >= 0, as_tuple=True)
+    mine = answers_for[view, cell]
+    truth, own = boxes_px[view, mine], boxes[view, cell]
+    overlap, hull_share = _overlaps(own, truth)
+    wanted = torch.zeros_like(logits)
+    wanted[view, cell, labels[view, mine]] = overlap.detach().clamp_min(0)
+    focus = (wanted - torch.sigmoid(logits)).detach().abs() ** 2
+    entropy = torch.nn.functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+    count = max(len(view), 1)
+    return (focus * entropy).sum() / count + (1 - overlap + hull_share).sum() / count
+
+
+def owners(labels: Tensor, boxes_px: Tensor) -> Tensor:
+    """N×A: which of the M objects a cell answers for, the smallest whose middle half it lies in or whose center lies in
+    it; -1 for none.
+    """
+    cells = INPUT_PX // 16
+    centers = centers_px(cells, cells)
+    middle, size = (boxes_px[..., :2] + boxes_px[..., 2:]) / 2, boxes_px[..., 2:] - boxes_px[..., :2]
+    reach = torch.maximum(size / 4, size.new_tensor(8.0))
+    inside = ((centers[None, :, None] - middle[:, None]).abs() <= reach[:, None]).all(-1)  # N×A×M
+    areas = size.prod(-1).masked_fill((labels < 0) | (size.amin(-1) < 4), torch.inf)
+    nearest = torch.where(inside, areas[:, None], torch.inf)
+    area, owner = nearest.min(-1)
+    return torch.where(torch.isfinite(area), owner, -1)
+
+
+def _overlaps(own: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """IoU of boxes P×4 with the true ones, and the share of the box around both that neither covers."""
+    overlap = iou(own[:, None], truth)[:, 0]
+    areas = (own[:, 2:] - own[:, :2]).prod(-1) + (truth[:, 2:] - truth[:, :2]).prod(-1)
+    low, high = torch.minimum(own[:, :2], truth[:, :2]), torch.maximum(own[:, 2:], truth[:, 2:])
+    hull = (high - low).prod(-1).clamp_min(1e-6)
+    return overlap, 1 - areas / (1 + overlap) / hull
+
+
+@torch.no_grad()
+def precision(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
+    """AP50 of each class over pictures with one object each."""
+    was_training = network.training
+    network.eval()
+    candidates = torch.cat([network(batch.float() / 255) for batch in shown.images.split(256)])
+    network.train(was_training)
+    boxes_px, labels = shown.boxes * INPUT_PX, range(len(primitives.names()))
+    return np.array([average_precision(candidates, label, boxes_px, shown.labels == label) for label in labels])
+
+
+def write(out: Path, network: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: dict[str, int]) -> None:
+    """The weights and what is known about them; the precision is that of the stored weights."""
+    count = stored(network, out / "builtin_detector.safetensors")
+    found = precision(network, held_out)
+    figures = {
+        "input_px": INPUT_PX,
+        "weights": count,
+        "held_out_ap50": round(float(found.mean()), 4),
+        "held_out_ap50_by_class": by_class(found),
+    }
+    write_card(out / "builtin_detector.json", figures, "train_detector", recipe, seconds)
+    print(f"held-out AP50 {figures['held_out_ap50']:.3f}: {figures['held_out_ap50_by_class']}")
+
+
+if __name__ == "__main__":
+    main()
