@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from patchproof.classifier import Classifier, center_square, confidence, find_labels, recognized
+from patchproof.classifier import Classifier, center_square, find_labels
 from patchproof.strict import Refused
 
 LABELS = ("jeep, landrover", "crane", "crane", "box truck", "maillot", "maillot, tank suit", "mouse, computer mouse")
@@ -72,12 +72,13 @@ def test_labels_that_are_absent_or_not_unique_are_refused(label, sentence):
 
 def test_confidence_is_the_summed_softmax_in_double_precision():
     logits = torch.tensor([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0]])
-    assert confidence(logits, (0,)).tolist() == [1 / 3, 1 / (1 + 2 * np.exp(-40))]
-    assert confidence(logits, (1, 2))[1] == pytest.approx(
+    network = Classifier("none", None, 8, ("a", "b", "c"), lambda x: x)
+    assert network.confidence(logits, (0,)).tolist() == [1 / 3, 1 / (1 + 2 * np.exp(-40))]
+    assert network.confidence(logits, (1, 2))[1] == pytest.approx(
         2 * np.exp(-40), rel=1e-12
     )  # float32 would have room for less
-    assert recognized(logits, (1, 0)).tolist() == [True, True]
-    assert recognized(logits, (2,)).tolist() == [False, False]
+    assert network.recognized(logits, (1, 0)).tolist() == [True, True]
+    assert network.recognized(logits, (2,)).tolist() == [False, False]
 
 
 def test_logits_are_those_of_the_centered_square():

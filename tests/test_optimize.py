@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from patchproof.claims import wilson
+from patchproof.classifier.network import Classifier
 from patchproof.goal import Goal
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.goals import target_loss, total_variation
@@ -59,6 +60,10 @@ def toml(path, **changes):
     return path
 
 
+def odds(logits, indices):
+    return Classifier("plain", None, 8, ("a", "b"), lambda x: x).odds(logits, indices)
+
+
 def last(problem):
     return list(steps(problem))[-1]
 
@@ -66,10 +71,10 @@ def last(problem):
 def test_cross_entropy_of_the_accepted_labels_by_hand():
     """Logits 0, ln 2, ln 5: probabilities 1/8, 2/8, 5/8."""
     logits = torch.tensor([[0.0, math.log(2), math.log(5)]])
-    assert float(target_loss(logits, [0, 1], Goal.assist)) == pytest.approx(-math.log(3 / 8))
-    assert float(target_loss(logits, [0, 1], Goal.deceive)) == pytest.approx(-math.log(5 / 8))
+    assert float(target_loss(odds(logits, [0, 1]), Goal.assist)) == pytest.approx(-math.log(3 / 8))
+    assert float(target_loss(odds(logits, [0, 1]), Goal.deceive)) == pytest.approx(-math.log(5 / 8))
     certain = torch.tensor([[60.0, 0.0]], requires_grad=True)
-    (gradient,) = torch.autograd.grad(target_loss(certain, [1], Goal.assist).sum(), certain)
+    (gradient,) = torch.autograd.grad(target_loss(odds(certain, [1]), Goal.assist).sum(), certain)
     assert float(gradient[0, 0]) == pytest.approx(1)  # a sure network still says which way
 
 
@@ -78,7 +83,7 @@ def test_cross_entropy_of_the_accepted_labels_by_hand():
 def test_what_is_wrong_with_certainty_keeps_its_gradient(goal, wrong, margin):
     """The goal is far from reached: p of label 0 is e^-margin or 1 - e^-margin. float32's log(1 - p) is lost at 17."""
     logits = (margin * torch.tensor(wrong)).requires_grad_()
-    (gradient,) = torch.autograd.grad(target_loss(logits, [0], goal).sum(), logits)
+    (gradient,) = torch.autograd.grad(target_loss(odds(logits, [0]), goal).sum(), logits)
     assert gradient[0].tolist() == pytest.approx([-1, 1] if goal is Goal.assist else [1, -1])
     assert not bool(torch.isfinite(torch.log(1 - torch.softmax(torch.tensor([17.0, 0.0]), 0)[0])))
 
@@ -95,7 +100,8 @@ def test_the_gradient_through_printer_scene_and_camera_is_a_difference_of_losses
 
     def loss(design):
         pictures = photograph(problem.stage, problem.subject.shown(design), conditions, (32, 32))
-        return target_loss(problem.classifiers[0].logits(pictures), (0,), Goal.assist).mean()
+        network = problem.classifiers[0]
+        return problem.losses(network, network.logits(pictures), (0,)).mean()
 
     torch.manual_seed(0)
     design = (0.4 + 0.2 * torch.rand(start(problem).design.shape)).requires_grad_()
@@ -356,7 +362,7 @@ def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path
 def test_every_goal_has_a_loss_that_falls_the_way_it_wants():
     logits = torch.tensor([[2.0, 0.0], [0.0, 2.0]])
     for goal in Goal:
-        likely, unlikely = target_loss(logits, [0], goal).tolist()
+        likely, unlikely = target_loss(odds(logits, [0]), goal).tolist()
         assert goal.sign * (unlikely - likely) > 0
 
 

@@ -58,10 +58,15 @@ def intrinsics(fov_deg: float, size_px: tuple[int, int]) -> np.ndarray:
 def project(matrix_px, camera_from_world, points_mm) -> np.ndarray:
     """Pixels N×2 of world points N×3; points behind the camera give NaN."""
     points = np.asarray(points_mm, float)
-    camera = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    camera = carried(camera_from_world, points)
     camera = np.where(camera[:, 2:] > 0, camera, np.nan)
     image = camera @ np.asarray(matrix_px).T
     return image[:, :2] / image[:, 2:]
+
+
+def carried(frame, points_mm) -> np.ndarray:
+    """Points N×3 by a pose 4×4."""
+    return np.asarray(points_mm, float) @ frame[:3, :3].T + frame[:3, 3]
 
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:

@@ -56,7 +56,7 @@ def looks(stage: Stage, classifiers: Sequence[Classifier], indices: Sequence[tup
     conditions = stage.scene.draw("train", VIEWS)
     with torch.no_grad():
         pictures = photograph(stage, None, conditions, (side_px, side_px), jpeg=False)
-        logits = [classifier.logits(pictures) for classifier in classifiers]
+        logits = [classifier.logits(pictures, stage.scene.boxes(conditions)) for classifier in classifiers]
     pose = conditions.pose
     return tuple(
         Look(
@@ -74,11 +74,13 @@ def looks(stage: Stage, classifiers: Sequence[Classifier], indices: Sequence[tup
     )
 
 
-def _answer(classifier: Classifier, logits: torch.Tensor, indices: tuple[int, ...]) -> Answer:
-    best = torch.softmax(logits.double(), 0).topk(min(TOP, len(classifier.labels)))
+def _answer(classifier: Classifier, logits: torch.Tensor, known: tuple[int, ...]) -> Answer:
+    best = classifier.probabilities(logits[None])[0].topk(min(TOP, len(classifier.labels)))
     pairs = zip(best.indices.tolist(), best.values.tolist(), strict=True)
     labels = tuple((classifier.labels[index], share) for index, share in pairs)
-    return Answer(Path(classifier.name).name, labels, int(best.indices[0]) in indices)
+    return Answer(
+        Path(classifier.name).name, labels, bool(known) and bool(classifier.recognized(logits[None], known)[0])
+    )
 
 
 def _outline(stage: Stage, conditions: Conditions, side_px: int) -> np.ndarray | None:

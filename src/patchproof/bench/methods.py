@@ -70,7 +70,7 @@ def flat(problem: Problem) -> Made:
     adam, steps = torch.optim.Adam([design], FLAT_STEP), budget(problem) // settings.views
     for _ in range(steps):
         drawn = photos[rng.integers(0, len(photos), settings.views)]
-        loss = problem.loss(classifier.logits(pasted(drawn, design, shares, rng)), indices).mean()
+        loss = problem.losses(classifier, classifier.logits(pasted(drawn, design, shares, rng)), indices).mean()
         (design.grad,) = torch.autograd.grad(loss, design)
         adam.step()
         with torch.no_grad():

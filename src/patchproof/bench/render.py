@@ -15,7 +15,6 @@ from patchproof.bench.chart import Chart, OnStage, Point
 from patchproof.bench.measure import ratio, timed
 from patchproof.bench.world import design_for_demo
 from patchproof.claims import student_mean
-from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import ask
@@ -44,12 +43,12 @@ def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int,
         return expose(problem.see(picture, part, side), picture)
 
     def confidence(photos: Tensor) -> np.ndarray:
-        return ask(problem, photos).confidence[0]
+        return ask(problem, photos, None).confidence[0]
 
     def step(side: int) -> None:
         design = trained.clone().requires_grad_()
         logits = classifier.logits(pictures(side, problem.patch.shown(design), conditions[:8]))
-        torch.autograd.grad(target_loss(logits, indices, problem.scene.settings.target.goal).mean(), design)
+        torch.autograd.grad(problem.losses(classifier, logits, indices).mean(), design)
 
     truth = []
     with torch.no_grad():

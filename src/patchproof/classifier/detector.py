@@ -1,18 +1,19 @@
 """A detector as the rest of the project sees it: photographs and the object's box in, logits out, as of a classifier.
 
 In: what a network finds in the photographs' centered squares: candidate boxes with a score for each label, before
-suppression of those that overlap. Out: per photograph and label the logit of the best candidate that lies on the object
-(intersection over union of at least `LEAST_IOU` with its box), so that rates, losses, controls and promises of detectors
-are written in the words of classifiers: the object is recognized where that score reaches `least_score`, confidence is
-the score. Where the object's box is not known, any candidate in the square counts.
+suppression of those that overlap. Out: per photograph and label the logit of the best candidate that lies on the
+object (intersection over union of at least `LEAST_IOU` with its box), so that rates, losses, controls and promises of
+detectors are written in the words of classifiers: the object is recognized where that score reaches `least_score`,
+confidence is the score. Where the object's box is not known, any candidate in the square counts.
 Left out on purpose: suppression. It leaves the best candidate of an object, which alone decides here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -49,14 +50,21 @@ class Detector(Classifier):
         """N bool: the object was found under one of these labels with a sufficient score."""
         return self.confidence(logits, indices) >= self.least_score
 
-    def answer(self, squares: Tensor, boxes: Tensor | None = None) -> Tensor:
+    def answer(self, squares: Tensor, boxes: np.ndarray | None = None) -> Tensor:
         """N×K logits of the best candidates on the object, whose box is known as shares of the square."""
         candidates = self.network(squares)
         logits = candidates[..., 4:]
         if boxes is not None:
-            overlap = iou(candidates[..., :4].detach(), boxes.to(squares) * self.input_px)
+            overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(squares) * self.input_px)
             logits = logits.masked_fill((overlap < LEAST_IOU)[..., None], NOTHING)
         return logits.amax(1)
+
+
+def at_score(network: Classifier, least_score: float | None) -> Classifier:
+    """The network with that score from which on its boxes count, if it is a detector and there is one."""
+    if least_score is None or not isinstance(network, Detector):
+        return network
+    return replace(network, least_score=least_score)
 
 
 def iou(boxes: Tensor, truth: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """From a model's name to a classifier that has been doubted and found usable.
 
     builtin                the small network that comes with the package (builtin.py)
+    builtin-detector       the small detector that comes with it (builtin_detector.py)
     file:NAME.pt2          a torch.export program with NAME.json beside it (program.py)
     torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py)
     timm:NAME
@@ -35,6 +36,10 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
         from patchproof.classifier.builtin import load_builtin
 
         classifier = load_builtin()
+    elif name == "builtin-detector":
+        from patchproof.classifier.builtin_detector import load_builtin_detector
+
+        classifier = load_builtin_detector()
     elif kind == "file":
         from patchproof.classifier.program import load_program
 
@@ -50,7 +55,7 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
-        known = "builtin, torchvision:NAME, timm:NAME, file:NAME.pt2 or module:package.factory"
+        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, file:NAME.pt2 or module:package.factory"
         do = f'write "file:{name}"' if name.endswith(".pt2") else "write one of these"
         raise Refused(f"a model named {known}", f'"{name}"', do)
     return _trusted(replace(classifier, name=name), device)

@@ -2,7 +2,7 @@
 
 In: N×3×H×W sRGB in [0, 1] of any size. Out: N×K logits. Normalization belongs to the network, cropping and resizing to
 the centered square belongs here: one function for training, promise, reprint and verification, so that none of them
-sees anything else. Recognized means that the top-1 label is among the target's indices.
+sees anything else. Recognized means that the top-1 label is among the target's indices; of a detector, see detector.py.
 Left out on purpose: labels' meaning (labels.py), loading (load.py), ensembles (a tuple of classifiers is one).
 """
 
@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,7 +39,7 @@ class Classifier:
 
     KIND: ClassVar[str] = "classifier"
 
-    def logits(self, photos_srgb: Tensor, boxes: Tensor | None = None) -> Tensor:
+    def logits(self, photos_srgb: Tensor, boxes: np.ndarray | None = None) -> Tensor:
         """N×K logits of the photographs' centered squares; refused where they are no numbers, which would pass for an
         answer: the largest of a row with NaN is the NaN. `boxes` N×4 tell where the object lies, as shares of the
         square's side (left, top, right, bottom); only a detector looks at them.
@@ -68,7 +69,7 @@ class Classifier:
         """N bool: the largest logit is one of `indices`."""
         return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
 
-    def answer(self, squares: Tensor, boxes: Tensor | None = None) -> Tensor:
+    def answer(self, squares: Tensor, boxes: np.ndarray | None = None) -> Tensor:
         """N×K logits of squares of the network's own size, unchecked."""
         return self.network(squares)
 

@@ -88,7 +88,9 @@ def measure_all(
             measured = result_of(future)
         except WorkerDied:
             measured = _rejected(item, Remark(code="unreadable", advice=_DIED))
-        predictions = judges.predictions(measured.squares) if judges and measured.squares is not None else {}
+        predictions = (
+            judges.predictions(measured.squares, measured.box) if judges and measured.squares is not None else {}
+        )
         sha256 = file_sha256(item.path)
         entry = measured.entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
@@ -115,19 +117,20 @@ class _Kept(Strict):
     counted: bool
     light: _Light | None
     pictures: bool
+    box: tuple[Finite, Finite, Finite, Finite] | None = None
 
     @property
     def photo(self) -> MeasuredPhoto:
         light = self.light
         if light is not None:
             light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
-        return MeasuredPhoto(self.entry, self.counted, light=light)
+        return MeasuredPhoto(self.entry, self.counted, light=light, box=self.box)
 
 
 def _serialized(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
     entry = measured.entry.model_dump(mode="json")
-    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures}
+    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "box": measured.box}
 
 
 def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> MeasuredPhoto | None:
@@ -209,7 +212,8 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
 
     def shot() -> Shot | None:
         view = view_of(read_photo(path), task.camera)
-        return shot_of(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
+        shot = shot_of(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
+        return shot and replace(shot, box=measured.box)
 
     try:
         return limited(shot)

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from patchproof.classifier import Classifier
 
 
+Box = tuple[float, float, float, float]  # left, top, right, bottom as shares of the photograph's centered square
+
+
 @dataclass(frozen=True)
 class Judges:
     """Networks, the labels of each that count as recognized, and the one that the promise was made for."""
@@ -29,9 +32,10 @@ class Judges:
     indices: dict[str, tuple[int, ...]]
     primary: Classifier
 
-    def predictions(self, squares: Mapping[int, np.ndarray]) -> dict[str, Prediction]:
-        """What every network says of one photograph, by name."""
-        return {model.name: predict(model, self.indices[model.name], squares[model.input_px]) for model in self.models}
+    def predictions(self, squares: Mapping[int, np.ndarray], box: Box | None) -> dict[str, Prediction]:
+        """What every network says of one photograph with the object in `box`, by name."""
+        models = {model.name: model for model in self.models}
+        return {n: predict(m, self.indices[n], squares[m.input_px], box) for n, m in models.items()}
 
 
 def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None:
@@ -52,6 +56,11 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
         )
     indices = {model.name: target_indices(model, manifest.promise, manifest.settings) for model in models}
     return Judges(models, indices, primary)
+
+
+def boxes_of(box: Box | None, n: int = 1) -> np.ndarray | None:
+    """The object's box in n pictures that all show it there, as networks take it."""
+    return None if box is None else np.tile(np.array(box), (n, 1))
 
 
 def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
@@ -89,13 +98,13 @@ def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, A
     return find_labels(model.labels, wanted.get("label", target.label), wanted.get("accept", ()))
 
 
-def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray) -> Prediction:
-    """What the network makes of one square of its size, float32 3×S×S."""
+def predict(model: Classifier, indices: tuple[int, ...], square: np.ndarray, box: Box | None) -> Prediction:
+    """What the network makes of one square of its size, float32 3×S×S, with the object in `box`."""
     import torch
 
     with torch.inference_mode():
-        logits = model.logits(torch.from_numpy(square)[None]).cpu()
-    likely = torch.softmax(logits.double(), 1)[0]
+        logits = model.logits(torch.from_numpy(square)[None], boxes_of(box)).cpu()
+    likely = model.probabilities(logits)[0]
     best = int(likely.argmax())
     return Prediction(
         label=model.labels[best],

@@ -67,7 +67,8 @@ def _recognized(shot: Shot, look: np.ndarray, surface: Surface, light: ColorFit,
     """Whether the primary network recognizes the photograph with that piece in it."""
     codes = np.rint(255 * square_with(shot, look, surface.piece_mm, light)).astype(np.uint8)
     model = judges.primary
-    return predict(model, judges.indices[model.name], squares_of(codes, [model.input_px])[model.input_px]).recognized
+    square = squares_of(codes, [model.input_px])[model.input_px]
+    return predict(model, judges.indices[model.name], square, shot.box).recognized
 
 
 def _beside(kind: str, own: list[bool], control: list[bool]) -> EstimatedControl:

@@ -30,7 +30,7 @@ import numpy as np
 
 from patchproof.claims import LEAST_CLUSTERS, resampled_means
 from patchproof.color import linear_from_srgb
-from patchproof.evidence.classify import Judges
+from patchproof.evidence.classify import Box, Judges, boxes_of
 from patchproof.evidence.reproject import Reference, Shot, Switches, print_and_lights, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture, with_markers
@@ -80,7 +80,7 @@ def ledger_of(
     references = _references(claims, shots, camera, promised)
     for shot, fit, print_light, reference in zip(shots, undo, print_lights, references, strict=True):
         squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
-        values.append(_confidences(squares, judges))
+        values.append(_confidences(squares, judges, shot.box))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
     own = np.array([confidence[shot.file] for shot in shots])
     return _ledger(steps, values, own, manifest.promise.target.goal.sign)
@@ -162,15 +162,15 @@ def _references(
     return references
 
 
-def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges) -> Values:
-    """Target confidence by combination."""
+def _confidences(squares: Mapping[Switches, np.ndarray], judges: Judges, box: Box | None) -> Values:
+    """Target confidence by combination, of squares with the object in `box`."""
     import torch
 
     from patchproof.classifier import center_square
 
-    model = judges.primary
+    model, boxes = judges.primary, boxes_of(box, len(squares))
     with torch.inference_mode():
         pictures = [torch.from_numpy(square.transpose(2, 0, 1))[None].float() for square in squares.values()]
         batch = torch.cat([center_square(picture, model.input_px) for picture in pictures])
-        confidence = model.confidence(model.logits(batch), judges.indices[model.name]).cpu().tolist()
+        confidence = model.confidence(model.logits(batch, boxes), judges.indices[model.name]).cpu().tolist()
     return dict(zip(squares, confidence, strict=True))

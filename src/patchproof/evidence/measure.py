@@ -16,7 +16,8 @@ import numpy as np
 
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import View
-from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, place, pose_of
+from patchproof.evidence.classify import Box
+from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, object_box, place, pose_of
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
 from patchproof.evidence.surface import Promised, Surface
@@ -61,7 +62,8 @@ _HIDDEN = "a corner of the design is covered, folded away or out of the picture:
 @dataclass(frozen=True)
 class MeasuredPhoto:
     """An entry without predictions, whether it is counted, pictures by kind, the light on the markers where it was
-    read, and what the networks will see of it by side, where it was asked for.
+    read, what the networks will see of it by side, where it was asked for, and the object's box in that, where it is
+    known.
     """
 
     entry: PhotoEntry
@@ -69,6 +71,7 @@ class MeasuredPhoto:
     pictures: dict[str, np.ndarray] = field(default_factory=dict)
     light: FrameLight | None = None
     squares: dict[int, np.ndarray] | None = None
+    box: Box | None = None
 
 
 def measure(
@@ -92,7 +95,7 @@ def measure(
         few = CannotJudge("too_few_markers", len(detected.markers), 1, advice)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True)
     light = frame_light(view.srgb, detected.markers.values())
-    fit = placed.fit
+    fit, box = placed.fit, object_box(view, placed, surface)
     geometry, corners = geometry_of(placed, detected, light, surface, promised)
     pose, focal = pose_of(view, placed, surface)
     geometry = geometry.changed(focal=focal)
@@ -119,7 +122,7 @@ def measure(
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
         entry = partial(entry, status="measured", scale=scale, remark=_print_check(page_check, scale))
-    return MeasuredPhoto(entry(color=color), counted, pictures, light)
+    return MeasuredPhoto(entry(color=color), counted, pictures, light, box=box)
 
 
 def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:

@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from patchproof.channel.boxes import box_of
 from patchproof.evidence.camera import FOCAL_ERROR, View
+from patchproof.evidence.classify import Box
 from patchproof.evidence.results import Focal, Geometry, Pose
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import apply_homography, rect_corners
+from patchproof.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.pose import bent_stance, flat_stance, scale_and_tilt, tilt_uncertainty_deg
@@ -26,6 +28,7 @@ from patchproof.photo.unroll import Unrolled, unroll
 
 MOST_SHIFT = 0.005  # of the design's shorter side, by which its own pixels may lie elsewhere than the markers say
 _LEAST_CELLS = 3
+_TANGENT_MM = 5.0  # of paper round the middle that stands for a plane
 _SHARE = 80  # per cent of the cells; gloss, a shadow's edge or a thumb may lie over the others
 _SURE_SIGMAS = 2.0
 _ODD_GROWS = 2.0  # the design's corner beside a marker that does not agree may lie off by as much as that, or more
@@ -97,6 +100,25 @@ def _unrolled(view: View, detected: MarkersInView, surface: Surface) -> Unrolled
         return unroll(view.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, *focal)
     except (np.linalg.LinAlgError, ValueError):
         return None  # a shape that no camera sees is no explanation; the plane's residual decides
+
+
+def object_box(view: View, placed: Placed, surface: Surface) -> Box | None:
+    """Where the object lies that the sheet hangs on, by the plane that touches the paper in the design's middle; None
+    where the sheet does not say, or no camera sees it so. Without a focal length the promised field of view stands in.
+    """
+    if surface.outermost_mm is None:
+        return None
+    size_px = view.srgb.shape[1], view.srgb.shape[0]
+    matrix = intrinsics(surface.fov_deg, size_px) if view.matrix_px is None else view.matrix_px
+    around = np.array(surface.center_mm) + _TANGENT_MM * (rect_corners((-1, -1, 2, 2)))
+    try:
+        pose = plane_pose(fit_homography(around, placed.px(placed.parameters, around)), matrix)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    side, left, top = min(size_px), *((size - min(size_px)) / 2 for size in size_px)
+    to_square = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]])
+    box = box_of(surface.outermost_mm, pose, to_square @ matrix, (side, side)) / side
+    return None if not np.isfinite(box).all() or not box.any() else (*box.tolist(),)
 
 
 def geometry_of(

@@ -20,7 +20,7 @@ import numpy as np
 
 from patchproof.color import LUMINANCE, srgb_from_linear
 from patchproof.evidence.appearance import cells_fit
-from patchproof.evidence.classify import square_of
+from patchproof.evidence.classify import Box, square_of
 from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, rect_corners
@@ -47,7 +47,8 @@ class Shot:
     """One photograph: `square` uint8 W×W×3, millimeters to its pixels, blur in its pixels, noise in linear light.
 
     `cells` h×w×3 are the design's linear light as photographed, NaN where clipped; `scale` is W over the photograph's
-    shorter side; `matrix_px` is the camera's for the square, None where its focal length is not known.
+    shorter side; `matrix_px` is the camera's for the square, None where its focal length is not known; `box` is the
+    object's, where networks ask for it.
     """
 
     file: str
@@ -59,6 +60,7 @@ class Shot:
     cells: np.ndarray
     scale: float
     matrix_px: np.ndarray | None = None
+    box: Box | None = None
 
 
 @dataclass(frozen=True)

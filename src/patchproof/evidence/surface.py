@@ -42,6 +42,8 @@ class Surface:
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
     bent: bool = False  # whether the piece was made to follow a curved surface
+    outermost_mm: np.ndarray | None = None  # the object's outermost points P×3, where networks look for its box
+    fov_deg: float = 45.0  # of the promised photographs, for those whose focal length is not known
 
     @property
     def center_mm(self) -> tuple[float, float]:
@@ -113,7 +115,17 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
         bent=(manifest.settings.get("patch") or {}).get("bend") is True,
+        outermost_mm=_outermost_mm(manifest),
+        fov_deg=(manifest.settings.get("view") or {}).get("fov_deg", 45.0),
     )
+
+
+def _outermost_mm(manifest: Manifest) -> np.ndarray | None:
+    """The object's outermost points in the page's frame, z into the paper."""
+    if manifest.promise is None or not manifest.promise.outermost_mm:
+        return None
+    left, top, *_ = manifest.cut_mm
+    return np.array(manifest.promise.outermost_mm) + np.array([left, top, 0])
 
 
 def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:

@@ -19,7 +19,6 @@ import itertools
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +31,6 @@ from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.experiments.image_classes import ImageClass, PastedSettings, class_scene, classes_of
-from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels
@@ -108,8 +106,7 @@ def flat_problem(
     """A patch on images of its class."""
     stage, printer = set_stage(scene), load_printer(settings.printer.profile, base)
     subject = Patch(scene, printer, (settings.made_px, settings.made_px), stage.device)
-    loss = partial(target_loss, goal=scene.settings.target.goal)
-    return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, loss)
+    return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, None)
 
 
 def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Shown]:

@@ -166,7 +166,8 @@ def _under(problem: Problem, conditions: Conditions, boxes: Sequence[Box | None]
     parts = []
     for part in in_parts(conditions):
         pictures = _photographs(problem, part)
-        parts.append({box: ask(problem, _blackened(pictures, box)) for box in boxes})
+        around = problem.boxes(part)
+        parts.append({box: ask(problem, _blackened(pictures, box), around) for box in boxes})
     return joined(parts)
 
 

@@ -133,7 +133,7 @@ def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Answers,
         for part in in_parts(conditions):
             views = problem.see(None, part, problem.figure_px)
             shown = {"clean": views, "alone": replace(views, object=None)}
-            parts.append({name: ask(problem, expose(each, None)) for name, each in shown.items()})
+            parts.append({name: ask(problem, expose(each, None), problem.boxes(part)) for name, each in shown.items()})
     answers = joined(parts)
     return answers["clean"], answers["alone"]
 

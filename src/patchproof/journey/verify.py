@@ -14,6 +14,7 @@ from pathlib import Path
 
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import load_printer
+from patchproof.classifier.detector import at_score
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
@@ -104,9 +105,10 @@ def options_of(
     sheet: str | Path, manifest: Manifest, models: Sequence[str | Classifier] | None = None, camera: str | None = None
 ) -> Options:
     """What photographs of the sheet are judged with and measured against; see `verify_photos`."""
-    base = Path(sheet).resolve().parent
+    base, promise = Path(sheet).resolve().parent, manifest.promise
+    least_score = None if promise is None else promise.models[0].least_score
     return Options(
-        models=[load_classifier(network, base) for network in _networks(manifest, models)],
+        models=[at_score(load_classifier(network, base), least_score) for network in _networks(manifest, models)],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=None if camera is None else load_camera(camera),
     )

@@ -11,22 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import torch
 from torch import Tensor
 
+from patchproof.classifier.network import Odds
 from patchproof.goal import Goal
 
 Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
 
 
-def target_loss(logits: Tensor, indices: Sequence[int], goal: Goal) -> Tensor:
-    """N losses: -log p of the accepted labels (`assist`) or of all others (`deceive`), in float64 so that none
+def target_loss(odds: Odds, goal: Goal) -> Tensor:
+    """N losses: -log of the confidence (`assist`) or of what it lacks to 1 (`deceive`), in float64 so that none
     saturates.
     """
-    log_p = torch.log_softmax(logits.double(), 1)
-    wanted = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
-    wanted[list(indices)] = True
-    return -torch.logsumexp(log_p[:, wanted if goal.sign > 0 else ~wanted], 1)
+    return -(odds.log_confidence if goal.sign > 0 else odds.log_rest)
 
 
 def total_variation(design_srgb: Tensor) -> Tensor:

@@ -116,7 +116,7 @@ def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
 def _step(problem: Problem, state: State, seen: Views) -> Step:
     design = state.design.clone().requires_grad_()
     pictures = expose(seen, problem.subject.shown(design))
-    losses, confidences, rates = score(problem, pictures)
+    losses, confidences, rates = score(problem, pictures, seen.conditions)
     (gradient,) = torch.autograd.grad(losses, design)
     largest, penalty = float(gradient.abs().max()), problem.subject.penalty(design)
     if not math.isfinite(largest):  # one such step would turn the design into nothing for good
@@ -147,12 +147,12 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 
-def score(problem: Problem, pictures: Tensor) -> tuple[Tensor, float, float]:
-    """Mean loss over classifiers and pictures; mean confidence and rate of the same."""
-    losses, confidence, rate = [], 0.0, 0.0
+def score(problem: Problem, pictures: Tensor, conditions: Conditions) -> tuple[Tensor, float, float]:
+    """Mean loss over classifiers and pictures of these conditions; mean confidence and rate of the same."""
+    losses, confidence, rate, boxes = [], 0.0, 0.0, problem.boxes(conditions)
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
-        logits = classifier.logits(pictures)
-        losses.append(problem.loss(logits, indices).mean())
+        logits = classifier.logits(pictures, boxes)
+        losses.append(problem.losses(classifier, logits, indices).mean())
         confidence += float(classifier.confidence(logits.detach(), indices).mean())
         rate += float(classifier.recognized(logits.detach(), indices).double().mean())
     count = len(losses)
@@ -174,7 +174,7 @@ def _select(problem: Problem, selection: list[Views], step: Step) -> Step:
     printed = from_pixels(as_pixels(state.design), problem.device)
     with torch.no_grad():
         shown = problem.subject.shown(printed)
-        scores = [score(problem, expose(seen, shown)) for seen in selection]
+        scores = [score(problem, expose(seen, shown), seen.conditions) for seen in selection]
     loss = sum(float(score[0]) for score in scores) / len(scores)
     rate = sum(score[2] for score in scores) / len(scores)
     if loss < state.best_loss:

@@ -208,7 +208,7 @@ class _Search:
         """(what gray costs, that less the decrease that its gradient promises)."""
         design = start(problem).design.requires_grad_()
         shown = problem.subject.shown(design)
-        loss, *_ = score(problem, expose(problem.see(shown, conditions, problem.training_px), shown))
+        loss, *_ = score(problem, expose(problem.see(shown, conditions, problem.training_px), shown), conditions)
         (gradient,) = torch.autograd.grad(loss, design)
         self._count(2 * len(conditions))
         coarse = problem.subject.levels(gradient)[-1]

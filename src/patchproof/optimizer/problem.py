@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from patchproof.channel.printer import Printer, load_printer
+from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -45,7 +47,7 @@ class Problem:
     classifiers: tuple[Classifier, ...]
     indices: tuple[tuple[int, ...], ...]
     subject: Subject
-    loss: Loss
+    own_loss: Loss | None  # in place of the goal's
 
     @property
     def training_px(self) -> int:
@@ -56,6 +58,16 @@ class Problem:
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
         return self._view_px(FIGURE_PX)
+
+    def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
+        """N losses to descend on, of what a network answers."""
+        if self.own_loss is not None:
+            return self.own_loss(logits, indices)
+        return target_loss(classifier.odds(logits, indices), self.scene.settings.target.goal)
+
+    def boxes(self, conditions: Conditions) -> np.ndarray | None:
+        """Where the object lies in these views (`Scene.boxes`), if one of the networks asks for it."""
+        return self.scene.boxes(conditions) if any(isinstance(c, Detector) for c in self.classifiers) else None
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
@@ -101,7 +113,8 @@ def set_problem(
     """The problem that a scene states; `models` replaces the scene's own classifiers, `loss` that of its goal."""
     _check_device(device)
     settings = scene.settings
-    classifiers = tuple(load_classifier(name, scene.base, device) for name in models or settings.target.models)
+    names, least_score = models or settings.target.models, settings.target.least_score
+    classifiers = tuple(at_score(load_classifier(name, scene.base, device), least_score) for name in names)
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
@@ -111,7 +124,6 @@ def set_problem(
         subject = Patch(hung, printer, hung.design_px(network_px), stage.device)
     else:
         subject = Texture(needs_texture(scene), stage.device)
-    loss = loss or partial(target_loss, goal=settings.target.goal)
     return Problem(scene, stage, printer, classifiers, indices, subject, loss)
 
 

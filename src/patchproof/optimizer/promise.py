@@ -15,12 +15,15 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
+from patchproof import geometry
+from patchproof.classifier.detector import Detector
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, joined, responses
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import PieceScene, needs_piece
 from patchproof.sessions import difference_in_sessions, in_sessions, spread_of
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
@@ -63,7 +66,17 @@ def make_promise(
         places=places,
         controls=control_claims(compared, 0, min(CONTROL_VIEWS, per_session)),
         conditions=_condition_claims(problem, conditions, answers.recognized[0]),
+        outermost_mm=_outermost_mm(problem),
     )
+
+
+def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
+    """The object's outermost points in the frame of its piece, where a network asks for its box in photographs."""
+    scene = problem.scene
+    if not isinstance(scene, PatchScene) or not any(isinstance(c, Detector) for c in problem.classifiers):
+        return ()
+    points = geometry.carried(np.linalg.inv(scene.placement.world_from_piece), scene.outermost_mm)
+    return tuple((round(x, 3), round(y, 3), round(z, 3)) for x, y, z in points.tolist())
 
 
 def _places(conditions: Conditions, per_session: int) -> tuple[int, ...]:
@@ -95,6 +108,7 @@ def model_claims(
             rate=float(recognized.mean()),
             interval=spread_of(*in_sessions(recognized, per_session, places)).rate,
             confidence=float(confidence.mean()),
+            least_score=classifier.least_score if isinstance(classifier, Detector) else None,
         )
         for classifier, recognized, confidence in rows
     )

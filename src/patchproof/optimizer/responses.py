@@ -49,8 +49,8 @@ def responses(
     parts: list[dict[Thing, Answers]] = []
     with torch.no_grad():
         for part in in_parts(conditions):
-            views = problem.see(laid_out, part, side_px or problem.figure_px)
-            parts.append({name: ask(problem, expose(views, thing)) for name, thing in shown.items()})
+            views, boxes = problem.see(laid_out, part, side_px or problem.figure_px), problem.boxes(part)
+            parts.append({name: ask(problem, expose(views, thing), boxes) for name, thing in shown.items()})
             on_views(len(part))
     return joined(parts)
 
@@ -61,17 +61,17 @@ def in_parts(conditions: Conditions) -> Iterator[Conditions]:
         yield conditions[first : first + AT_A_TIME]
 
 
-def ask(problem: Problem, pictures: Tensor) -> Answers:
-    """Every network's answers to pictures N×3×H×W. One that stands in the problem twice, with other labels, is asked
-    once.
+def ask(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) -> Answers:
+    """Every network's answers to pictures N×3×H×W with the object in `boxes` (`Problem.boxes`). One that stands in the
+    problem twice, with other labels, is asked once.
     """
     rows = []
     with torch.no_grad():
-        logits = {classifier: classifier.logits(pictures) for classifier in dict.fromkeys(problem.classifiers)}
+        logits = {classifier: classifier.logits(pictures, boxes) for classifier in dict.fromkeys(problem.classifiers)}
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
             own = logits[classifier]
             recognized, confidence = classifier.recognized(own, indices), classifier.confidence(own, indices)
-            rows.append(torch.stack([recognized.double(), confidence, problem.loss(own, indices)]))
+            rows.append(torch.stack([recognized.double(), confidence, problem.losses(classifier, own, indices)]))
     recognized, confidence, loss = torch.stack(rows, 1).cpu().numpy()
     return Answers(recognized > 0.5, confidence, loss)
 

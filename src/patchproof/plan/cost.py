@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.optimizer.goals import target_loss
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
@@ -82,9 +81,9 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     parts[problem.subject.LOOK] = clock.lap()
     pictures = expose(views, shown)
     parts["light, piece and camera"] = clock.lap()
-    leaf = pictures.detach().requires_grad_()
+    leaf, boxes = pictures.detach().requires_grad_(), problem.boxes(conditions)
     losses = [
-        target_loss(classifier.logits(leaf), indices, problem.scene.settings.target.goal).mean()
+        problem.losses(classifier, classifier.logits(leaf, boxes), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
     ]
     loss = torch.stack(losses).mean()

@@ -87,19 +87,20 @@ def measure_terms(
         wholes = [term for term in on if term.whole]
         whole = _squares(problem, photo_px, base, [changed[term.name] for term in wholes], advance)
         small = _squares(problem, problem.training_px, base, [changed[term.name] for term in on], advance)
-        confidence = _confidence(problem, whole[0])
+        boxes = problem.boxes(conditions)
+        confidence = _confidence(problem, whole[0], boxes)
         threshold = float(confidence.std()) / selection_views**0.5
-        rows = {t.name: _row(problem, t, small[0], pictures) for t, pictures in zip(on, small[1:], strict=True)}
+        rows = {t.name: _row(problem, t, small[0], pictures, boxes) for t, pictures in zip(on, small[1:], strict=True)}
         for term, pictures in zip(wholes, whole[1:], strict=True):
             shows = bool(rows[term.name].codes_mean)
-            rows[term.name] = _row(problem, term, whole[0], pictures).changed(in_training=shows)
+            rows[term.name] = _row(problem, term, whole[0], pictures, boxes).changed(in_training=shows)
         judged = {row.name: row for row in _judged(terms, rows, threshold)}
         gone, setup, together = [t for t in on if t.key and judged[t.name].verdict == "can go"], base, None
         for term in gone:
             setup = term.change(setup) or setup
         if gone:
             (pictures,) = _squares(problem, photo_px, setup, [], advance)
-            together = float((_confidence(problem, pictures) - confidence).abs().mean())
+            together = float((_confidence(problem, pictures, boxes) - confidence).abs().mean())
     return Terms(
         views=len(conditions),
         confidence=float(confidence.mean()),
@@ -131,9 +132,9 @@ def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: floa
     ]
 
 
-def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermError:
+def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor, boxes: np.ndarray | None) -> TermError:
     codes = (255 * (changed - base)).abs().cpu().numpy()
-    change = _confidence(problem, changed) - _confidence(problem, base)
+    change = _confidence(problem, changed, boxes) - _confidence(problem, base, boxes)
     return TermError(
         name=term.name,
         key=term.key,
@@ -145,10 +146,10 @@ def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor) -> TermErr
     )
 
 
-def _confidence(problem: Problem, pictures: Tensor) -> Tensor:
-    """N confidences of the primary classifier in the target."""
+def _confidence(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) -> Tensor:
+    """N confidences of the primary network in the target."""
     classifier = problem.classifiers[0]
-    return classifier.confidence(classifier.logits(pictures), problem.indices[0])
+    return classifier.confidence(classifier.logits(pictures, boxes), problem.indices[0])
 
 
 def _squares(

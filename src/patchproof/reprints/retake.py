@@ -19,7 +19,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
 from patchproof import geometry
 from patchproof.color import linear_from_srgb, photo_codes_of, srgb_from_linear
@@ -30,7 +29,7 @@ from patchproof.optimizer.responses import ask
 from patchproof.optimizer.run import Run
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
-from patchproof.render.views import see
+from patchproof.render.views import Views, see
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.patch_scene import PatchScene
@@ -83,14 +82,17 @@ def retaker(run: Run, manifest: Manifest) -> Callable[[Shot], float | None]:
         scene = run.scene
         if not isinstance(scene, PatchScene) or not scene.is_flat or shot.matrix_px is None:
             return None
-        hits = ask(problem, retake(problem, scene, shown, shot, manifest)).recognized[0]
+        views = retake(problem, scene, shown, shot, manifest)
+        with torch.no_grad():
+            pictures = expose(views, shown)
+        hits = ask(problem, pictures, views.stage.scene.boxes(views.conditions)).recognized[0]
         return float((hits.sum() + usual) / (len(hits) + 1))
 
     return chance
 
 
-def retake(problem: Problem, scene: PatchScene, shown: Shown, shot: Shot, manifest: Manifest) -> Tensor:
-    """`DRAWS`×3×S×S sRGB: the photograph's square as rendering has it, with what is `shown`."""
+def retake(problem: Problem, scene: PatchScene, shown: Shown, shot: Shot, manifest: Manifest) -> Views:
+    """`DRAWS` views: the photograph's square as rendering has it, for what is `shown`."""
     side, (left, top, *_) = len(shot.square), manifest.cut_mm
     piece = shot.px_from_mm @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]])
     pose = geometry.plane_pose(piece, shot.matrix_px) @ np.linalg.inv(scene.placement.world_from_piece)
@@ -103,9 +105,7 @@ def retake(problem: Problem, scene: PatchScene, shown: Shown, shot: Shot, manife
     retaken = Retaken(**own, pose=pose, unit_matrix=np.diag([1 / side, 1 / side, 1.0]) @ shot.matrix_px)
     conditions = _conditions(scene, shot, float(paper[1]), tint)
     size_px = problem.figure_px, problem.figure_px
-    views = see(replace(problem.stage, scene=retaken), shown, conditions, size_px)
-    with torch.no_grad():
-        return expose(views, shown)
+    return see(replace(problem.stage, scene=retaken), shown, conditions, size_px)
 
 
 def _conditions(scene: PatchScene, shot: Shot, white: float, tint: np.ndarray) -> Conditions:

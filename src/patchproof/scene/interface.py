@@ -76,6 +76,12 @@ class Scene(ABC):
         `shorter`, foreshortened one.
         """
 
+    def boxes(self, conditions: Conditions) -> np.ndarray | None:
+        """N×4 (left, top, right, bottom) of the object in each photograph's centered square, as shares of its side;
+        None where nobody knows.
+        """
+        return None
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader should know."""

@@ -15,10 +15,10 @@ import numpy as np
 
 from patchproof import geometry
 from patchproof.channel import lens
+from patchproof.channel.boxes import box_of, outermost
 from patchproof.channel.effects import Pose
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.backgrounds import Backgrounds
-from patchproof.scene.boxes import box_of, outermost
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
 from patchproof.scene.placement import Frame, view_frame
@@ -112,14 +112,15 @@ class MeshScene(Scene):
         return geometry.intrinsics(self.settings.view.fov_deg, size_px)
 
     def boxes(self, conditions: Conditions) -> np.ndarray:
-        """N×4 (left, top, right, bottom) of the object in each photograph's centered square, as shares of its side."""
+        """As in `Scene.boxes`, of the whole mesh."""
         side_px = min(self.photo_px)
         size_px = side_px, side_px
         matrix_px, poses = self.matrix_px(size_px), self.camera_from_world(conditions)
-        return np.stack([box_of(self._outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses]) / side_px
+        return np.stack([box_of(self.outermost_mm, pose, matrix_px, size_px, self.camera) for pose in poses]) / side_px
 
     @cached_property
-    def _outermost_mm(self) -> np.ndarray:
+    def outermost_mm(self) -> np.ndarray:
+        """P×3 points of the mesh that its box in any view depends on."""
         return outermost(self.mesh.vertices)
 
     def cosines(self, azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:

@@ -115,13 +115,16 @@ class Target(Strict):
 
 
 class ModelClaim(Strict):
-    """One network's promised rate. Its name is as written; SHA-256 of its file where there is one."""
+    """One network's promised rate. Its name is as written; SHA-256 of its file where there is one; of a detector the
+    score from which on its boxes count.
+    """
 
     name: str
     sha256: str | None
     rate: Share
     interval: Interval
     confidence: Share
+    least_score: Share | None = None
 
 
 class ControlClaim(Strict):
@@ -148,7 +151,8 @@ class ConditionClaim(Strict):
 class Promise(Strict):
     """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
     of one session. Promises from before sessions drew everything anew for each condition. `places` has a number for
-    each session's place where some share one. A `draft` was made of few conditions, to try things out.
+    each session's place where some share one. A `draft` was made of few conditions, to try things out. `outermost_mm`
+    are the object's outermost points in the piece's frame, where a detector's boxes are compared with it.
     """
 
     target: Target
@@ -159,6 +163,7 @@ class Promise(Strict):
     per_session: Count = 1
     places: tuple[Annotated[int, Field(ge=0, le=10**6)], ...] = ()
     draft: bool = False
+    outermost_mm: Annotated[tuple[tuple[Mm, Mm, Mm], ...], Field(max_length=2000)] = ()
     controls: dict[Annotated[str, Gray], ControlClaim]
     conditions: tuple[ConditionClaim, ...]
 

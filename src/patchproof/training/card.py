@@ -1,4 +1,4 @@
-"""What is stored of a trained network: its weights as float16, and a card that says how it was made and how good it is."""
+"""What is stored of a trained network: weights as float16, and a card that says how it was made and how good it is."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The pictures that the built-in networks learn from: renders of our own procedural objects.
 
 In: nothing but seeds. Out: pictures, labels and boxes. Our own renderer shows objects with drawn shapes, colors,
-textures, poses, lights, cameras and backgrounds. Half of the pictures are rendered at the network's size, as in training
-a patch, half at twice the size and then reduced, as a photograph is.
+textures, poses, lights, cameras and backgrounds. Half of the pictures are rendered at the network's size, as in
+training a patch, half at twice the size and then reduced, as a photograph is.
 Left out on purpose: anything real. The networks serve demos and tests and say nothing of photographs of real objects.
 """
 

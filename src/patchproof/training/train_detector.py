@@ -98,8 +98,8 @@ def train(shown: Pictures, recipe: Recipe) -> Iterator[tuple[int, float, SmallDe
 def with_mosaics(
     images: Tensor, labels: Tensor, boxes: Tensor, share: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The pictures with up to four objects each: labels N×4 (-1: none) and boxes N×4×4; a share of them replaced by four
-    of the others at half their size.
+    """The pictures with up to four objects each: labels N×4 (-1: none) and boxes N×4×4; a share of them is replaced by
+    four of the others at half their size.
     """
     n = len(images)
     all_labels = torch.cat([labels[:, None], labels.new_full((n, 3), -1)], 1)

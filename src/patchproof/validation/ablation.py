@@ -120,8 +120,10 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if settings.photos:
         drawn = problem.scene.draw("reprint", settings.photos)
         piece = shown if isinstance(shown, PiecePicture) else None
-        photos = (photograph_traced(problem.stage, piece, drawn[i : i + 1]) for i in range(len(drawn)))
-        answers["path_traced"] = joined([{"design": ask(problem, photo)} for photo in photos])
+        alone = [drawn[i : i + 1] for i in range(len(drawn))]
+        photos = (photograph_traced(problem.stage, piece, each) for each in alone)
+        asked = (ask(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
+        answers["path_traced"] = joined([{"design": answer} for answer in asked])
     costs = _costs(problem, settings.effects) if effect == ALL else {}
     return {"cost": costs, **{world: recorded(some) for world, some in answers.items()}}
 

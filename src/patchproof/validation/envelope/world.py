@@ -121,11 +121,12 @@ def recognized(world: World, points: Sequence[Point], conditions: Conditions) ->
             every = np.arange(first, len(conditions), 4)
             size = 1 if as_file else AT_A_TIME
             for rows in (every[i : i + size] for i in range(0, len(every), size)):
+                boxes = first_network.boxes(conditions[rows])
                 views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
                 for i, kind in product(_by_cost(points), out):
                     file = views.file(points[i], kind)[0] if as_file else None
                     pictures = views.at(points[i], kind) if file is None else from_pixels(file)[None]
-                    out[kind][i, rows] = ask(first_network, pictures).recognized
+                    out[kind][i, rows] = ask(first_network, pictures, boxes).recognized
     return out
 
 
