@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.classifier import confidence, find_labels, load_classifier
+from patchproof.classifier import find_labels, load_classifier
 from patchproof.classifier.builtin import HERE, INPUT_PX, load_builtin
 from patchproof.mesh import primitives
 from patchproof.strict import Refused
+from patchproof.training import pictures as rendered
 from patchproof.training import train_builtin
+from patchproof.training.pictures import HELD_OUT, Pictures, augmented, pictures
 
 FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
 
@@ -31,8 +33,8 @@ def builtin():
 
 
 @pytest.fixture(scope="module")
-def fresh() -> tuple[torch.Tensor, torch.Tensor]:
-    return train_builtin.pictures(train_builtin.VIEWS_PER_SHAPE, FRESH)
+def fresh() -> Pictures:
+    return pictures(rendered.VIEWS_PER_SHAPE, FRESH, INPUT_PX)
 
 
 def test_it_names_the_primitives_and_is_small(builtin):
@@ -43,7 +45,7 @@ def test_it_names_the_primitives_and_is_small(builtin):
 
 
 def test_it_knows_fresh_renders_about_as_well_as_its_card_says(builtin, fresh):
-    images, labels = fresh
+    images, labels, _ = fresh
     card = json.loads((HERE / "builtin.json").read_text())
     assert card["held_out_accuracy"] >= 0.9
     with torch.no_grad():
@@ -52,7 +54,7 @@ def test_it_knows_fresh_renders_about_as_well_as_its_card_says(builtin, fresh):
     # ten views of one shape are alike, so this share scatters by about 0.05 on other seeds
     assert right > card["held_out_accuracy"] - 0.15
     # room left for gradients: label smoothing of 0.1 aims at 0.91
-    assert np.median(confidence(logits, range(12)).numpy()) == pytest.approx(1)
+    assert np.median(builtin.confidence(logits, range(12)).numpy()) == pytest.approx(1)
     assert torch.softmax(logits, 1).amax(1).median() < 0.99
 
 
@@ -62,12 +64,12 @@ def test_missing_weights_are_refused(tmp_path):
 
 
 def test_pictures_are_repeatable_and_follow_the_seed(monkeypatch):
-    monkeypatch.setattr(train_builtin, "VIEWS_PER_SHAPE", 2)
-    first, labels = train_builtin.pictures(1, 3)
-    again, _ = train_builtin.pictures(1, 3)
-    other, _ = train_builtin.pictures(1, 4)
+    monkeypatch.setattr(rendered, "VIEWS_PER_SHAPE", 2)
+    first, labels, boxes = pictures(1, 3, INPUT_PX)
+    again, other = pictures(1, 3, INPUT_PX).images, pictures(1, 4, INPUT_PX).images
     assert first.dtype == torch.uint8 and first.shape == (24, 3, 96, 96)
     assert torch.equal(labels.bincount(), torch.full((12,), 2))
+    assert boxes.shape == (24, 4) and bool((boxes[:, 2:] > boxes[:, :2]).all())
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert (first.float().std((1, 2, 3)) > 1).all()  # none is blank
@@ -78,7 +80,7 @@ def test_augmenting_keeps_the_range_and_pastes_as_often_as_said():
     cards = torch.ones(1, 3, 40, 40)
 
     def augment(pasted):
-        return train_builtin.augmented(images, cards, np.random.default_rng(0), pasted)
+        return augmented(images, torch.zeros(400, 4), cards, np.random.default_rng(0), pasted)[0]
 
     assert torch.equal(augment(0.3), augment(0.3))
     assert 0 <= augment(0.3).min() and augment(0.3).max() <= 1
@@ -92,22 +94,22 @@ def test_training_is_repeatable_and_what_it_writes_can_be_loaded(tmp_path):
     # twelve plain colors are twelve classes that can be learned at once
     colors = torch.randint(0, 256, (12, 3, 1, 1), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     labels = torch.arange(12).repeat(8)
-    images = colors[labels].expand(-1, -1, 96, 96)
+    shown = Pictures(colors[labels].expand(-1, -1, 96, 96), labels, torch.zeros(len(labels), 4))
     before = torch.get_num_threads()
-    runs = [list(train_builtin.train(images, labels, recipe)) for _ in range(2)]
+    runs = [list(train_builtin.train(shown, recipe)) for _ in range(2)]
     assert torch.get_num_threads() == before
     assert [loss for _, loss, _ in runs[0]] == [loss for _, loss, _ in runs[1]]
     network = train_builtin.folded(runs[0][-1][2].eval())
-    train_builtin.write(tmp_path, network, recipe, (images, labels), {"render": 1, "train": 2})
+    train_builtin.write(tmp_path, network, recipe, shown, {"render": 1, "train": 2})
     card = json.loads((tmp_path / "builtin.json").read_text())
     assert card["recipe"] == dataclasses.asdict(recipe)
     loaded = load_builtin(folder=tmp_path)
-    by_class = train_builtin.accuracy(loaded.network, images, labels)
+    by_class = train_builtin.accuracy(loaded.network, shown)
     assert card["held_out_accuracy"] == pytest.approx(by_class.mean(), abs=1e-4)
 
 
 def test_held_out_shapes_are_none_of_the_training_shapes():
     recipe = train_builtin.Recipe()
-    shapes = recipe.pictures_per_class // train_builtin.VIEWS_PER_SHAPE
-    assert recipe.seed + shapes < recipe.seed + train_builtin.HELD_OUT
-    assert recipe.seed + train_builtin.HELD_OUT + recipe.held_out_per_class < FRESH
+    shapes = recipe.pictures_per_class // rendered.VIEWS_PER_SHAPE
+    assert recipe.seed + shapes < recipe.seed + HELD_OUT
+    assert recipe.seed + HELD_OUT + recipe.held_out_per_class < FRESH

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from patchproof.channel.printer import Printer as Printer
     from patchproof.channel.printer import load_printer as load_printer
     from patchproof.classifier.custom import classifier_of as classifier_of
+    from patchproof.classifier.custom import detector_of as detector_of
+    from patchproof.classifier.detector import Detector as Detector
     from patchproof.classifier.load import load_classifier as load_classifier
     from patchproof.classifier.network import Classifier as Classifier
     from patchproof.evidence.results import Report as Report
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Classifier": "classifier.network:Classifier",
     "Conditions": "scene.conditions:Conditions",
+    "Detector": "classifier.detector:Detector",
     "Goal": "goal:Goal",
     "Manifest": "sheets.manifest:Manifest",
     "Place": "optimizer.places:Place",
@@ -58,6 +61,7 @@ _HOME = {
     "Stage": "render.stage:Stage",
     "choose_place": "optimizer.places:choose_place",
     "classifier_of": "classifier.custom:classifier_of",
+    "detector_of": "classifier.custom:detector_of",
     "evaluate": "optimizer.evaluate:evaluate_run",
     "load_classifier": "classifier.load:load_classifier",
     "load_manifest": "sheets.manifest:load_manifest",
@@ -76,6 +80,7 @@ _HOME = {
 __all__ = [
     "Classifier",
     "Conditions",
+    "Detector",
     "Goal",
     "Manifest",
     "Place",
@@ -89,6 +94,7 @@ __all__ = [
     "Stage",
     "choose_place",
     "classifier_of",
+    "detector_of",
     "evaluate",
     "load_classifier",
     "load_manifest",

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from patchproof.classifier.check import first_line
-from patchproof.classifier.custom import classifier_of
+from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
+from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
 from patchproof.strict import Refused
@@ -41,17 +42,33 @@ class Normalized(nn.Module):
 
 
 def load_torchvision(name: str) -> Classifier:
-    """A torchvision classification model with its default weights."""
+    """A torchvision classification or detection model with its default weights."""
     models = _library("torchvision").models
+    if name in models.list_models(module=models.detection):
+        return _detector(models, name)
     known = models.list_models(module=models)  # segmentation, detection and video have modules of their own
     if name not in known:
         do = nearest_names(name, known, "choose one of torchvision.models.list_models()")
-        raise Refused("a torchvision classifier", f'"{name}"', do)
+        raise Refused("a torchvision classifier or detector", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
     network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
     view = weights.transforms()
     normalized = Normalized(network, view.mean, view.std)
     return classifier_of(normalized, int(view.crop_size[0]), weights.meta["categories"], f"torchvision:{name}")
+
+
+# of torchvision's detectors by what their constructors call it: as many candidates as there are, none suppressed
+_RAW = {"score_thresh": 1e-3, "nms_thresh": 1.0, "detections_per_img": MOST_FOUND}
+
+
+def _detector(models: Any, name: str) -> Detector:
+    """A torchvision detector with its default weights, before suppression."""
+    weights = models.get_model_weights(name).DEFAULT
+    raw = {f"box_{key}": value for key, value in _RAW.items()} if "rcnn" in name else _RAW
+    network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights, **raw))
+    view = network.transform
+    input_px = view.fixed_size[0] if getattr(view, "fixed_size", None) else view.min_size[0]
+    return detector_of(network, int(input_px), weights.meta["categories"], f"torchvision:{name}")
 
 
 def load_timm(name: str) -> Classifier:

@@ -31,13 +31,14 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
         "patchproof-demo"
     ),
+    detector: Annotated[bool, typer.Option("--detector", help="Before the built-in detector, not classifier.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """The whole journey, offline, on a built-in object and classifier."""
+    """The whole journey, offline, on a built-in object and network."""
     from patchproof.journey.demo import run_demo
 
     with progress() as bar:
-        summary = run_demo(out, overwrite=overwrite, on_stage=bar)
+        summary = run_demo(out, detector=detector, overwrite=overwrite, on_stage=bar)
     say(*summary)
 
 

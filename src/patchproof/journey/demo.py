@@ -1,4 +1,4 @@
-"""The demo: the whole journey on an object and a classifier that come with the package, offline, in two minutes.
+"""The demo: the whole journey on an object and a network that come with the package, offline, in two minutes.
 
 In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard ones on purpose: far,
 dim, oblique and in cluttered places, so that the bare object and the controls are often misread and there is something
@@ -63,13 +63,14 @@ seed = 1
 def run_demo(
     out: str | Path,
     *,
+    detector: bool = False,
     overwrite: bool = False,
     on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[str]:
-    """Run every step into the folder `out`; returns the summary's lines."""
+    """Run every step into the folder `out`, before the built-in classifier or detector; returns the summary's lines."""
     with new_folder(out, OWN, overwrite) as folder:
         run = optimize_scene(
-            demo_scene(folder),
+            demo_scene(folder, detector),
             folder / "run",
             on_step=lambda step, total: on_stage("optimize", step.state.number, total),
             on_promise=lambda done, total: on_stage("promise", done, total),
@@ -97,8 +98,8 @@ def run_demo(
     ]
 
 
-def demo_scene(folder: Path) -> Path:
+def demo_scene(folder: Path, detector: bool = False) -> Path:
     """Write scene.toml into a folder; its path."""
     scene = folder / "scene.toml"
-    scene.write_text(SCENE, encoding="utf-8")
+    scene.write_text(SCENE.replace('"builtin"', '"builtin-detector"') if detector else SCENE, encoding="utf-8")
     return scene
