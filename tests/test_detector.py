@@ -16,7 +16,7 @@ from patchproof.channel.boxes import MOST_POINTS, box_of, outermost
 from patchproof.classifier.builtin_detector import HERE, INPUT_PX
 from patchproof.classifier.detector import NOTHING, Detector, at_score, iou
 from patchproof.classifier.load import load_classifier
-from patchproof.classifier.precision import average_precision, unsuppressed
+from patchproof.classifier.precision import average_precision, findings, unsuppressed
 from patchproof.geometry import intrinsics, project
 from patchproof.goal import Goal
 from patchproof.optimizer.goals import target_loss
@@ -149,11 +149,13 @@ def test_average_precision_by_hand():
             [[*here, -9.0], [*away, -9.0]],
         ]
     )
-    truth, shows = torch.tensor([here] * 3), torch.tensor([True, True, False])
     assert unsuppressed(rows[0, :, :4], rows[0, :, 4]).tolist() == [0]
-    assert average_precision(rows, 0, truth, shows) == pytest.approx((1 + 2 / 3) / 2)
-    assert average_precision(rows, 0, truth, torch.tensor([True, True, True])) == pytest.approx((1 + 2 / 3) / 3)
-    assert math.isnan(average_precision(rows, 0, truth, torch.tensor([False] * 3)))
+    found = findings(rows, [0], torch.tensor([here] * 3), [True, True, False])
+    assert [right for _, right in found] == [True, False, True]
+    assert average_precision(found, 2) == pytest.approx((1 + 2 / 3) / 2)
+    assert average_precision(found, 3) == pytest.approx((1 + 2 / 3) / 3)
+    assert average_precision([], 3) == 0
+    assert not any(right for _, right in findings(rows, [0], torch.tensor([here] * 3), [False] * 3))
 
 
 def test_suppression_agrees_with_opencv_s():
@@ -214,7 +216,8 @@ def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(ship
     card = json.loads((HERE / "builtin_detector.json").read_text())
     assert card["held_out_ap50"] >= 0.8 and (HERE / "builtin_detector.safetensors").stat().st_size < 5_000_000
     fresh = pictures(10, 7_000_000, INPUT_PX)
-    found = train_detector.precision(shipped.network, fresh)
+    found = train_detector.precision(train_detector.found_by_class(shipped.network, fresh), fresh)
+    assert shipped.least_score == card["least_score"]
     assert found.mean() > card["held_out_ap50"] - 0.15  # ten views of one shape are alike
 
 
@@ -233,6 +236,8 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped):
     assert claim.least_score == 0.4 and 3 < len(run.promise.outermost_mm) <= MOST_POINTS
     pp.sheet(run, tmp_path / "sheet.pdf")
     pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
+    found = pp.evaluate(run.folder, n=4)["models"]["builtin-detector"]["ap50"]
+    assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
     report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run)
     truth = scene.boxes(scene.draw("reprint", 3))
     network = at_score(shipped, 0.4)

@@ -135,7 +135,7 @@ class TargetSettings(Strict):
     models: Annotated[tuple[str, ...], Field(min_length=1)]  # trained against together; the first one decides
     accept: tuple[str | int, ...] = ()  # labels that count as recognized, too
     goal: Goal = Goal.assist  # raise the label's rate, or lower it
-    least_score: Share = 0.5  # from which on a detector's box counts; classifiers have none
+    least_score: Share | None = None  # from which on a detector's box counts; by default its own, or 0.5
 
 
 class ViewSettings(Strict):

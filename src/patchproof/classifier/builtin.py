@@ -59,24 +59,24 @@ def folded(trained: nn.Module) -> nn.Module:
 
 def load_builtin(folder: Path = HERE) -> Classifier:
     """The network from `builtin.safetensors` with the classes of `builtin.json`."""
-    sha256, labels, network = stored_network(SmallNetwork, "builtin", folder)
-    return Classifier("builtin", sha256, INPUT_PX, labels, network)
+    sha256, card, network = stored_network(SmallNetwork, "builtin", folder)
+    return Classifier("builtin", sha256, INPUT_PX, tuple(card["classes"]), network)
 
 
 def stored_network(
     kind: Callable[[int], nn.Module], name: str, folder: Path = HERE
-) -> tuple[str, tuple[str, ...], nn.Module]:
-    """SHA-256 of the weights NAME.safetensors, the classes of NAME.json, and the network of this kind with them."""
+) -> tuple[str, dict[str, Any], nn.Module]:
+    """SHA-256 of the weights NAME.safetensors, what NAME.json says, and the network of this kind with them."""
     from safetensors.torch import load
 
     weights, card = folder / f"{name}.safetensors", folder / f"{name}.json"
     if not weights.is_file() or not card.is_file():
         raise Refused("the built-in network's weights beside the program", "none", "install patchproof again")
     stored = weights.read_bytes()
-    labels = tuple(json.loads(card.read_text(encoding="utf-8"))["classes"])
-    network = kind(len(labels))
+    card_says = json.loads(card.read_text(encoding="utf-8"))
+    network = kind(len(card_says["classes"]))
     network.load_state_dict({key: tensor.float() for key, tensor in load(stored).items()})
-    return hashlib.sha256(stored).hexdigest(), labels, network.eval()
+    return hashlib.sha256(stored).hexdigest(), card_says, network.eval()
 
 
 def conv(before: int, after: int, stride: int, batch_norm: bool) -> nn.Module:

@@ -1,11 +1,15 @@
 """How well a detector finds objects of one label: average precision, with one object or none in each picture.
 
-In: candidates before suppression, and the true boxes. Out: AP at an IoU of 0.5: all findings of the label, the surest
-first, are right where they are the first on their object; AP is the mean precision over the recall that they reach,
-each precision the best at that recall or a higher one (as COCO and PASCAL VOC 2010 have it, at every point).
+In: candidates before suppression, and the true boxes. Out: `Finding`s, what is left after suppression, and their AP at
+an IoU of 0.5: the surest first, they are right where they are the first on their object; AP is the mean precision over
+the recall that they reach, each precision the best at that recall or a higher one (as PASCAL VOC 2010 has it, at every
+point).
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,25 +21,44 @@ SUPPRESS_IOU = 0.5  # of two findings of one label that overlap more, only the s
 LEAST_LOGIT = -4.6  # a score of 0.01: less is no finding
 
 
-def average_precision(candidates: Tensor, label: int, boxes_px: Tensor, shows: Tensor) -> float:
-    """AP50 of `label` over N pictures with candidates N×A×(4+K); `boxes_px` N×4 of the objects in those that show one
-    (N bool). NaN where none does.
+class Finding(NamedTuple):
+    """One box that is left: its label's logit, and whether it is the surest on the picture's object."""
+
+    logit: float
+    right: bool
+
+
+def findings(candidates: Tensor, indices: Sequence[int], boxes_px: Tensor, shows: Sequence[bool]) -> list[Finding]:
+    """What is found under one of the labels in N pictures with candidates N×A×(4+K); `boxes_px` N×4 of the objects in
+    those that show one.
     """
-    scores, right = [], []
-    for found, box, is_there in zip(candidates, boxes_px, shows.tolist(), strict=True):
-        kept = unsuppressed(found[:, :4], found[:, 4 + label])
-        on_object = (iou(found[None, kept, :4], box[None])[0] >= LEAST_IOU) & is_there
-        first = on_object & (on_object.cumsum(0) == 1)  # kept ones come surest first
-        scores.append(found[kept, 4 + label])
-        right.append(first)
-    order = torch.cat(scores).argsort(descending=True, stable=True)
-    hits = torch.cat(right)[order].cpu().numpy().astype(float)
-    total = int(shows.sum())
-    if not total:
-        return float("nan")
+    all_found = []
+    for found, box, is_there in zip(candidates, boxes_px, shows, strict=True):
+        boxes, logits = found[:, :4], found[:, 4:][:, list(indices)].amax(1)
+        kept = unsuppressed(boxes, logits)
+        on_object = (iou(boxes[None, kept], box[None])[0] >= LEAST_IOU) & is_there
+        first = on_object & (on_object.cumsum(0) == 1)
+        all_found += map(Finding, logits[kept].tolist(), first.tolist())
+    return all_found
+
+
+def average_precision(found: Iterable[Finding], objects: int) -> float:
+    """AP50 of what was found where there were so many objects, at least one."""
+    hits = np.array([finding.right for finding in sorted(found, key=lambda each: -each.logit)], float)
     precision = hits.cumsum() / np.arange(1, len(hits) + 1)
     best = np.maximum.accumulate(precision[::-1])[::-1]
-    return float((best * hits).sum() / total)
+    return float((best * hits).sum() / objects)
+
+
+def best_score(found: Iterable[Finding], objects: int) -> float:
+    """The score, in twentieths, from which on findings have the highest F1, of so many objects."""
+
+    def f1(score: float) -> float:
+        right = [finding.right for finding in known if 1 / (1 + np.exp(-finding.logit)) >= score]
+        return 2 * sum(right) / (len(right) + objects)
+
+    known = list(found)
+    return max((i / 20 for i in range(1, 20)), key=f1)
 
 
 def unsuppressed(boxes: Tensor, logits: Tensor) -> Tensor:

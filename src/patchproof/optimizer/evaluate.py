@@ -1,25 +1,30 @@
 """Evaluate a run again: fresh conditions, its controls, and networks it was not optimized with.
 
-In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control. Conditions
-come from the evaluate stream, which neither training nor the promise has seen. They are seen a few at a time, by this
-process or by others, each of which opens the run for itself.
+In: a run. Out: RUN/evaluate.json with, per network, rate, confidence and paired differences to each control, of a
+detector also its average precision. Conditions come from the evaluate stream, which neither training nor the promise
+has seen. They are seen a few at a time, by this process or by others, each of which opens the run for itself.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from patchproof.classifier.network import Classifier
+import torch
+
+from patchproof.classifier.detector import Detector
+from patchproof.classifier.network import Classifier, center_square
+from patchproof.classifier.precision import Finding, average_precision, findings
 from patchproof.input import is_file
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, shown_with_controls
 from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined, responses
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import write_whole
+from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.strict import Refused
 from patchproof.workers import open_workers
@@ -54,12 +59,16 @@ def evaluate_run(
         run, problem = _opened(folder, networks, device)
         parts = in_parts(run.scene.draw("evaluate", n, seed))
         show = partial(_show, folder, networks, device)
-        answers = joined(workers.map(show, parts, lambda done, _: on_view(min(done * AT_A_TIME, n), n)))
+        shown = list(workers.map(show, parts, lambda done, _: on_view(min(done * AT_A_TIME, n), n)))
+    answers = joined([part for part, _ in shown])
     _opened.cache_clear()
     result = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
     for i, claim in enumerate(model_claims(problem, answers["design"])):
         controls = {kind: control.model_dump() for kind, control in control_claims(answers, i).items()}
         result["models"][claim.name] = claim.model_dump(exclude={"name"}) | {"controls": controls}
+        if found := [part[claim.name] for _, part in shown if claim.name in part]:
+            ap50 = {kind: average_precision([f for part in found for f in part[kind]], n) for kind in found[0]}
+            result["models"][claim.name]["ap50"] = ap50
     write_whole(
         run.folder / "evaluate.json", lambda path: path.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
     )
@@ -73,6 +82,30 @@ def _opened(folder: Path, models: Networks, device: str) -> tuple[Run, Problem]:
     return run, set_problem(run.scene, device, models)
 
 
-def _show(folder: Path, models: Networks, device: str, conditions: Conditions) -> dict[str, Answers]:
+Found = dict[str, dict[str, list[Finding]]]  # by detector and what is shown
+
+
+def _show(folder: Path, models: Networks, device: str, conditions: Conditions) -> tuple[dict[str, Answers], Found]:
     run, problem = _opened(folder, models, device)
-    return responses(problem, shown_with_controls(problem, run.design, CONTROLS), conditions)
+    shown = shown_with_controls(problem, run.design, CONTROLS)
+    return responses(problem, shown, conditions), _found(problem, shown, conditions)
+
+
+def _found(problem: Problem, shown: Mapping[str, Shown], conditions: Conditions) -> Found:
+    """All that detectors find under the target's labels, where it is known where the object lies."""
+    boxes = problem.boxes(conditions)
+    if boxes is None:
+        return {}
+    found: Found = {}
+    with torch.no_grad():
+        views = problem.see(shown["design"], conditions, problem.figure_px)
+        pictures = {kind: expose(views, thing) for kind, thing in shown.items()}
+        for network, indices in zip(problem.classifiers, problem.indices, strict=True):
+            if not isinstance(network, Detector):
+                continue
+            boxes_px, shows = torch.as_tensor(boxes * network.input_px), [True] * len(boxes)
+            found[network.name] = {
+                kind: findings(network.network(center_square(photos, network.input_px)), indices, boxes_px, shows)
+                for kind, photos in pictures.items()
+            }
+    return found
