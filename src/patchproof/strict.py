@@ -129,7 +129,10 @@ def expand(text: str, base: Path) -> str:
     prefix, colon, rest = text.partition(":")
     if colon and prefix == "file":
         return f"file:{base / rest}"  # an absolute path stays as it is
-    if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text == "builtin":
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text in (
+        "builtin",
+        "builtin-detector",
+    ):
         return text
     return str(base / text)
 
