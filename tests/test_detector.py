@@ -239,6 +239,8 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped):
     found = pp.evaluate(run.folder, n=4)["models"]["builtin-detector"]["ap50"]
     assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
     report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run)
+    said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
+    assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
     truth = scene.boxes(scene.draw("reprint", 3))
     network = at_score(shipped, 0.4)
     for photo, box in zip(report.photos, truth, strict=True):

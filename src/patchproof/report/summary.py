@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from patchproof.report.words import headline_of, remarks, worth_sentence
+from patchproof.report.words import headline_of, meaning_of, remarks, worth_sentence
 
 
 def promise_lines(promise: Any, background: str = "") -> list[str]:
@@ -25,6 +25,7 @@ def promise_lines(promise: Any, background: str = "") -> list[str]:
         f"  also {model.name}: {model.rate:.1%} [{model.interval[0]:.1%}, {model.interval[1]:.1%}]"
         for model in promise.models[1:]
     ]
+    lines += [meaning] if (meaning := meaning_of(promise.models[0].model_dump())) else []
     return lines + _control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()})
 
 

@@ -63,3 +63,13 @@ def remarks(photos: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int, st
             alike.setdefault((photo["code"], photo["advice"]), []).append(photo["file"])
     rows = ((code, advice, len(files), listed(files)) for (code, advice), files in alike.items())
     return sorted(rows, key=lambda row: (-row[2], row[:2]))
+
+
+def meaning_of(model: Mapping[str, Any]) -> str:
+    """What it means that this network of a promise recognizes the object; of a classifier that is plain."""
+    if model["least_score"] is None:
+        return ""
+    return (
+        f"{model['name']} is a detector: recognized is what it finds in a box of score {model['least_score']:g} or "
+        "more that overlaps the object's own by half."
+    )

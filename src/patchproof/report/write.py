@@ -17,7 +17,7 @@ from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import page
 from patchproof.report.photo_table import photos_csv
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
-from patchproof.report.words import VERDICTS, headline_of, remarks, worth_sentence
+from patchproof.report.words import VERDICTS, headline_of, meaning_of, remarks, worth_sentence
 
 _EFFECTS = {
     "shown": "The patch itself makes the difference: it did better than every control.",
@@ -72,6 +72,7 @@ def render(
         primary=primary,
         headline=headline_of(summary),
         worth=worth_sentence(summary),
+        meaning=meaning_of(promise["models"][0]) if promise else "",
         word=(summary["worth"] or {}).get("word", "not_shown"),
         verdict=VERDICTS[summary["verdict"]],
         effect=_EFFECTS["estimated" if _is_estimated(summary) else summary["effect"]],
