@@ -32,7 +32,7 @@ class SmallDetector(nn.Module):
         self.join = nn.ModuleList(conv(width, HEAD, 1, batch_norm) for width in WIDTHS[-2:])
         self.head = nn.ModuleList(conv(HEAD, HEAD, 1, batch_norm) for _ in range(2))
         self.name, self.sides = nn.Conv2d(HEAD, classes, 1), nn.Conv2d(HEAD, 4, 1)
-        nn.init.constant_(self.name.bias, -4.0)  # most cells show no object: Lin et al., ICCV 2017
+        self.name.bias = nn.Parameter(torch.full((classes,), -4.0))  # most cells show no object: Lin et al., ICCV 2017
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×128×128 sRGB in [0, 1] → a candidate for each of 64 cells, N×64×(4+K)."""

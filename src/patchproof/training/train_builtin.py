@@ -63,7 +63,7 @@ def main() -> None:
             write(out, folded(trained.eval()), recipe, held_out, seconds)
 
 
-def write(out: Path, network: SmallNetwork, recipe: Recipe, held_out: Pictures, seconds: dict[str, int]) -> None:
+def write(out: Path, network: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: dict[str, int]) -> None:
     """The weights and what is known about them; the accuracy is that of the stored weights."""
     count = stored(network, out / "builtin.safetensors")
     right = accuracy(network, held_out)
