@@ -84,7 +84,7 @@ def test_doubts_are_warned_about_and_let_pass():
 
 @pytest.mark.parametrize("name", ["resnet50", "", "torch:x", "models/a.pt2", "http://x/y.pt2", "Builtin"])
 def test_a_name_of_no_known_form_is_refused(name, tmp_path):
-    with pytest.raises(Refused, match=r'file:NAME\.pt2 or module:package\.factory, got "' + name):
+    with pytest.raises(Refused, match=r'file:NAME\.onnx or module:package\.factory, got "' + name):
         load_classifier(name, tmp_path)
 
 

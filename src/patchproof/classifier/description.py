@@ -12,7 +12,7 @@ Source: torch/_export/serde/schema.py, whose words for arguments are used here, 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from patchproof.classifier.archive import DTYPES, STRIDED, Unwanted, quoted, whole
 from patchproof.classifier.batches import MAX_BATCH
-from patchproof.classifier.graph import Here, Program, Step, Value
+from patchproof.classifier.graph import Here, Program, Step, Value, mark_spent
 from patchproof.classifier.operators import is_check, operator_named
 
 MAX_STEPS = 1 << 15  # DenseNet-201 has 709
@@ -61,7 +61,7 @@ class _Reader:
             raise Unwanted(f"more than {MAX_STEPS} operators")
         steps = [step for node in nodes if not is_check(node["target"]) for step in [self._step(node)]]
         output = self._output()
-        _mark_spent(steps, {*range(len(weights) + 1), output})
+        mark_spent(steps, {*range(len(weights) + 1), output})
         return Program(weights, steps, output, sizes), low, high
 
     def _inputs(self) -> tuple[list[Tensor], str]:
@@ -219,20 +219,3 @@ def _few(items: list[Any]) -> list[Any]:
     if type(items) is not list or len(items) > MAX_LIST:
         raise Unwanted(f"a list of more than {MAX_LIST} items, or none")
     return items
-
-
-def _mark_spent(steps: list[Step], kept: set[int]) -> None:
-    """Write into each step which values it is the last to need."""
-    needed = set(kept)
-    for step in reversed(steps):
-        used = {*step.results, *_numbers(step.arguments), *_numbers(step.keywords.values())}
-        step.spent.extend(used - needed)
-        needed |= used
-
-
-def _numbers(arguments: Iterable[Any]) -> Iterator[int]:
-    for argument in arguments:
-        if type(argument) is Value:
-            yield argument.number
-        elif type(argument) is list:
-            yield from _numbers(argument)

@@ -8,12 +8,13 @@ weights or of the input are refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from patchproof.classifier.archive import MAX_DIMENSIONS, quoted
 
@@ -44,6 +45,23 @@ class Step:
     spent: list[int]
 
 
+def mark_spent(steps: list[Step], kept: set[int]) -> None:
+    """Write into each step which values it is the last to need."""
+    needed = set(kept)
+    for step in reversed(steps):
+        used = {*step.results, *_numbers(step.arguments), *_numbers(step.keywords.values())}
+        step.spent.extend(used - needed)
+        needed |= used
+
+
+def _numbers(arguments: Iterable[Any]) -> Iterator[int]:
+    for argument in arguments:
+        if type(argument) is Value:
+            yield argument.number
+        elif type(argument) is list:
+            yield from _numbers(argument)
+
+
 class Program(torch.nn.Module):
     """The graph as a function of pictures; weights are buffers, so that they move with the module."""
 
@@ -58,20 +76,18 @@ class Program(torch.nn.Module):
         """N×3×S×S → N×K."""
         if photos.shape not in self.weighed:
             self._weigh(photos.shape)
-        return self._computed(list(self.buffers()), photos, None)
+        return self._computed(list(self.buffers()), photos)
 
-    def _computed(self, weights: list[Tensor], photos: Tensor, limit: int | None) -> Tensor:
+    def _computed(self, weights: list[Tensor], photos: Tensor) -> Tensor:
         values: dict[int, Any] = dict(enumerate([*weights, photos]))
         for step in self.steps:
             arguments = [_filled(argument, values, photos) for argument in step.arguments]
             keywords = {name: _filled(argument, values, photos) for name, argument in step.keywords.items()}
-            if limit is not None and step.several:
+            if step.several and photos.is_meta:
                 _check_split(arguments)
             results = step.compute(*arguments, **keywords)
             for number, result in zip(step.results, results if step.several else [results], strict=True):
                 values[number] = result
-                if limit is not None:
-                    _check_value(result, limit)
             for number in step.spent:  # memory is used again while it is in the cache
                 del values[number]
         return values[self.output]
@@ -83,7 +99,8 @@ class Program(torch.nn.Module):
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
             photos = torch.empty(shape, device="meta")
-            self._computed(weights, photos, MAX_VALUE * len(photos))
+            with _Watched(MAX_VALUE * len(photos)):
+                self._computed(weights, photos)
         if any(tensor._version for tensor in [*weights, photos]):
             raise ValueError("it changes its weights or its input")
         self.weighed.add(shape)
@@ -98,9 +115,19 @@ def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
     return photos.device if argument is Here else argument
 
 
-def _check_value(value: Any, limit: int) -> None:
-    if isinstance(value, Tensor) and (value.numel() > limit or value.dim() > MAX_DIMENSIONS):
-        raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(value.shape))}")
+class _Watched(TorchDispatchMode):
+    """Refuses tensors of absurd sizes, also those that an operator makes on its way (einsum, paddings)."""
+
+    def __init__(self, limit: int):
+        super().__init__()
+        self.limit = limit
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        results = func(*args, **(kwargs or {}))
+        for value in results if isinstance(results, (list, tuple)) else [results]:
+            if isinstance(value, Tensor) and (value.numel() > self.limit or value.dim() > MAX_DIMENSIONS):
+                raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(value.shape))}")
+        return results
 
 
 def _check_split(arguments: list[Any]) -> None:

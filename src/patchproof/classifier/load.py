@@ -3,6 +3,7 @@
     builtin                the small network that comes with the package (builtin.py)
     builtin-detector       the small detector that comes with it (builtin_detector.py)
     file:NAME.pt2          a torch.export program with NAME.json beside it (program.py)
+    file:NAME.onnx         an ONNX file with NAME.json beside it
     torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py)
     timm:NAME
     module:package.factory the user's own code, which is imported and called (custom.py)
@@ -55,9 +56,9 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
-        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, file:NAME.pt2 or module:package.factory"
-        do = f'write "file:{name}"' if name.endswith(".pt2") else "write one of these"
-        raise Refused(f"a model named {known}", f'"{name}"', do)
+        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, file:NAME.pt2, file:NAME.onnx"
+        do = f'write "file:{name}"' if name.endswith((".pt2", ".onnx")) else "write one of these"
+        raise Refused(f"a model named {known} or module:package.factory", f'"{name}"', do)
     return _trusted(replace(classifier, name=name), device)
 
 

@@ -1,20 +1,22 @@
-"""`file:NAME.pt2`: a network as a `torch.export` program, with NAME.json beside it.
+"""`file:NAME.pt2`, `file:NAME.onnx`: a network as a `torch.export` program or in ONNX, with NAME.json beside it.
 
 The JSON says `input_px`, the side of the square that the program takes, and `labels`: a list, or the name of a JSON
 file beside it that holds one. The program takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits.
 A program exported for one batch size, or for a range of them, is called in such batches.
 Nothing of the file is executed: archive.py reads tensors and JSON, description.py the graph from it, and graph.py
-computes its operators, which are on the list in operators.py. torch's own loader, which writes names of the file into
-Python, is not called.
+computes its operators, which are on the list in operators.py; for ONNX these are protobuf.py, onnx_file.py and
+onnx_operators.py. torch's own loader, which writes names of the file into Python, is not called, nor is onnx.
 
 To make one: `torch.export.save(torch.export.export(network.eval(), (torch.rand(2, 3, S, S),),
-dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)), "NAME.pt2")`.
+dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)), "NAME.pt2")`, or `torch.onnx.export` with the same
+`dynamic_shapes`; what it writes into NAME.onnx.data belongs to NAME.onnx.
 """
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -22,6 +24,7 @@ from patchproof.classifier.archive import Unwanted, read_archive
 from patchproof.classifier.batches import InBatches
 from patchproof.classifier.description import read_program
 from patchproof.classifier.network import Classifier
+from patchproof.classifier.onnx_file import read_onnx
 from patchproof.input import is_file, read_json
 from patchproof.strict import Refused
 
@@ -30,18 +33,24 @@ MAX_BYTES = 4 << 30  # larger than any classifier here has been
 
 def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
     """The program and its card as a Classifier."""
-    if path.suffix != ".pt2":
-        do = "save it with torch.export.save as NAME.pt2, with NAME.json beside it"
-        raise Refused("a torch.export program, file:NAME.pt2", f"{path}", do)
-    if not is_file(path):
-        raise Refused("a torch.export program", f"no file at {path}", "check the path")
-    if path.stat().st_size > MAX_BYTES:
-        got = f"{path}, which is larger"
-        raise Refused(f"a program of at most {MAX_BYTES >> 30} GiB", got, "use a smaller network")
+    if path.suffix not in _WORDS:
+        do = "save it with torch.export.save as NAME.pt2, or with torch.onnx.export, with NAME.json beside it"
+        raise Refused("a torch.export program, file:NAME.pt2, or file:NAME.onnx", f"{path}", do)
+    stored = _bytes(path)  # once, so that what is hashed is what is loaded
     input_px, labels = _card(path.with_suffix(".json"))
-    stored = path.read_bytes()  # once, so that what is hashed is what is loaded
-    network = _network(stored, path).to(device)
-    return Classifier(f"file:{path}", hashlib.sha256(stored).hexdigest(), input_px, labels, network)
+    digest = hashlib.sha256(stored)
+    network = _network(stored, path, digest).to(device)
+    return Classifier(f"file:{path}", digest.hexdigest(), input_px, labels, network)
+
+
+def _bytes(path: Path) -> bytes:
+    if not is_file(path):
+        raise Refused("a network", f"no file at {path}", "check the path")
+    if path.stat().st_size > MAX_BYTES:
+        raise Refused(
+            f"a network of at most {MAX_BYTES >> 30} GiB", f"{path}, which is larger", "use a smaller network"
+        )
+    return path.read_bytes()
 
 
 def _card(path: Path) -> tuple[int, tuple[str, ...]]:
@@ -59,18 +68,29 @@ def _card(path: Path) -> tuple[int, tuple[str, ...]]:
     return input_px, tuple(labels)
 
 
-def _network(stored: bytes, path: Path) -> InBatches:
+def _network(stored: bytes, path: Path, digest: Any) -> InBatches:
     """The program as a function of any number of photographs."""
+
+    def beside() -> bytes:
+        data = _bytes(path.with_name(f"{path.name}.data"))
+        digest.update(data)
+        return data
+
+    expected, plain, again = _WORDS[path.suffix]
     try:
+        if path.suffix == ".onnx":
+            return InBatches(*read_onnx(stored, beside))
         return InBatches(*read_program(*read_archive(stored, path)))
     except Unwanted as error:
-        raise Refused("a torch.export program of plain tensors and operators", f"{path} with {error}", _EVAL) from error
+        raise Refused(f"{expected} of plain tensors and operators", f"{path} with {error}", plain) from error
     except Refused:
         raise
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        got = f"{path}, whose description cannot be read ({type(error).__name__})"
-        raise Refused("a torch.export program", got, _AGAIN) from error
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise Refused(expected, f"{path}, whose description cannot be read ({type(error).__name__})", again) from error
 
 
 _EVAL = "export it in evaluation mode, without custom operators, control flow or tensor subclasses"
-_AGAIN = "export it again with torch.export.save, torch 2.9 or later"
+_WORDS = {  # what it should be, and what to do where it holds something else, or cannot be read
+    ".pt2": ("a torch.export program", _EVAL, "export it again with torch.export.save, torch 2.9 or later"),
+    ".onnx": ("an ONNX file", f"{_EVAL}, opset 13 or later", "export it again with torch.onnx.export"),
+}
