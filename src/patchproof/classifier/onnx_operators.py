@@ -249,7 +249,6 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "LayerNormalization": _layer_norm,
     "GroupNormalization": _group_norm,
     "InstanceNormalization": _instance_norm,
-    "LRN": lambda x, /, *, size, alpha=1e-4, beta=0.75, bias=1.0: F.local_response_norm(x, size, alpha, beta, bias),
     "Dropout": _dropout,
     # shapes
     "Reshape": shapes.reshape,

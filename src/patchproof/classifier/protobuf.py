@@ -16,7 +16,7 @@ import numpy as np
 
 from patchproof.classifier.archive import Unwanted
 
-MAX_FIELDS = 1 << 20  # in a file: Swin's, which computes all its sizes, has 57 thousand
+MAX_FIELDS = 1 << 19  # in a file: Swin's, which computes all its sizes, has 57 thousand
 MAX_ITEMS = 1 << 15  # of one kind in a message
 MAX_TEXT = 1 << 16  # names are paths through modules
 
