@@ -618,6 +618,123 @@ def card_json(rng: Rng, folder: Path) -> Read:
     return lambda: load_program(folder / "n.pt2")
 
 
+# a protobuf message as pairs of a field's number and what it holds: a number, bytes, text or another message
+Message = list[tuple[int, "int | bytes | str | Message"]]
+
+
+def node(kind: str, inputs: str, output: str, *attributes: Message) -> tuple[int, Message]:
+    """A node of an ONNX graph."""
+    words = [(1, word) for word in inputs.split()]
+    return 1, [*words, (2, output), (4, kind), *((5, attribute) for attribute in attributes)]
+
+
+def stored_tensor(name: str, array: np.ndarray) -> tuple[int, Message]:
+    """An initializer of an ONNX graph."""
+    kind = 1 if array.dtype == np.float32 else 7
+    return 5, [*((1, size) for size in array.shape), (2, kind), (8, name), (9, array.tobytes())]
+
+
+def onnx_model() -> Message:
+    """A convolution, a pool and a matrix product, with a shape that is computed: N×3×8×8 → N×4."""
+    noise = np.random.default_rng(0).normal(size=(4, 3, 3, 3)).astype(np.float32)
+    pads: Message = [(1, "pads"), *((8, 1) for _ in range(4)), (20, 7)]
+    window: Message = [(1, "kernel_shape"), (8, 2), (8, 2), (20, 7)]
+    axis: Message = [(1, "axis"), (3, 0), (20, 2)]
+    nodes = [
+        node("Conv", "x w", "a", pads),
+        node("Relu", "a", "b"),
+        node("MaxPool", "b", "c", window, [(1, "strides"), (8, 2), (8, 2), (20, 7)]),
+        node("Shape", "c", "d"),
+        node("Gather", "d zero", "e", axis),
+        node("Concat", "e rest", "f", axis),
+        node("Reshape", "c f", "g"),
+        node("ReduceMean", "g", "h", [(1, "axes"), (8, 2), (20, 7)], [(1, "keepdims"), (3, 0), (20, 2)]),
+        node("Gemm", "h m", "y"),
+    ]
+    arrays = {
+        "w": noise,
+        "m": noise[..., 0, 0].repeat(2, 1)[:, :4],
+        "zero": np.zeros(1, int),
+        "rest": np.array([4, -1]),
+    }
+    sizes: Message = [(1, [(2, "n")]), (1, [(1, 3)]), (1, [(1, 8)]), (1, [(1, 8)])]
+    place: Message = [(1, "x"), (2, [(1, [(1, 1), (2, sizes)])])]
+    weights = [stored_tensor(name, array) for name, array in arrays.items()]
+    return [(1, 8), (7, [*nodes, *weights, (11, place), (12, [(1, "y")])]), (8, [(2, 13)])]
+
+
+def protobuf(message: Message) -> bytes:
+    """The message as its file holds it."""
+
+    def varint(number: int) -> bytes:
+        return bytes([number & 127 | 128]) + varint(number >> 7) if number > 127 else bytes([number])
+
+    def field(number: int, content) -> bytes:
+        if isinstance(content, int):
+            return varint(number << 3) + varint(content % (1 << 64))
+        data = content.encode("utf-8", "replace") if isinstance(content, str) else content
+        data = protobuf(data) if isinstance(data, list) else data
+        return varint(number << 3 | 2) + varint(len(data)) + data
+
+    return b"".join(field(number, content) for number, content in message)
+
+
+def broken_message(rng: Rng, message: Message) -> Message:
+    """One field in it, or in a message in it, made another, dropped, doubled, moved or renumbered."""
+    at = int(rng.integers(len(message)))
+    number, content = message[at]
+    if isinstance(content, list) and content and rng.random() < 0.9:
+        return [*message[:at], (number, broken_message(rng, content)), *message[at + 1 :]]
+    words = [
+        "",
+        "x",
+        "a",
+        "w",
+        "y",
+        "zero",
+        "Loop",
+        "Tile",
+        "Expand",
+        "Identity",
+        "Split",
+        "Cast",
+        "Range",
+        "Pad",
+        "axes",
+    ]
+    numbers = [0, 1, -1, 2, 3, 64, 1 << 16, 1 << 31, 1 << 62, -(1 << 63)]
+    if isinstance(content, int):
+        content = int(rng.choice(numbers))
+    elif isinstance(content, str):
+        content = str(rng.choice(words))
+    how = rng.integers(8)
+    if how == 0:
+        return message[:at] + message[at + 1 :]
+    if how == 1:
+        return [*message, message[at]]
+    if how == 2:
+        return [*message[:at], message[rng.integers(len(message))], *message[at + 1 :]]
+    if how == 3:
+        return [*message[:at], (int(rng.integers(1, 26)), content), *message[at + 1 :]]
+    if how == 4 and isinstance(content, bytes):
+        content = mutated(rng, content)
+    return [*message[:at], (number, content), *message[at + 1 :]]
+
+
+def onnx_file(rng: Rng, folder: Path) -> Read:
+    from patchproof.classifier import load_classifier
+
+    message = onnx_model()
+    for _ in range(rng.integers(0, 4)):
+        message = broken_message(rng, message)
+    stored = protobuf(message)
+    (folder / "n.onnx").write_bytes(mutated(rng, stored) if rng.random() < 0.3 else stored)
+    (folder / "n.json").write_text(json.dumps({"input_px": 8, "labels": ["a", "b", "c", "d"]}))
+    if rng.random() < 0.2:
+        (folder / "n.onnx.data").write_bytes(bytes(int(rng.integers(0, 500))))
+    return lambda: load_classifier("file:n.onnx", folder)
+
+
 def mask(rng: Rng, folder: Path) -> Read:
     from patchproof.scene.backgrounds import load_backgrounds
     from patchproof.scene.texture import _read_mask
@@ -815,6 +932,7 @@ READERS: dict[str, tuple[Callable[[Rng, Path], Read], int]] = {
     "labels.csv": (labels_csv, 4),
     "faces.txt": (faces_txt, 3),
     "network card": (card_json, 3),
+    "onnx": (onnx_file, 4),
     "mask, background": (mask, 4),
     "scene.toml": (scene_toml, 3),
     "template": (template_toml, 3),

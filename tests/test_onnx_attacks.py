@@ -223,7 +223,7 @@ HOSTILE: dict[str, tuple[Callable[[], ModelProto | bytes], str]] = {
         "of an absurd size",
     ),
     "a range past memory": (
-        lambda: ending(f"y = Range([0], [{1 << 60}], [1])"),
+        lambda: ending(f"y = Range([0], [{1 << 50}], [1])"),
         "of an absurd size",
     ),
     "a border past memory": (lambda: ending(f"y = Pad(z, [0, 0, 0, 0, 0, 0, {1 << 20}, {1 << 20}])"), "absurd size"),
