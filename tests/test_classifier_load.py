@@ -149,7 +149,7 @@ def test_torchvision_is_wrapped_with_its_own_figures(tmp_path, monkeypatch):
 
 def test_timm_is_wrapped_with_its_own_figures(tmp_path, monkeypatch):
     network = Good()
-    network.num_classes = 4
+    network.num_classes, network.pretrained_cfg = 4, {}
     subset = "imagenet-1k"
 
     class Info:
@@ -184,6 +184,10 @@ def test_timm_is_wrapped_with_its_own_figures(tmp_path, monkeypatch):
     subset = None
     with pytest.raises(Refused, match="labels are known"):
         load_classifier("timm:vit", tmp_path)
+    network.pretrained_cfg = {"label_names": list("wxyz"), "label_descriptions": {"x": "a sheep"}}
+    assert load_classifier("timm:hf-hub:org/vit@main", tmp_path).labels == ("w", "a sheep", "y", "z")
+    with pytest.raises(Refused, match="choose one of timm"):
+        load_classifier("timm:hf-hub/vit", tmp_path)
 
 
 # ------------------------------------------------------------------------------------------------ the user's own code

@@ -179,7 +179,10 @@ def test_expand_paths_and_names(tmp_path, monkeypatch):
     assert expand("${PP_TEST_DIR}/car.glb", tmp_path) == "/data/car.glb"
     assert expand("file:${PP_TEST_DIR}/net.pt2", tmp_path) == "file:/data/net.pt2"
     assert expand("file:net.pt2", tmp_path) == f"file:{tmp_path / 'net.pt2'}"
-    for name in ("builtin", "primitive:mug", "torchvision:resnet50", "timm:vit", "module:a.b"):
+    assert expand("timm:vit@w.safetensors", tmp_path) == f"timm:vit@{tmp_path / 'w.safetensors'}"
+    assert expand("torchvision:vgg11@/data/w.safetensors", tmp_path) == "torchvision:vgg11@/data/w.safetensors"
+    kept = ("timm:hf-hub:timm/vit@main", "timm:vit@w.pth", "torchvision:resnet50", "timm:vit")
+    for name in ("builtin", "primitive:mug", *kept, "module:a.b"):
         assert expand(name, tmp_path) == name
     monkeypatch.delenv("PP_TEST_DIR")
     with pytest.raises(Refused, match="the environment variable PP_TEST_DIR, got none"):

@@ -117,6 +117,10 @@ def validated(model: type[Model], data: Any, where: str) -> Model:
         raise _explain(model, first, where) from error
 
 
+# a network's name up to the file in it, and that file
+NETWORK_FILE = re.compile(r"(file:|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
+
+
 def expand(text: str, base: Path) -> str:
     """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
 
@@ -126,9 +130,9 @@ def expand(text: str, base: Path) -> str:
         return os.environ[match[1]]
 
     text = re.sub(r"\$\{(\w+)\}", variable, text)
-    prefix, colon, rest = text.partition(":")
-    if colon and prefix == "file":
-        return f"file:{base / rest}"  # an absolute path stays as it is
+    if match := NETWORK_FILE.fullmatch(text):
+        return f"{match[1]}{base / match[2]}"  # an absolute path stays as it is
+    prefix, colon, _ = text.partition(":")
     if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text in (
         "builtin",
         "builtin-detector",

@@ -32,7 +32,7 @@ from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.piece import smallest_piece_mm
-from patchproof.strict import Refused, Side, validated
+from patchproof.strict import NETWORK_FILE, Refused, Side, validated
 
 NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm
 _SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
@@ -252,8 +252,8 @@ def _line(setting: str, comment: str) -> str:
 
 def _model(name: str, base: Path) -> str:
     """A network's name as a scene in `base` says it; on the command line paths start where one is."""
-    kind, colon, rest = name.partition(":")
-    return f"file:{_path(Path(rest), base)}" if colon and kind == "file" and "${" not in rest else name
+    match = NETWORK_FILE.fullmatch(name)
+    return f"{match[1]}{_path(Path(match[2]), base)}" if match and "${" not in match[2] else name
 
 
 def _path(path: Path, base: Path) -> str:

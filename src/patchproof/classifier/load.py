@@ -4,8 +4,8 @@
     builtin-detector       the small detector that comes with it (builtin_detector.py)
     file:NAME.pt2          a torch.export program with NAME.json beside it (program.py)
     file:NAME.onnx         an ONNX file with NAME.json beside it
-    torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py)
-    timm:NAME
+    torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py),
+    timm:NAME              or with @FILE.safetensors behind the name read from that file
     module:package.factory the user's own code, which is imported and called (custom.py)
     python:...             a Classifier given in Python beside the scene (custom.classifier_of)
 

@@ -36,14 +36,15 @@ def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
     if path.suffix not in _WORDS:
         do = "save it with torch.export.save as NAME.pt2, or with torch.onnx.export, with NAME.json beside it"
         raise Refused("a torch.export program, file:NAME.pt2, or file:NAME.onnx", f"{path}", do)
-    stored = _bytes(path)  # once, so that what is hashed is what is loaded
-    input_px, labels = _card(path.with_suffix(".json"))
+    stored = network_bytes(path)  # once, so that what is hashed is what is loaded
+    input_px, labels = read_card(path.with_suffix(".json"))
     digest = hashlib.sha256(stored)
     network = _network(stored, path, digest).to(device)
     return Classifier(f"file:{path}", digest.hexdigest(), input_px, labels, network)
 
 
-def _bytes(path: Path) -> bytes:
+def network_bytes(path: Path) -> bytes:
+    """A file of a network or of its weights, refused where there is none or it is of an absurd size."""
     if not is_file(path):
         raise Refused("a network", f"no file at {path}", "check the path")
     if path.stat().st_size > MAX_BYTES:
@@ -53,8 +54,8 @@ def _bytes(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _card(path: Path) -> tuple[int, tuple[str, ...]]:
-    """Input size and labels."""
+def read_card(path: Path) -> tuple[int, tuple[str, ...]]:
+    """Input size and labels, as the JSON file beside a network says them."""
     do = 'write {"input_px": 224, "labels": ["...", ...]} into it, or the name of a JSON list beside it as labels'
     card = read_json(path, "a JSON file", do, do)
     input_px, labels = (card.get("input_px"), card.get("labels")) if isinstance(card, dict) else (None, None)
@@ -72,7 +73,7 @@ def _network(stored: bytes, path: Path, digest: Any) -> InBatches:
     """The program as a function of any number of photographs."""
 
     def beside() -> bytes:
-        data = _bytes(path.with_name(f"{path.name}.data"))
+        data = network_bytes(path.with_name(f"{path.name}.data"))
         digest.update(data)
         return data
 

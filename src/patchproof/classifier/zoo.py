@@ -1,17 +1,24 @@
-"""`torchvision:NAME` and `timm:NAME`: published networks with their published weights.
+"""`torchvision:NAME` and `timm:NAME`: published networks with their published weights, or with those of a file.
 
-The weights are downloaded by these libraries, and only because the scene file names the model. The libraries are not
-needed otherwise: where one is missing, the sentence says what to install. Input size, labels and the mean and standard
-deviation that the weights were trained with are the library's own figures; normalization is put inside the network.
+The weights are downloaded by these libraries, and only because the scene file names the model; `timm:hf-hub:ORG/NAME`
+is one of the hub's. With `NAME@FILE.safetensors` they are the file's, read as numbers, never as a pickle; a network
+trained for other labels says these, and its input size, in FILE.json beside it. The libraries are not needed otherwise:
+where one is missing, the sentence says what to install. Input size, labels and the mean and standard deviation that the
+weights were trained with are the library's own figures; normalization is put inside the network.
 Their resize-then-crop is left out on purpose: here every network sees the whole centered square.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import re
 import socket
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import getproxies
@@ -24,6 +31,8 @@ from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
+from patchproof.classifier.program import network_bytes, read_card
+from patchproof.input import is_file
 from patchproof.strict import Refused
 
 
@@ -42,19 +51,27 @@ class Normalized(nn.Module):
 
 
 def load_torchvision(name: str) -> Classifier:
-    """A torchvision classification or detection model with its default weights."""
+    """A torchvision classification or detection model with its default weights; a classifier's may be a file's."""
     models = _library("torchvision").models
     if name in models.list_models(module=models.detection):
         return _detector(models, name)
+    name, own = _own_weights(name)
     known = models.list_models(module=models)  # segmentation, detection and video have modules of their own
     if name not in known:
         do = nearest_names(name, known, "choose one of torchvision.models.list_models()")
         raise Refused("a torchvision classifier or detector", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
-    network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
     view = weights.transforms()
-    normalized = Normalized(network, view.mean, view.std)
-    return classifier_of(normalized, int(view.crop_size[0]), weights.meta["categories"], f"torchvision:{name}")
+    side_px, labels = (own and own.card) or (int(view.crop_size[0]), weights.meta["categories"])
+    if own is None:
+        network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of how it begins, before the file's weights are in it
+            network = models.get_model(name, weights=None, num_classes=len(labels))
+        if hasattr(network, "transform_input"):  # Inception's published weights are for another normalization
+            network.transform_input = True
+    return _with(own, network, view.mean, view.std, side_px, labels, f"torchvision:{name}")
 
 
 # of torchvision's detectors by what their constructors call it: as many candidates as there are, none suppressed
@@ -72,21 +89,88 @@ def _detector(models: Any, name: str) -> Detector:
 
 
 def load_timm(name: str) -> Classifier:
-    """A timm model with its pretrained weights, for the ImageNet subsets that timm has the labels of."""
+    """A timm model with its pretrained weights or a file's, where its labels are known."""
     timm = _library("timm")
-    if not timm.is_model(name):
+    name, own = _own_weights(name)
+    if not (timm.is_model(name) or (name.startswith("hf-hub:") and own is None)):
         do = nearest_names(name, timm.list_models(), "choose one of timm.list_models()")
         raise Refused("a timm model", f'"{name}"', do)
-    with _offline_at_once():
-        network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
+    if own is None:
+        with _offline_at_once():
+            network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
+    else:
+        network = timm.create_model(name, **({"num_classes": len(own.card[1])} if own.card else {}))
+    view = timm.data.resolve_model_data_config(network)
+    side_px, labels = (own and own.card) or (int(view["input_size"][-1]), _timm_labels(timm, network, name))
+    return _with(own, network, view["mean"], view["std"], side_px, labels, f"timm:{name}")
+
+
+def _timm_labels(timm: Any, network: Any, name: str) -> list[str]:
+    """Those of the model's own list, or of the ImageNet subset that timm takes it for."""
+    own = network.pretrained_cfg.get("label_names")
+    if own and len(own) == network.num_classes:
+        described = network.pretrained_cfg.get("label_descriptions") or {}
+        return [str(described.get(label, label)) for label in own]
     subset = timm.data.infer_imagenet_subset(network)
     if not subset:
         do = "use one trained on ImageNet, or write a module:package.factory with its labels"
         raise Refused("a timm model whose labels are known", f'"{name}" with {network.num_classes} outputs', do)
-    info, view = timm.data.ImageNetInfo(subset), timm.data.resolve_model_data_config(network)
-    labels = [info.index_to_description(index) for index in range(network.num_classes)]
-    normalized = Normalized(network, view["mean"], view["std"])
-    return classifier_of(normalized, int(view["input_size"][-1]), labels, f"timm:{name}")
+    info = timm.data.ImageNetInfo(subset)
+    return [info.index_to_description(index) for index in range(network.num_classes)]
+
+
+@dataclass(frozen=True)
+class _Own:
+    """Weights of a local file."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    sha256: str
+    card: tuple[int, tuple[str, ...]] | None  # input size and labels, where they are not the published ones
+
+
+def _own_weights(name: str) -> tuple[str, _Own | None]:
+    """The model's name, and the weights of the file that is named with it."""
+    name, at, file = name.partition("@") if not name.startswith("hf-hub:") else (name, "", "")  # there @ is a revision
+    if not at:
+        return name, None
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    path = Path(file)
+    if path.suffix != ".safetensors":
+        do = 'save them with safetensors.torch.save_file(network.state_dict(), "NAME.safetensors")'
+        raise Refused("weights in a file NAME.safetensors", f"{path}", do)
+    stored = network_bytes(path)
+    try:
+        tensors = load(stored)
+    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        raise Refused(
+            "weights in safetensors", f"{path} that cannot be read ({first_line(error)})", "save it again"
+        ) from error
+    card = path.with_suffix(".json")
+    return name, _Own(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
+
+
+# heads that only training uses, and a counter of its steps
+_UNUSED = re.compile(r"(aux\d?|AuxLogits)\..*|.*\.num_batches_tracked")
+
+
+def _with(
+    own: _Own | None, network: Any, mean: Sequence[float], std: Sequence[float], side_px: int, labels: Any, name: str
+) -> Classifier:
+    """The network as a Classifier, the file's weights in it where there is one."""
+    classifier = classifier_of(Normalized(network, mean, std), side_px, labels, name)
+    if own is None:
+        return classifier
+    wanted = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
+    given = {key: tensor.shape for key, tensor in own.tensors.items() if not _UNUSED.fullmatch(key)}
+    if wrong := sorted(wanted.items() ^ given.items()):
+        got = f"{own.path} with another {wrong[0][0]}"
+        do = "check the name, and write the labels of a network with others into NAME.json beside it"
+        raise Refused(f"weights of {name} for {len(labels)} labels", got, do)
+    network.load_state_dict({key: own.tensors[key] for key in wanted}, strict=False)
+    return replace(classifier, sha256=own.sha256)
 
 
 @contextmanager

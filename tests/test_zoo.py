@@ -1,0 +1,113 @@
+"""torchvision's and timm's own networks, with weights from a file: nothing is downloaded."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from archives import seeded
+from patchproof.classifier import load_classifier, zoo
+from patchproof.strict import Refused
+
+pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights are noise
+
+LABELS = [f"label {number}" for number in range(12)]
+
+
+@pytest.fixture(scope="module")
+def torchvision():
+    """torchvision; one that was built for CUDA lacks, beside a CPU torch, operators that no classifier needs."""
+    library = torch.library.Library("torchvision", "FRAGMENT")
+    try:
+        import torchvision
+    except ImportError:
+        pytest.skip('needs torchvision, of the extra "models"')
+    except RuntimeError:
+        for name in ("nms", "qnms"):
+            library.define(f"{name}(Tensor boxes, Tensor scores, float least) -> Tensor")
+        import torchvision
+    yield torchvision
+
+
+def saved(path, network, labels=LABELS, input_px=None) -> None:
+    """Weights, and a card where the labels are not the published ones."""
+    save_file(seeded(network).state_dict(), path)
+    if input_px is not None:
+        path.with_suffix(".json").write_text(json.dumps({"input_px": input_px, "labels": labels}))
+
+
+def normalized(photos, mean, std):
+    return (photos - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
+
+
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+@pytest.mark.parametrize(("name", "px"), [("resnet18", 64), ("densenet121", 64), ("shufflenet_v2_x0_5", 64)])
+def test_torchvisions_families_from_a_file_with_own_labels(name, px, torchvision, tmp_path):
+    network = torchvision.models.get_model(name, num_classes=12)
+    saved(tmp_path / "w.safetensors", network, input_px=px)
+    classifier = load_classifier(f"torchvision:{name}@w.safetensors", tmp_path)
+    assert (classifier.name, list(classifier.labels)) == (f"torchvision:{name}@w.safetensors", LABELS)
+    photos = torch.rand(2, 3, px, px)
+    torch.testing.assert_close(classifier.logits(photos), network(normalized(photos, *IMAGENET)), rtol=1e-4, atol=1e-4)
+
+
+def test_googlenets_published_form_has_heads_for_training_and_another_normalization(torchvision, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        network = torchvision.models.googlenet(init_weights=False, transform_input=True)
+    saved(tmp_path / "w.safetensors", network)
+    without = {key: tensor for key, tensor in network.state_dict().items() if not key.startswith("aux")}
+    save_file(without, tmp_path / "v.safetensors")
+    photos, answers = torch.rand(2, 3, 224, 224), []
+    for file in ("w", "v"):
+        classifier = load_classifier(f"torchvision:googlenet@{file}.safetensors", tmp_path)
+        assert classifier.input_px == 224 and classifier.labels[967] == "espresso"
+        answers.append(classifier.logits(photos))
+    torch.testing.assert_close(answers[0], network(normalized(photos, *IMAGENET)), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(*answers)
+
+
+@pytest.mark.parametrize("name", ["vit_tiny_patch16_224", "convnext_atto"])
+def test_timms_families_from_a_file(name, tmp_path):
+    timm = pytest.importorskip("timm", reason='needs timm, of the extra "models"')
+    network = timm.create_model(name)
+    saved(tmp_path / "w.safetensors", network)
+    classifier = load_classifier(f"timm:{name}@w.safetensors", tmp_path)
+    view = timm.data.resolve_model_data_config(network)
+    assert classifier.input_px == view["input_size"][-1] and "espresso" in classifier.labels[967]
+    photos = torch.rand(1, 3, 224, 224)
+    by_hand = network(normalized(photos, view["mean"], view["std"]))
+    torch.testing.assert_close(classifier.logits(photos), by_hand, rtol=1e-4, atol=1e-4)
+
+
+def test_weights_that_do_not_fit_are_refused(torchvision, tmp_path):
+    saved(tmp_path / "w.safetensors", torchvision.models.shufflenet_v2_x0_5(num_classes=12))
+    for name, sentence in {
+        "shufflenet_v2_x0_5@w.safetensors": r"another fc\.bias: .*write the labels of a network with others into",
+        "resnet18@w.safetensors": "weights of torchvision:resnet18 for 1000 labels",
+        "resnet18@no.safetensors": r"no file at .*no\.safetensors",
+        "resnet18@w.pth": r"weights in a file NAME\.safetensors, got w\.pth: save them with safetensors",
+        "resnet18@b.safetensors": r"b\.safetensors that cannot be read",
+    }.items():
+        (tmp_path / "b.safetensors").write_bytes(b"\x80\4" + bytes(50))
+        with pytest.raises(Refused, match=sentence):
+            load_classifier(f"torchvision:{name}", tmp_path)
+
+
+def test_a_model_of_the_hub_needs_a_way_to_it(tmp_path, monkeypatch):
+    pytest.importorskip("timm", reason='needs timm, of the extra "models"')
+
+    def nowhere(*_, **__):
+        raise OSError("no route")
+
+    monkeypatch.setattr(zoo.socket, "create_connection", nowhere)
+    monkeypatch.setattr(zoo, "getproxies", dict)
+    monkeypatch.setenv("HF_HOME", str(tmp_path))
+    with pytest.raises(Refused, match=r"published weights of timm:hf-hub:timm/none, got \w+ .*the way to the internet"):
+        load_classifier("timm:hf-hub:timm/none", tmp_path)
