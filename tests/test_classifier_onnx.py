@@ -32,6 +32,18 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+class Prompted(ViT):
+    """CLIP's way: cosines with the embeddings of prompts, which are constants."""
+
+    def __init__(self):
+        super().__init__()
+        self.prompts = torch.nn.Parameter(torch.zeros(4, 4))
+
+    def forward(self, x):
+        seen, said = (torch.nn.functional.normalize(y, dim=-1) for y in (super().forward(x), self.prompts))
+        return 10 * seen @ said.T
+
+
 def written(folder: Path, network: torch.nn.Module, batch: int | None = None, dynamo: bool = False) -> Path:
     """`network` for N×3×16×16, by one of torch's two exporters, of any N or of one."""
     path = folder / "net.onnx"
@@ -60,7 +72,7 @@ def check_alike(network, truth, numbers=(1, 5)) -> None:
 
 
 @pytest.mark.parametrize("batch", [None, 1])
-@pytest.mark.parametrize("make", [ResNet, ViT, ConvNeXt])
+@pytest.mark.parametrize("make", [ResNet, ViT, ConvNeXt, Prompted])
 def test_logits_and_gradients_are_torchs(make, batch, tmp_path):
     check_alike(load_program(written(tmp_path, make(), batch)).network, seeded(make()))
 
