@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from archives import seeded
+from patchproof.begin.new import _model
 from patchproof.classifier import load_classifier, zoo
 from patchproof.strict import Refused
 
@@ -98,6 +99,14 @@ def test_weights_that_do_not_fit_are_refused(torchvision, tmp_path):
         (tmp_path / "b.safetensors").write_bytes(b"\x80\4" + bytes(50))
         with pytest.raises(Refused, match=sentence):
             load_classifier(f"torchvision:{name}", tmp_path)
+
+
+def test_a_new_scene_names_weights_from_its_own_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for kind in ("file:", "torchvision:resnet18@", "timm:vit@"):
+        assert _model(f"{kind}w.safetensors", tmp_path) == f"{kind}w.safetensors"
+        assert _model(f"{kind}w.safetensors", tmp_path / "x") == f"{kind}{tmp_path}/w.safetensors"
+    assert _model("timm:hf-hub:org/vit@main", tmp_path / "x") == "timm:hf-hub:org/vit@main"
 
 
 def test_a_model_of_the_hub_needs_a_way_to_it(tmp_path, monkeypatch):
