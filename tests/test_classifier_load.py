@@ -123,7 +123,8 @@ def fake_torchvision(monkeypatch, network, broken=False) -> None:
         return network
 
     models = types.SimpleNamespace(
-        list_models=lambda module: ["resnet18", "resnet50"],
+        detection=None,
+        list_models=lambda module: ["resnet18", "resnet50"] if module else [],
         get_model_weights=lambda name: types.SimpleNamespace(DEFAULT=weights),
         get_model=get_model,
     )
