@@ -17,8 +17,9 @@ from patchproof.cli.begin import new, plan, preview
 from patchproof.cli.calibrate import camera, printer
 from patchproof.cli.capture import capture
 from patchproof.cli.console import stoppable
+from patchproof.cli.designs import evaluate, import_picture
 from patchproof.cli.experiments import ListsStudies, bench, harden, keys, study
-from patchproof.cli.journey import demo, evaluate, optimize, reprint, sheet, verify
+from patchproof.cli.journey import demo, optimize, reprint, sheet, verify
 from patchproof.output import disk_is_full
 from patchproof.strict import Refused
 from patchproof.version import __version__
@@ -30,7 +31,10 @@ app = typer.Typer(
 )
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
-for _verb in (demo, new, preview, plan, optimize, evaluate, sheet, reprint, capture, verify):
+for _verb in (demo, new, preview, plan, optimize):
+    app.command()(stoppable(_verb))
+app.command("import")(stoppable(import_picture))
+for _verb in (evaluate, sheet, reprint, capture, verify):
     app.command()(stoppable(_verb))
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):

@@ -88,35 +88,6 @@ def optimize(
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
 
 
-def evaluate(
-    run: Annotated[Path, typer.Argument(help="A finished run.")],
-    models: Models = None,
-    n: Annotated[int, typer.Option(min=1, help="Fresh conditions.")] = 400,
-    seed: Seed = None,
-    device: Device = "cpu",
-    jobs: Jobs = 1,
-    cluster: Cluster = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Rates on fresh conditions, with controls, on any classifiers."""
-    from patchproof.optimizer.evaluate import evaluate_run
-    from patchproof.report.summary import evaluation_lines
-
-    with progress() as bar:
-        result = evaluate_run(
-            run,
-            models=names_of(models),
-            n=n,
-            seed=seed,
-            device=device,
-            jobs=jobs,
-            cluster=cluster,
-            overwrite=overwrite,
-            on_view=lambda done, total: bar("evaluate", done, total),
-        )
-    say(*evaluation_lines(result), f"written: {run / 'evaluate.json'}")
-
-
 def sheet(
     out: Annotated[Path | None, typer.Option(help="The PDF; its manifest is written beside it.")] = None,
     runs: Annotated[

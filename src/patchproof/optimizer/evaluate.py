@@ -27,9 +27,10 @@ from patchproof.output import write_whole
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
 from patchproof.strict import Refused
-from patchproof.workers import open_workers
+from patchproof.workers import Workers, open_workers
 
 Networks = tuple[str | Classifier, ...] | None
+Found = dict[str, dict[str, list[Finding]]]  # by detector and what is shown
 
 
 def evaluate_run(
@@ -50,23 +51,20 @@ def evaluate_run(
     `models` are names, or classifiers in memory, which other processes cannot have.
     """
     folder, networks = Path(run_folder).resolve(), None if models is None else tuple(models)
-    if (jobs > 1 or cluster is not None) and any(isinstance(network, Classifier) for network in networks or ()):
-        raise Refused("networks that other processes load by name", "one in memory", "leave jobs and cluster out")
+    refuse_unnamed(networks, jobs, cluster)
     if is_file(folder / "evaluate.json") and not overwrite:
         do = "add --overwrite, or rename it to keep it"
         raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
     with open_workers(jobs, cluster) as workers:
         run, problem = _opened(folder, networks, device)
-        parts = in_parts(run.scene.draw("evaluate", n, seed))
-        show = partial(_show, folder, networks, device)
-        shown = list(workers.map(show, parts, lambda done, _: on_view(min(done * AT_A_TIME, n), n)))
-    answers = joined([part for part, _ in shown])
-    _opened.cache_clear()
+        conditions = run.scene.draw("evaluate", n, seed)
+        answers, shown = answers_of(folder, conditions, workers, networks, device, lambda done: on_view(done, n))
+    forget()
     result = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
     for i, claim in enumerate(model_claims(problem, answers["design"])):
         controls = {kind: control.model_dump() for kind, control in control_claims(answers, i).items()}
         result["models"][claim.name] = claim.model_dump(exclude={"name"}) | {"controls": controls}
-        if found := [part[claim.name] for _, part in shown if claim.name in part]:
+        if found := [part[claim.name] for part in shown if claim.name in part]:
             ap50 = {kind: average_precision([f for part in found for f in part[kind]], n) for kind in found[0]}
             result["models"][claim.name]["ap50"] = ap50
     write_whole(
@@ -75,14 +73,38 @@ def evaluate_run(
     return result
 
 
+def refuse_unnamed(networks: Networks, jobs: int, cluster: str | None) -> None:
+    """Refuse networks in memory where other processes do the work."""
+    if (jobs > 1 or cluster is not None) and any(isinstance(network, Classifier) for network in networks or ()):
+        raise Refused("networks that other processes load by name", "one in memory", "leave jobs and cluster out")
+
+
+def answers_of(
+    folder: Path,
+    conditions: Conditions,
+    workers: Workers,
+    networks: Networks = None,
+    device: str = "cpu",
+    on_view: Callable[[int], None] = lambda done: None,
+) -> tuple[dict[str, Answers], list[Found]]:
+    """What the networks answer to the design of the run in an absolute folder, and to its controls, under the
+    conditions; and what detectors find, some conditions at a time.
+    """
+    show, n = partial(_show, folder, networks, device), len(conditions)
+    shown = workers.map(show, in_parts(conditions), lambda done, _: on_view(min(done * AT_A_TIME, n)))
+    return joined([answers for answers, _ in shown]), [found for _, found in shown]
+
+
+def forget() -> None:
+    """Let go of the run that `answers_of` has open in this process."""
+    _opened.cache_clear()
+
+
 @lru_cache(maxsize=1)
 def _opened(folder: Path, models: Networks, device: str) -> tuple[Run, Problem]:
     """A run and its problem, once in each process."""
     run = load_run(folder)
     return run, set_problem(run.scene, device, models)
-
-
-Found = dict[str, dict[str, list[Finding]]]  # by detector and what is shown
 
 
 def _show(folder: Path, models: Networks, device: str, conditions: Conditions) -> tuple[dict[str, Answers], Found]:

@@ -17,3 +17,13 @@ def as_pixels(design_srgb: Tensor) -> np.ndarray:
 def from_pixels(pixels: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
     """uint8 h×w×3 as 3×h×w in [0, 1]."""
     return torch.tensor(pixels, dtype=torch.float32, device=device).permute(2, 0, 1) / 255
+
+
+def side_by_side(pictures: Tensor, columns: int = 4) -> np.ndarray:
+    """Pictures N×3×h×w in rows of so many, as one of uint8 H×W×3; white where there are none left."""
+    pixels = codes_of(pictures).permute(0, 2, 3, 1).cpu().numpy()
+    rows = -(-len(pixels) // columns)
+    count, height, width, _ = pixels.shape
+    blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)
+    grid = np.concatenate([pixels, blank]).reshape(rows, columns, height, width, 3)
+    return grid.swapaxes(1, 2).reshape(rows * height, columns * width, 3)

@@ -2,8 +2,9 @@
 
 In: a scene file. Out: RUN/ with `design.png`, `run.json` (settings, versions, seeds, threads, promise), `steps.jsonl`
 (one flushed line per step), `views.png` and `checkpoint.safetensors` (replaced atomically); where the place was
-searched for also `place.json` and `place.png`, while run.json has it like one that was given. Nothing in it depends on
-the time of day, so that the same seed gives the same bytes on one machine with one thread count and device.
+searched for also `place.json` and `place.png`, while run.json has it like one that was given. A design that was made
+elsewhere (`given`) is finished here, too. Nothing in it depends on the time of day, so that the same seed gives the
+same bytes on one machine with one thread count and device.
 """
 
 from __future__ import annotations
@@ -12,29 +13,28 @@ import json
 import os
 import platform
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import torch
-from PIL import Image
 from pydantic import BaseModel, Field
 
 from patchproof.classifier.network import Classifier
-from patchproof.color import codes_of
 from patchproof.input import is_file, read_json
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
 from patchproof.optimizer.patch import DESIGN_FILE
+from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.place_files import PLACE_FILES, read_place, save_place
 from patchproof.optimizer.places import choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, make_promise
-from patchproof.optimizer.subject import read_png
+from patchproof.optimizer.subject import read_png, write_png
 from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
 from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.patch_scene import OpenScene
@@ -89,10 +89,7 @@ def optimize_scene(
     `controls`, one at least. A promise of fewer `promise_views` than usual (two sessions at least) is a draft's.
     `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
     """
-    out = Path(out)
-    views = PROMISE_VIEWS if promise_views is None else promise_views
-    if promise_views is not None and views < 2 * PER_SESSION:
-        raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{views}", "promise of more")
+    out, views = Path(out), promised_views(promise_views)
     if not resume:
         check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / _RUN))
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
@@ -110,11 +107,34 @@ def optimize_scene(
         save_place(place, needs_patch(scene), out)
     state = resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
+    return finish_run(problem, design, out, controls, views, on_promise)
+
+
+def promised_views(asked: int | None) -> int:
+    """How many views a promise is made of; refused where they are too few for one."""
+    if asked is not None and asked < 2 * PER_SESSION:
+        raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{asked}", "promise of more")
+    return PROMISE_VIEWS if asked is None else asked
+
+
+def finish_run(
+    problem: Problem,
+    design: np.ndarray,
+    out: Path,
+    controls: Sequence[str],
+    views: int,
+    on_promise: Callable[[int, int], None],
+    imported: Mapping[str, Any] | None = None,
+) -> Run:
+    """Promise a design's rate and write what its run keeps into a folder; `imported` says where a design comes from
+    that was not optimized here.
+    """
+    scene = problem.scene
     problem.subject.save(design, out)
     promise = _promise(problem, design, controls, views, on_promise)
     if scene.given_glb is not None:
         write_whole(out / _GIVEN, scene.given_glb)
-    details = _details(problem, promise, out, device)
+    details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
     write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
     return Run(out, scene, design, promise, details)
 
@@ -134,6 +154,8 @@ def load_run(folder: str | Path) -> Run:
         base = (folder / record.scene_folder).resolve()
         glb = (folder / _GIVEN).read_bytes() if is_file(folder / _GIVEN) else None
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
+        if record.imported is not None:
+            scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
         design = _design(scene, folder)
     except Refused:
         raise
@@ -146,6 +168,10 @@ class _Placement(BaseModel):
     piece_mm: tuple[Positive, Positive] | None = None
 
 
+class _Imported(BaseModel):
+    sha256: str
+
+
 class _Record(BaseModel):
     """What is read of run.json."""
 
@@ -156,6 +182,7 @@ class _Record(BaseModel):
     seed: NotNegativeInt
     sheet_id: str
     printer: dict[str, Any]
+    imported: _Imported | None = None
 
 
 def _refuse_framed(settings: SceneSettings, placement: _Placement | None, folder: Path) -> None:
@@ -194,9 +221,7 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             log.write(json.dumps(_log_line(step)) + "\n")
             log.flush()
             if state.number == total and step.pictures is not None:
-                write_whole(
-                    out / _VIEWS, lambda path, pictures=step.pictures: _contact_sheet(pictures).save(path, "PNG")
-                )
+                write_png(out / _VIEWS, side_by_side(step.pictures))
             if step.select_loss is not None:  # after the views, which a run that goes on from the last step lacks
                 save_checkpoint(state, problem, out)
             largest = max(step.gradient, largest or 0.0)
@@ -249,13 +274,13 @@ def _cut_log(path: Path, number: int) -> None:
     write_whole(path, b"".join(lines))
 
 
-def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict[str, Any]:
+def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:
     scene = problem.scene
     packages = ("torch", "numpy", "kornia", "trimesh")  # those that pixels depend on
     return {
         "sheet_id": scene.sheet_id,
         "seed": scene.seed,
-        "device": device,
+        "device": str(problem.device),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
         "versions": {"patchproof": __version__} | {name: version(name) for name in packages},
@@ -267,13 +292,3 @@ def _details(problem: Problem, promise: Promise, out: Path, device: str) -> dict
         "select_after_views": SELECT_AFTER,
         "promise": promise.model_dump(mode="json"),
     }
-
-
-def _contact_sheet(pictures: torch.Tensor, columns: int = 4) -> Image.Image:
-    """The step's training views side by side."""
-    pixels = codes_of(pictures).permute(0, 2, 3, 1).cpu().numpy()
-    rows = -(-len(pixels) // columns)
-    count, height, width, _ = pixels.shape
-    blank = np.full((rows * columns - count, height, width, 3), 255, np.uint8)
-    grid = np.concatenate([pixels, blank]).reshape(rows, columns, height, width, 3)
-    return Image.fromarray(grid.swapaxes(1, 2).reshape(rows * height, columns * width, 3))

@@ -175,13 +175,14 @@ def _into_srgb(image) -> Callable | None:
     from PIL import ImageCms
 
     profile = image.info.get("icc_profile")
-    if not profile or image.mode not in {"RGB", "CMYK"}:
+    if not profile or image.mode not in {"RGB", "RGBA", "CMYK", "L"}:
         return None
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         if "srgb" in ImageCms.getProfileDescription(source).lower():
             return None
-        change = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), image.mode, "RGB")
+        into = "RGBA" if image.mode == "RGBA" else "RGB"  # alpha is carried over
+        change = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), image.mode, into)
     except (ImageCms.PyCMSError, OSError, ValueError):
         return None
     return lambda part: ImageCms.applyTransform(part, change)

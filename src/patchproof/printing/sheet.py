@@ -19,7 +19,7 @@ from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
 from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.manifest import Manifest, Promise
+from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
@@ -37,7 +37,7 @@ def sheet_of(
     """
     content, scene = _content(run, template, control)
     page = load_template(scene.settings.sheet.template)
-    plan = _plan(scene, page, content.promise) if page.plan_page else None
+    plan = _plan(scene, page, content) if page.plan_page else None
     if control == "blank":
         content = replace(content, design_srgb8=None)
     return write_sheet(pdf_path, page, content, plan, copies)
@@ -58,6 +58,8 @@ def _content(run: Run, template: str | None, control: str | None) -> tuple[Print
     own = needs_piece(run.scene)
     scene = own if template is None else own.with_template(template)
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
+    if (imported := run.details.get("imported")) is not None:
+        settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
     piece = scene.piece
     if control is not None:
         piece = with_ids(piece, scene.sheet_id, control)
@@ -66,9 +68,11 @@ def _content(run: Run, template: str | None, control: str | None) -> tuple[Print
     return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings), scene
 
 
-def _plan(scene: PieceScene, template: Template, promise: Promise | None) -> PlanPage | None:
-    """Where the piece goes and, for a promise, how to photograph it; None where neither can be said."""
-    hung, sections = None, []
+def _plan(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
+    """Where the piece goes, whose design it is if not ours and, for a promise, how to photograph it; None where none of
+    it can be said.
+    """
+    hung, sections, imported = None, [], content.settings.get("imported")
     if scene.HAS_OBJECT:
         hung = hang(needs_patch(scene), template)
         edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edges_mm(hung).items())
@@ -83,8 +87,12 @@ def _plan(scene: PieceScene, template: Template, promise: Promise | None) -> Pla
                 "neighbors and 1 mm of their picture. Letters name rows, numbers columns."
             )
         sections.append(("Where the piece goes", tuple(placed)))
-    if promise is not None:
-        sections += shot_sections(promise, scene.settings)
+    if imported is not None and content.kind == "design":
+        file = imported["file"] if len(imported["file"]) <= 60 else f"{imported['file'][:57]}..."  # breaks no line
+        origin = f"Imported from {file} (SHA-256 {imported['sha256'][:16]}...); it was not optimized here."
+        sections.append(("Whose design it is", (origin,)))
+    if content.promise is not None:
+        sections += shot_sections(content.promise, scene.settings)
     return PlanPage(hung, tuple(sections)) if sections else None
 
 

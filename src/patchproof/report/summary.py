@@ -29,6 +29,17 @@ def promise_lines(promise: Any, background: str = "") -> list[str]:
     return lines + _control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()})
 
 
+def imported_lines(imported: Mapping[str, Any]) -> list[str]:
+    """What became of a picture that was made elsewhere."""
+    width, height = imported["picture_px"]
+    return [
+        f"{imported['file']}: {width} × {height} pixels, printed at {imported['dpi']:.0f} dpi; {imported['printer']} "
+        f"misses its colors by {imported['delta_e00']:.1f} ΔE00 in the mean, {imported['out_of_gamut']:.0%} of them "
+        "visibly",
+        *(f"  {note}" for note in imported["notes"]),
+    ]
+
+
 def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
     """Each network's rate and controls."""
     lines = []

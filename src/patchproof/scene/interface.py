@@ -109,9 +109,18 @@ class Scene(ABC):
         """The scene for a page of another template: its sheet id and, where there is one, its piece anew."""
         if name == self.settings.sheet.template:
             return self
-        settings = self.settings.changed(sheet={"template": name})
-        identity = sheet_id(identifying(settings) | dict(self.known), self.seed)
-        return replace(self, settings=settings, sheet_id=identity)._laid_out()
+        return self._identified(self.settings.changed(sheet={"template": name}), self.known)
+
+    def of_design(self, sha256: str) -> Self:
+        """The scene of a design that is there before its run: its sheet id, and so its markers, are the design's own,
+        by which photographs of several designs on one scene are told apart.
+        """
+        return self._identified(self.settings, {**self.known, "design": sha256})
+
+    def _identified(self, settings: SceneSettings, known: Mapping[str, str]) -> Self:
+        """The scene with the sheet id of these settings and of what else is known."""
+        identity = sheet_id(identifying(settings) | dict(known), self.seed)
+        return replace(self, settings=settings, known=known, sheet_id=identity)._laid_out()
 
     def _laid_out(self) -> Self:
         """The scene with its piece laid out for its page and sheet id."""

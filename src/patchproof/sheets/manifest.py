@@ -227,6 +227,11 @@ class _SheetUsed(_Loose):
     template: str = ""
 
 
+class _ImportedUsed(_Loose):
+    file: str
+    sha256: str
+
+
 class _Used(_Loose):
     """What is read of a manifest's settings when its sheet is judged; of them versions may differ in all else."""
 
@@ -234,6 +239,7 @@ class _Used(_Loose):
     camera: _CameraUsed = _CameraUsed()
     target: _TargetUsed = _TargetUsed()
     sheet: _SheetUsed = _SheetUsed()
+    imported: _ImportedUsed | None = None  # of a design that was made elsewhere
 
 
 class Manifest(Strict):
