@@ -49,7 +49,7 @@ MAY_IMPORT = {
     "evidence": GROUND | {"sheets", "photo", "classifier", "channel"},
     "report": GROUND,
     "printing": WORLD | {"optimizer", "evidence"},
-    "reprints": WORLD | {"optimizer", "evidence", "printing"},
+    "reprints": WORLD | {"optimizer", "evidence", "report", "printing"},
     "journey": COMMANDS,
     "begin": COMMANDS,
     "capture": GROUND | {"sheets", "photo", "evidence", "optimizer", "printing", "reprints", "report", "journey"},

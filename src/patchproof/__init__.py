@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from patchproof.classifier.network import Classifier as Classifier
     from patchproof.evidence.results import Report as Report
     from patchproof.goal import Goal as Goal
+    from patchproof.journey.compare import compare_runs as compare
     from patchproof.journey.verify import verify_photos as verify
     from patchproof.optimizer.evaluate import evaluate_run as evaluate
+    from patchproof.optimizer.given import import_patch as import_patch
     from patchproof.optimizer.places import Place as Place
     from patchproof.optimizer.places import choose_place as choose_place
     from patchproof.optimizer.run import Run as Run
@@ -61,8 +63,10 @@ _HOME = {
     "Stage": "render.stage:Stage",
     "choose_place": "optimizer.places:choose_place",
     "classifier_of": "classifier.custom:classifier_of",
+    "compare": "journey.compare:compare_runs",
     "detector_of": "classifier.custom:detector_of",
     "evaluate": "optimizer.evaluate:evaluate_run",
+    "import_patch": "optimizer.given:import_patch",
     "load_classifier": "classifier.load:load_classifier",
     "load_manifest": "sheets.manifest:load_manifest",
     "load_printer": "channel.printer:load_printer",
@@ -94,8 +98,10 @@ __all__ = [
     "Stage",
     "choose_place",
     "classifier_of",
+    "compare",
     "detector_of",
     "evaluate",
+    "import_patch",
     "load_classifier",
     "load_manifest",
     "load_printer",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -40,7 +40,7 @@ def import_picture(
     from patchproof.settings import behind
 
     with progress() as bar:
-        options = {
+        options: dict[str, Any] = {
             "seed": seed,
             "device": device,
             "overwrite": overwrite,
@@ -76,7 +76,7 @@ def evaluate(
     if (out is None) != (len(runs) == 1):
         raise typer.BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
     with progress() as bar:
-        options = {
+        options: dict[str, Any] = {
             "models": names_of(models),
             "n": n,
             "seed": seed,

@@ -24,7 +24,7 @@ from patchproof.optimizer.responses import Answers
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import new_folder
 from patchproof.report.results import Results, write_results
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Drawing, Table, Value
 from patchproof.scene.scene import Scene, needs_piece
 from patchproof.strict import Refused, listed
 from patchproof.workers import open_workers
@@ -133,7 +133,7 @@ def _tables(
     networks: Sequence[str],
     order: Sequence[str],
     all_views: Mapping[str, Shown],
-    fresh: Mapping,
+    fresh: Mapping[str, Shown],
 ) -> list[Table]:
     best, *_ = order
     n = all_views[best]["design"].recognized.shape[1]
@@ -155,7 +155,9 @@ def _tables(
     return [quoted, chosen]
 
 
-def _row(runs: Mapping[str, Run], answers: Mapping[str, Shown], name: str, best: str, network: str, i: int) -> tuple:
+def _row(
+    runs: Mapping[str, Run], answers: Mapping[str, Shown], name: str, best: str, network: str, i: int
+) -> tuple[Value, ...]:
     hits = {kind: answer.recognized[i].tolist() for kind, answer in answers[name].items()}
     sign = runs[name].promise.target.goal.sign
     control = max(CONTROLS, key=lambda kind: sign * sum(hits[kind]))
@@ -182,7 +184,8 @@ def _drawing(runs: Mapping[str, Run], answers: Mapping[str, Shown]) -> Drawing:
             for height, (kind, estimate) in enumerate(reversed(shown.items())):
                 _bar(axes, height, estimate, "#2457c5" if kind == "design" else "#b0713c")
             axes.set_yticks(range(len(shown)), list(shown)[::-1], fontsize=6)
-            axes.set(xlim=(0, 1), title=name)
+            axes.set(xlim=(-0.01, 1.01), ylim=(-0.7, len(shown) - 0.3))
+            axes.set_title(name, fontsize=9, loc="left")
         grid[-1][1].set_xlabel("recognized by the first network")
 
     about = "Bars are 95 % intervals of the rate under the conditions that all designs share."

@@ -1,9 +1,9 @@
 """Verify: photographs and a manifest in, a report out.
 
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
-report.html, pictures and photos.jsonl, one line per finished photograph, from which `resume` goes on. This joins what
-must not know each other: the judge, its networks and the page. The promise's primary network always judges, whatever
-others are named.
+report.html, pictures, coco.json with the piece's place in photographs, and photos.jsonl, one line per finished
+photograph, from which `resume` goes on. This joins what must not know each other: the judge, its networks and the page.
+The promise's primary network always judges, whatever others are named.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from patchproof.channel.lens import load_camera
+import numpy as np
+
+from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.detector import at_score
 from patchproof.classifier.load import load_classifier
@@ -22,9 +24,11 @@ from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
+from patchproof.geometry import apply_homography, rect_corners
 from patchproof.input import is_file
 from patchproof.optimizer.run import Run, load_run
-from patchproof.output import check_folder
+from patchproof.output import check_folder, write_whole
+from patchproof.report.coco import PATCH, Labeled, coco_json
 from patchproof.report.images import save_pictures, stem_of
 from patchproof.report.results import versions_of
 from patchproof.report.write import write_report
@@ -33,7 +37,7 @@ from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.strict import Refused
 
 _JOURNAL = "photos.jsonl"
-OWN = ("report.json", "report.csv", "report.html", "pictures", _JOURNAL)
+OWN = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _JOURNAL)
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 
 
@@ -98,7 +102,25 @@ def verify_photos(
     _drop_pictures(out / "pictures", {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]})
     ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
+    write_whole(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
+
+
+def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
+    """The photographs, and where the piece lies in those that show it flat and straight, as COCO JSON; where the object
+    ends in them nobody knows.
+    """
+    corners, photos = rect_corners(manifest.cut_mm), []
+    bends = camera is not None and camera.bends  # then places are those in the picture made straight
+    for entry in report.photos:
+        if entry.photo_px is None:
+            continue
+        px_from_mm = None if entry.geometry is None else entry.geometry.homography_px_from_mm
+        known = px_from_mm is not None and not bends and entry.status != "rejected"
+        outlines = {PATCH: apply_homography(np.array(px_from_mm), corners)} if known else {}
+        photos.append(Labeled(entry.file, entry.photo_px, outlines))
+    label = "object" if manifest.promise is None else manifest.promise.target.label
+    return coco_json(photos, label, f"photographs of sheet {manifest.sheet_id}")
 
 
 def options_of(

@@ -60,7 +60,7 @@ def evaluate_run(
         conditions = run.scene.draw("evaluate", n, seed)
         answers, shown = answers_of(folder, conditions, workers, networks, device, lambda done: on_view(done, n))
     forget()
-    result = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
+    result: dict[str, Any] = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
     for i, claim in enumerate(model_claims(problem, answers["design"])):
         controls = {kind: control.model_dump() for kind, control in control_claims(answers, i).items()}
         result["models"][claim.name] = claim.model_dump(exclude={"name"}) | {"controls": controls}

@@ -18,7 +18,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -111,25 +110,48 @@ def import_patch(
 
 
 def import_folder(
-    folder: str | Path, scene: str | Path | Scene, out: str | Path, resume: bool = False, **options: Any
+    folder: str | Path,
+    scene: str | Path | Scene,
+    out: str | Path,
+    *,
+    seed: int | None = None,
+    device: str = "cpu",
+    resume: bool = False,
+    overwrite: bool = False,
+    promise_views: int | None = None,
+    on_promise: Callable[[int, int], None] = lambda done, total: None,
+    on_scene: Callable[[Scene], None] = lambda scene: None,
 ) -> list[Run]:
-    """A run `out`/NAME of every picture NAME.png (or another kind) in a folder, as `import_patch` makes them with these
-    `options`. All pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
+    """A run `out`/NAME of every picture NAME.png (or another kind) in a folder, as `import_patch` makes it. All
+    pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
     """
-    scene, out = _with_piece(scene, options.get("seed")), Path(out)
-    pictures = {path: out / printable(path.stem) for path in list_photos(folder)}
-    if len(set(pictures.values())) < len(pictures):
+    scene, out, total = _with_piece(scene, seed), Path(out), promised_views(promise_views)
+    on_scene(scene)
+    runs = {path: out / printable(path.stem) for path in list_photos(folder)}
+    if len(set(runs.values())) < len(runs):
         raise Refused("pictures whose names differ in more than their kind", f"others in {folder}", "rename them")
-    finished: dict[Path, Run] = {}
-    for path, each in pictures.items():
+    made: dict[Path, Run] = {}
+    for path, each in runs.items():
         _, sha256, pixels = _read(path)
         fit(pixels, scene)
         run = load_run(each) if resume and is_file(each / "run.json") else None
         if run is not None and run.details.get("imported", {}).get("sha256") == sha256:
-            finished[path] = run
+            made[path] = run
         else:
-            check_folder(each, OWN, options.get("overwrite", False))
-    return [finished.get(path) or import_patch(path, scene, each, **options) for path, each in pictures.items()]
+            check_folder(each, OWN, overwrite)
+    for path, each in runs.items():
+        if path not in made:
+            before = len(made) * total
+            made[path] = import_patch(
+                path,
+                scene,
+                each,
+                device=device,
+                overwrite=overwrite,
+                promise_views=promise_views,
+                on_promise=lambda done, _, before=before: on_promise(before + done, len(runs) * total),
+            )
+    return [made[path] for path in runs]
 
 
 def fit(pixels: np.ndarray, scene: PieceScene) -> np.ndarray:
@@ -212,12 +234,8 @@ def _marker_notes(design: np.ndarray, piece: Piece) -> Iterator[str]:
     finer = math.ceil(_MODULE_PX / (piece.module_mm * design.shape[1] / piece.size_mm[0]))
     large = design.repeat(finer, 0).repeat(finer, 1)
     markers, reserved = marker_image(piece, large.shape[1::-1])
-    flat = cv2.copyMakeBorder(
-        np.where(reserved[..., None], codes_of(markers), large),
-        *[_MODULE_PX] * 4,
-        cv2.BORDER_CONSTANT,
-        value=(255,) * 3,
-    )
+    flat = np.where(reserved[..., None], codes_of(markers), large)
+    flat = np.pad(flat, ((_MODULE_PX,) * 2, (_MODULE_PX,) * 2, (0, 0)), constant_values=255)
     expected, do = "a design beside which the piece's markers can be read", "take squares like those of markers out"
     try:
         seen = find_markers(flat, ids)

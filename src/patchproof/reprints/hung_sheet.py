@@ -29,8 +29,10 @@ from patchproof.printing.sheet import sheet_of
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
+from patchproof.report.coco import PATCH
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions, fields_of
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import PieceScene, Scene, needs_piece
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
@@ -43,6 +45,7 @@ from patchproof.strict import Refused
 # patterns of strong colors came out 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
 OVERSAMPLING = 2.5
 DPI_RANGE = (100.0, 400.0)
+_SIDE_POINTS = 8
 _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal length refers
 
 
@@ -118,12 +121,31 @@ class HungSheet:
             "conditions": drawn,
         }
 
+    def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
+        """Pixels N×2 round the object, where it has a mesh, and round the piece, where it faces the camera of one
+        view.
+        """
+        scene, outlines = self.scene, {}
+        if isinstance(scene, PatchScene):
+            outlines[str(scene.settings.target.label)] = scene.object_px(conditions)
+        if self.piece is not None and scene.facing(conditions)[0]:
+            outlines[PATCH] = scene.piece_px(conditions, _round_about(scene.piece.size_mm))
+        return outlines
+
     def px_from_page(self, conditions: Conditions) -> np.ndarray:
         """3×3 from page millimeters to pixels of one view; of bent paper its tangent plane's, without the lens."""
         x, y, *_ = self.manifest.cut_mm
         piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
         photo_px = self.scene.settings.camera.photo_px
         return self.scene.piece_homographies(conditions, photo_px)[0] @ piece_from_page
+
+
+def _round_about(size_mm: tuple[float, float]) -> np.ndarray:
+    """Points N×2 along the sides of a piece, so many that bent ones are followed."""
+    corners = geometry.rect_corners((0, 0, *size_mm))
+    steps = np.arange(_SIDE_POINTS)[:, None] / _SIDE_POINTS
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    return np.concatenate([start + (end - start) * steps for start, end in sides])
 
 
 def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:

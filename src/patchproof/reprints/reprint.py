@@ -1,7 +1,8 @@
 """Simulated photographs of a printed sheet on its object, or scans of the uncut page.
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object, and
-`truth.json` with each one's homography, marker corners and conditions (see `hung_sheet`). With `scan` the uncut page is
+`truth.json` with each one's homography, marker corners and conditions (see `hung_sheet`), and `coco.json` with boxes of
+object and piece. With `scan` the uncut page is
 scanned flat instead. Conditions come from the reprint stream, which nothing else has seen: one print, photographed in
 one session or in several, each with a place, light and camera of its own and in a folder of its own.
 """
@@ -26,6 +27,7 @@ from patchproof.geometry import MM_PER_INCH
 from patchproof.optimizer.run import Run, load_run
 from patchproof.output import image_bytes, make_folder, new_folder
 from patchproof.printing.sheet import sheet_of
+from patchproof.report.coco import Labeled, coco_json
 from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, hang, sheet_scene
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import Manifest
@@ -34,7 +36,7 @@ from patchproof.strict import Refused
 from patchproof.workers import open_workers, result_of
 
 SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
-OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json")
+OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
 
 
 def reprint(
@@ -76,6 +78,10 @@ def reprint(
                 (folder / names[i]).write_bytes(result_of(photo))
                 done += 1
                 on_photo(done, n)
+            label, size_px = str(sheet.scene.settings.target.label), sheet.scene.photo_px
+            photos = [Labeled(name, size_px, sheet.outlines(v)) for name, v in zip(names, views, strict=True)]
+            text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
+            (folder / "coco.json").write_text(text, encoding="utf-8")
             return _write_truth(folder, dict(zip(names, map(sheet.truth, views), strict=True)))
 
 

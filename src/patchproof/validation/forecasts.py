@@ -21,7 +21,7 @@ from patchproof.report.tables import Drawing, Table
 from patchproof.study.grid import grouped, networks_at, of_values
 from patchproof.study.record import hits_of
 from patchproof.study.study import Cell, Result, Study
-from patchproof.validation.promises import (
+from patchproof.validation.photographed import (
     SessionsSettings,
     cells,
     printed_run,

@@ -14,9 +14,8 @@ Photographs are path-traced (`path_traced`), since those of our own renderer wou
 from __future__ import annotations
 
 import tempfile
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,21 +29,18 @@ from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 from patchproof.sessions import TAIL, Spread, in_sessions, spread_of
-from patchproof.study.grid import (
-    Count,
-    GridSettings,
-    Names,
-    cell_of,
-    grouped,
-    networks_at,
-    of_values,
-    pairs,
-    scene_of,
-    short_name,
-    with_tables,
-)
+from patchproof.strict import Refused, nearest
+from patchproof.study.grid import Names, grouped, networks_at, of_values, short_name
 from patchproof.study.record import bits, hits_of
 from patchproof.study.study import Cell, Result, Study
+from patchproof.validation.photographed import (
+    SessionsSettings,
+    cells,
+    printed_run,
+    recorded_promise,
+    recorded_spread,
+    take_photos,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,34 +51,27 @@ if TYPE_CHECKING:
 _LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
 
 
-class SessionsSettings(GridSettings):
-    """A run for each scene, network, printer and seed, and sessions of photographs of each."""
-
-    printers: Names = ("coated",)  # that print the designs, and are known while optimizing
-    sessions: Count = 4  # of each print
-    photos: Annotated[int, Field(ge=5, le=1000)] = 20  # of each session
-    path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
-
-
 class PromisesSettings(SessionsSettings):
     """As above, and views by our own renderer without paper, in places that the promise does not know."""
 
     rendered: Annotated[int, Field(ge=0, le=1000)] = 0  # sessions of as many views as photographs
     elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views, each in a place of its own
+    # By scene's name pictures made elsewhere, imported in place of optimized designs; scenes without any have no runs.
+    pictures: dict[str, Names] = Field(default_factory=dict)
 
 
-def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
-    """One per combination, with the whole scene in it."""
+def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
+    """One per combination and picture."""
+    optimized = cells(settings, base)
+    if not settings.pictures:
+        return optimized
+    names = {cell.values["name"] for cell in optimized}
+    for name in settings.pictures.keys() - names:
+        raise Refused("pictures of the config's scenes", f'"{name}"', nearest(name, names))
     return [
-        cell_of(
-            with_tables(values, {"target": {"models": values["networks"]}, "printer": {"profile": printer}}),
-            seed,
-            values["network"],
-            short_name(printer),
-        )
-        for values in pairs(settings, base)
-        for printer in settings.printers
-        for seed in settings.seeds
+        Cell(f"{short_name(f'/{picture}')}.{cell.name}", {**cell.values, "picture": picture})
+        for cell in optimized
+        for picture in settings.pictures.get(cell.values["name"], ())
     ]
 
 
@@ -113,47 +102,6 @@ def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
     if settings.elsewhere:
         kept["elsewhere"] = bits(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
     return kept
-
-
-def recorded_promise(made: Run) -> dict[str, Any]:
-    """What answers keep of a run's promise."""
-    promise = made.promise
-    hits = bits([condition.recognized for condition in promise.conditions])
-    return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
-
-
-def recorded_spread(result: Result) -> Spread:
-    """What that promise says of photographs to come."""
-    answers = result.answers
-    return spread_of(*in_sessions(hits_of(answers["promised"]), answers["per_session"], answers["places"]))
-
-
-def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
-    """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
-    from patchproof.optimizer.run import optimize_scene
-    from patchproof.printing.sheet import sheet_of
-
-    scene = scene_of(base, cell.values)
-    scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
-    # one control is enough for a page, and all of them would take most of a promise's time
-    made = optimize_scene(scene, folder / "run", controls=("bare",))
-    sheet_of(made, folder / "sheet.pdf")
-    return made
-
-
-def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
-    """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
-    conditions.
-    """
-    from patchproof.reprints.hung_sheet import Hanging
-    from patchproof.reprints.reprint import reprint
-
-    out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
-    how = Hanging(path_traced=settings.path_traced, control=control)
-    # cells that shared a seed's draws would be one case
-    seed = zlib.crc32(cell.name.encode())
-    reprint(folder / "sheet.pdf", made, n, out, how, sessions=settings.sessions, seed=seed)
-    return out
 
 
 def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
@@ -245,13 +193,14 @@ def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Tab
 
 
 def _each(results: Sequence[Result]) -> Table:
-    head = ("scene", "network", "printer", "seed", "session", "promised", "correlation")
+    head = ("scene", "network", "printer", "seed", "design", "session", "promised", "correlation")
     head = (*head, "judged", "recognized", "low", "high", "held", "verdict")
     rows = []
     for result in results:
         values, printer = result.cell.values, short_name(result.cell.values["scene"]["printer"]["profile"])
         for number, session in enumerate(counted(result), 1):
-            start = (values["name"], values["network"], printer, values["seed"], number)
+            design = short_name(f"/{values['picture']}") if "picture" in values else "own"
+            start = (values["name"], values["network"], printer, values["seed"], design, number)
             what = (session.rate, session.spread.correlation[0], session.judged, session.recognized)
             rows.append((*start, *what, *session.interval(), session.held(), result.answers["verdict"]))
     return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
@@ -292,4 +241,4 @@ def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Draw
     return (Drawing("calibration", "Promised and seen", draw, (6.0, 5.0), about),)
 
 
-STUDY = Study("promises", PromisesSettings, cells, run, tables, figures)
+STUDY = Study("promises", PromisesSettings, promise_cells, run, tables, figures)
