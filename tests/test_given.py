@@ -47,7 +47,7 @@ def journey(tmp_path_factory):
     """A folder with picture.png, scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
     folder = tmp_path_factory.mktemp("given")
     Image.fromarray(noise(230, 230)).save(folder / "picture.png")  # 2 px per mm: as fine as designs are printed
-    toml(folder / "scene.toml", camera__photo_px=[800, 600], background__color=[0.5, 0.5, 0.5])
+    toml(folder / "scene.toml", camera__photo_px=[1600, 1200], background__color=[0.5, 0.5, 0.5])
     run, pdf, photos = folder / "run", folder / "sheet.pdf", folder / "photos"
     assert command("import", folder / "picture.png", folder / "scene.toml", "--out", run, "--promise", 8) == 0
     assert command("sheet", run, "--out", pdf) == 0
@@ -59,7 +59,7 @@ def journey(tmp_path_factory):
 
 def test_pixels_come_through_unchanged_where_no_marker_lies(journey):
     run, picture = load_run(journey / "run"), np.asarray(Image.open(journey / "picture.png"))
-    assert (run.design[free(run)] == picture[free(run)]).all() and 0.5 < free(run).mean() < 0.9
+    assert (run.design[free(run)] == picture[free(run)]).all() and 0.5 < free(run).mean() < 1
     assert (run.design[~free(run)] == 255).all()
 
 
@@ -99,6 +99,7 @@ def test_designs_on_one_scene_have_markers_of_their_own(tmp_path):
     assert not a & b and runs[0].scene.sheet_id != scene.sheet_id
 
 
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools under NumPy 2
 def test_boxes_of_reprints_and_reports_are_read_by_the_formats_own_reader(journey, capsys):
     truth = json.loads((journey / "photos" / "truth.json").read_text())
     cut = rect_corners(load_manifest(journey / "sheet.json").cut_mm)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from patchproof.photo import read
 from patchproof.photo.cannot import CannotJudge
@@ -97,6 +97,21 @@ def test_every_mode_becomes_rgb(tmp_path, mode):
     srgb = read_photo(path).srgb
     assert srgb.shape == (30, 40, 3) and srgb.dtype == np.uint8
     assert srgb.astype(float) == pytest.approx(255 if mode == "1" else 128, abs=2)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_an_embedded_profile_is_converted_and_alpha_kept(tmp_path, mode):
+    """sRGB's own profile with red and green exchanged, under another name."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    profile = profile.replace("sRGB".encode("utf-16-be"), "gRBG".encode("utf-16-be"))
+    for old, new in ((b"rXYZ", b"????"), (b"gXYZ", b"rXYZ"), (b"????", b"gXYZ")):
+        profile = profile.replace(old, new)
+    red = np.tile(np.array([255, 0, 0, 255], np.uint8), (8, 8, 1))
+    red[:4, :, 3] = 0 if mode == "RGBA" else 255
+    Image.fromarray(red).convert(mode).save(tmp_path / "a.png", icc_profile=profile)
+    srgb = read_photo(tmp_path / "a.png").srgb.astype(int)
+    assert np.abs(srgb[4:] - (0, 255, 0)).max() <= 2
+    assert np.abs(srgb[:4] - ((255, 255, 255) if mode == "RGBA" else (0, 255, 0))).max() <= 2
 
 
 def test_see_through_pixels_lie_on_white(tmp_path):

@@ -4,10 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.promise import PER_SESSION
 from patchproof.sessions import spread_of
+from patchproof.strict import Refused
 from patchproof.study.study import Cell, Result, run_study
 from patchproof.validation import promises
 from test_optimize import SCENE
@@ -79,3 +81,15 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     judged = [judged for _, judged in one.answers["sessions"]]
     assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])
     assert (tmp_path / "out" / "promises_calibration.png").is_file()
+
+
+def test_a_picture_made_elsewhere_takes_the_place_of_a_design(tmp_path, monkeypatch):
+    Image.new("RGB", (48, 48), (220, 30, 30)).save(tmp_path / "red.png")
+    finished = small_study("promises", tmp_path, monkeypatch, 'pictures = {scene = ["red.png"]}\n')
+    (only,) = finished.results
+    assert only.cell.values["picture"] == "red.png" and len(only.answers["promised"]) == 16
+    (row, _) = next(table for table in finished.tables if table.name == "promises").rows
+    assert row[4] == "red"
+    (tmp_path / "b").mkdir()
+    with pytest.raises(Refused, match='got "other": use one of: scene'):
+        small_study("promises", tmp_path / "b", monkeypatch, 'pictures = {other = ["red.png"]}\n')

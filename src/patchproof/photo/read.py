@@ -175,7 +175,7 @@ def _into_srgb(image) -> Callable | None:
     from PIL import ImageCms
 
     profile = image.info.get("icc_profile")
-    if not profile or image.mode not in {"RGB", "RGBA", "CMYK", "L"}:
+    if not profile or image.mode not in {"RGB", "RGBA", "CMYK"}:
         return None
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
