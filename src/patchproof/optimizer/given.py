@@ -27,7 +27,7 @@ from patchproof.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
 from patchproof.geometry import MM_PER_INCH
 from patchproof.input import is_file
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS
 from patchproof.optimizer.run import OWN, Run, finish_run, load_run, promised_views
 from patchproof.output import check_folder, new_folder
@@ -91,19 +91,7 @@ def import_patch(
     problem = set_problem(scene, device, models)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
-    missed = problem.printer.gamut_distance(from_pixels(design)[None])[0, 0].numpy()
-    missed = missed[~marker_image(scene.piece, design.shape[1::-1])[1]]
-    record = Imported(
-        file=file,
-        sha256=sha256,
-        picture_px=pixels.shape[1::-1],
-        design_px=fitted.shape[1::-1],
-        dpi=round(MM_PER_INCH * _px_per_mm(fitted, scene), 1),
-        printer=problem.printer.name,
-        out_of_gamut=round(float((missed > OUT_OF_GAMUT).mean()), 4),
-        delta_e00=round(float(missed.mean()), 2),
-        notes=(*_resolution_notes(fitted, pixels, scene, problem.network_px), *_marker_notes(design, scene.piece)),
-    )
+    record = _looked_at(problem, file, sha256, pixels, fitted, design)
     with new_folder(out, OWN, overwrite) as folder:
         run = finish_run(problem, design, folder, controls, views, on_promise, asdict(record))
     return replace(run, folder=out)
@@ -207,6 +195,26 @@ def _read(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray]:
         raise Refused("a picture that can be read", printable(path.name), cannot.advice) from cannot
     with open(path, "rb") as file:
         return printable(path.name), hashlib.file_digest(file, "sha256").hexdigest(), pixels
+
+
+def _looked_at(
+    problem: Problem, file: str, sha256: str, picture: np.ndarray, fitted: np.ndarray, design: np.ndarray
+) -> Imported:
+    """What is to be said of a picture: as it came, as it fits, and as it is printed."""
+    scene = needs_piece(problem.scene)
+    free = ~marker_image(scene.piece, design.shape[1::-1])[1]
+    missed = problem.printer.gamut_distance(from_pixels(design)[None])[0, 0].numpy()[free]
+    return Imported(
+        file=file,
+        sha256=sha256,
+        picture_px=picture.shape[1::-1],
+        design_px=fitted.shape[1::-1],
+        dpi=round(MM_PER_INCH * _px_per_mm(fitted, scene), 1),
+        printer=problem.printer.name,
+        out_of_gamut=round(float((missed > OUT_OF_GAMUT).mean()), 4),
+        delta_e00=round(float(missed.mean()), 2),
+        notes=(*_resolution_notes(fitted, picture, scene, problem.network_px), *_marker_notes(design, scene.piece)),
+    )
 
 
 def _px_per_mm(design: np.ndarray, scene: PieceScene) -> float:
