@@ -114,6 +114,14 @@ def test_boxes_of_reprints_and_reports_are_read_by_the_formats_own_reader(journe
             assert coco.annToMask(found).sum() == pytest.approx(found["area"], rel=0.02)
             others = coco.loadAnns(coco.getAnnIds(imgIds=[image["id"]], catIds=coco.getCatIds(catNms=["red"])))
             assert len(others) == (folder == "photos")  # only the renderer knows where the object ends
+            for whole in others:  # but for 3 % of overhang the piece lies on it
+                overlap = [min(a + c, b + d) - max(a, b) for a, c, b, d in _sides(found["bbox"], whole["bbox"])]
+                assert np.prod(overlap) > 0.9 * np.prod(found["bbox"][2:]) and whole["area"] > 2 * found["area"]
+
+
+def _sides(a: list[float], b: list[float]) -> list[tuple[float, float, float, float]]:
+    """(start, length) of two boxes along x and y."""
+    return [(a[i], a[i + 2], b[i], b[i + 2]) for i in range(2)]
 
 
 @pytest.mark.parametrize(("width", "height"), [(102, 100), (32, 32), (1024, 1024)])

@@ -2,9 +2,9 @@
 
 In: per photograph its size and the outlines of things in it. Out: the text of a `coco.json`: images by file name,
 relative to the folder of photographs, a category for each kind of thing, boxes [x, y, width, height] in pixels of the
-upright picture (corners at 0), cut off at its borders. Of the patch the outline is exact and becomes a polygon; of the
-object it is the convex hull of its mesh, so that only its box is said. What stands in front of what is left out on
-purpose: boxes are whole ones. Source: Lin et al., Microsoft COCO, ECCV 2014, and its data format.
+upright picture (corners at 0), cut off at its borders. The patch's outline becomes a polygon, too; of the object only
+the box is known. What stands in front of what is left out on purpose: boxes are whole ones.
+Source: Lin et al., Microsoft COCO, ECCV 2014, and its data format.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _LEAST_PX = 1.0  # of a box's sides: less of a thing is not seen
 
 @dataclass(frozen=True, eq=False)
 class Labeled:
-    """A photograph: its file, (width, height), and outlines N×2 in its pixels by category; those with NaN are not known
-    and are left out.
+    """A photograph: its file, (width, height), and outlines N×2 in its pixels by category; those with NaN (a part is
+    behind the camera) are left out.
     """
 
     file: str
@@ -54,8 +54,8 @@ def coco_json(photos: Sequence[Labeled], label: str, about: str) -> str:
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def _annotation(outline: np.ndarray, size_px: tuple[int, int], exact: bool) -> dict[str, Any] | None:
-    """Box, area and, of an exact outline, the polygon of what lies in the picture; None where that is nothing."""
+def _annotation(outline: np.ndarray, size_px: tuple[int, int], is_outline: bool) -> dict[str, Any] | None:
+    """Box, area and, of more than a box, the polygon of what lies in the picture; None where that is nothing."""
     if not np.isfinite(outline).all():
         return None
     inside = cut_off(outline, size_px)
@@ -63,7 +63,7 @@ def _annotation(outline: np.ndarray, size_px: tuple[int, int], exact: bool) -> d
         return None
     (x, y), (width, height) = inside.min(0).tolist(), np.ptp(inside, axis=0).tolist()
     box = [round(value, 2) for value in (x, y, width, height)]
-    if not exact:
+    if not is_outline:
         return {"bbox": box, "area": round(width * height, 2), "iscrowd": 0}
     following = np.roll(inside, -1, axis=0)
     area = abs(float((inside[:, 0] * following[:, 1] - inside[:, 1] * following[:, 0]).sum())) / 2

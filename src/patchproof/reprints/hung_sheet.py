@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from patchproof import geometry
+from patchproof.channel.boxes import box_of
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.color import photo_codes_of
 from patchproof.evidence.surface import surface_of
@@ -122,12 +123,15 @@ class HungSheet:
         }
 
     def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
-        """Pixels N×2 round the object, where it has a mesh, and round the piece, where it faces the camera of one
-        view.
+        """Corners of the object's box, where it has a mesh, and pixels N×2 round the piece, where it faces the camera
+        of one view.
         """
         scene, outlines = self.scene, {}
         if isinstance(scene, PatchScene):
-            outlines[str(scene.settings.target.label)] = scene.object_px(conditions)
+            pose, size_px = scene.camera_from_world(conditions)[0], scene.photo_px
+            left, top, *end = box_of(scene.outermost_mm, pose, scene.matrix_px(size_px), size_px, scene.camera)
+            box = geometry.rect_corners((left, top, end[0] - left, end[1] - top))
+            outlines[str(scene.settings.target.label)] = box
         if self.piece is not None and scene.facing(conditions)[0]:
             outlines[PATCH] = scene.piece_px(conditions, _round_about(scene.piece.size_mm))
         return outlines

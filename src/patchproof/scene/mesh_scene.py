@@ -11,7 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import cv2
 import numpy as np
 
 from patchproof import geometry
@@ -128,17 +127,6 @@ class MeshScene(Scene):
         """N cosines between the normal and directions, 0 from behind."""
         toward = geometry.orbit(azimuth_deg, elevation_deg, self.frame.normal, self.frame.up)
         return np.clip(toward @ self.normal, 0, None)
-
-    def object_px(self, conditions: Conditions) -> np.ndarray:
-        """The object's convex hull N×2 in the whole photograph of the first condition, through a bent picture, too; NaN
-        where a part of it lies behind the camera.
-        """
-        pose = self.camera_from_world(conditions)[0]
-        points = geometry.project(self.matrix_px(self.photo_px), pose, self.mesh.vertices)
-        if not np.isfinite(points).all():
-            return np.full((1, 2), np.nan)
-        points = points if self.camera is None else lens.distort_points(points, self.camera, self.photo_px)
-        return cv2.convexHull(points.astype(np.float32))[:, 0]
 
     def closest_px_per_mm(self, size_px: tuple[int, int]) -> float:
         """Pixels per millimeter of the piece in the closest view."""
