@@ -249,3 +249,29 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped):
         logits = network.logits(pixels.permute(2, 0, 1)[None] / 255, box[None])
         assert answer.target_confidence == pytest.approx(network.confidence(logits, (4,)).item(), abs=0.02)
         assert answer.recognized == (answer.target_confidence >= 0.4)
+
+
+class Bright(torch.nn.Module):
+    """One candidate, whose logits are the picture's mean red and blue."""
+
+    def forward(self, photos):
+        box = photos.new_tensor([2.0, 2, 6, 6]).expand(photos.shape[0], 4)
+        return torch.cat([box, photos.mean((2, 3))[:, ::2]], 1)[:, None]
+
+
+@pytest.mark.parametrize(("kind", "refused"), [("detector", None), ("segmenter", 'kind, "classifier" or "detector"')])
+def test_an_exported_detector_says_so_in_its_json(tmp_path, kind, refused):
+    program = torch.export.export(
+        Bright(), (torch.rand(2, 3, 8, 8),), dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)
+    )
+    torch.export.save(program, tmp_path / "net.pt2")
+    card = {"input_px": 8, "labels": ["red", "blue"], "kind": kind}
+    (tmp_path / "net.json").write_text(json.dumps(card))
+    if refused:
+        with pytest.raises(Refused, match=refused):
+            load_classifier("file:net.pt2", tmp_path)
+        return
+    made, photo = load_classifier("file:net.pt2", tmp_path), torch.rand(1, 3, 8, 8)
+    assert isinstance(made, Detector)
+    torch.testing.assert_close(made.logits(photo, np.array([FOUR])), photo.mean((2, 3))[:, ::2])
+    assert made.logits(photo, np.array([[0, 0, 0.2, 0.2]])).tolist() == [[NOTHING, NOTHING]]

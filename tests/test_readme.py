@@ -135,6 +135,22 @@ def test_figures_of_the_promises_are_the_stored_ones():
     assert f"{count} sessions" in words(README) and f": {share}." in words(README)
 
 
+def test_figures_of_the_detector_are_the_stored_ones():
+    tables = stored("detector/promises.json")["tables"]
+    held = tables["held"]["rows"][-1][1]
+    count = f"{round(held['value'] * held['n'])} of {held['n']} sessions lay in their intervals"
+    assert f"{count} ({held['value']:.0%} [{100 * held['low']:.0f}, {100 * held['high']:.0f}])".replace(
+        "%", " %"
+    ) in words(NOTEBOOK)
+    shown: dict[str, int] = {}
+    for scene, *_, recognized, _, _, _, _ in tables["promises"]["rows"]:
+        shown[scene] = shown.get(scene, 0) + recognized
+    truck, mailbox, carton, chair = (shown[name] for name in ("truck", "mailbox", "carton", "chair"))
+    assert f"Photographed were {truck}, {carton}, {chair} and {mailbox} of 48." in words(NOTEBOOK)
+    card = json.loads((ROOT / "src/patchproof/classifier/builtin_detector.json").read_text(encoding="utf-8"))
+    assert f"AP50 {card['held_out_ap50']:.3f}" in words(NOTEBOOK)
+
+
 def rows_of(name: str) -> list[dict[str, str]]:
     with (NOTEBOOK.parent / name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))

@@ -1,7 +1,8 @@
 """`file:NAME.pt2`, `file:NAME.onnx`: a network as a `torch.export` program or in ONNX, with NAME.json beside it.
 
 The JSON says `input_px`, the side of the square that the program takes, and `labels`: a list, or the name of a JSON
-file beside it that holds one. The program takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits.
+file beside it that holds one. The program takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits;
+where the JSON says `"kind": "detector"`, candidates N×A×(4+K), boxes in pixels before the logits (detector.py).
 A program exported for one batch size, or for a range of them, is called in such batches.
 Nothing of the file is executed: archive.py reads tensors and JSON, description.py the graph from it, and graph.py
 computes its operators, which are on the list in operators.py; for ONNX these are protobuf.py, onnx_file.py and
@@ -16,13 +17,14 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from patchproof.classifier.archive import Unwanted, read_archive
 from patchproof.classifier.batches import InBatches
 from patchproof.classifier.description import read_program
+from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.onnx_file import read_onnx
 from patchproof.input import is_file, read_json
@@ -37,10 +39,11 @@ def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
         do = "save it with torch.export.save as NAME.pt2, or with torch.onnx.export, with NAME.json beside it"
         raise Refused("a torch.export program, file:NAME.pt2, or file:NAME.onnx", f"{path}", do)
     stored = network_bytes(path)  # once, so that what is hashed is what is loaded
-    input_px, labels = read_card(path.with_suffix(".json"))
+    card = read_card(path.with_suffix(".json"))
     digest = hashlib.sha256(stored)
     network = _network(stored, path, digest).to(device)
-    return Classifier(f"file:{path}", digest.hexdigest(), input_px, labels, network)
+    make = Detector if card.kind == Detector.KIND else Classifier
+    return make(f"file:{path}", digest.hexdigest(), card.input_px, card.labels, network)
 
 
 def network_bytes(path: Path) -> bytes:
@@ -54,8 +57,16 @@ def network_bytes(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def read_card(path: Path) -> tuple[int, tuple[str, ...]]:
-    """Input size and labels, as the JSON file beside a network says them."""
+class Card(NamedTuple):
+    """What the JSON file beside a network says."""
+
+    input_px: int
+    labels: tuple[str, ...]
+    kind: str
+
+
+def read_card(path: Path) -> Card:
+    """The JSON file beside a network."""
     do = 'write {"input_px": 224, "labels": ["...", ...]} into it, or the name of a JSON list beside it as labels'
     card = read_json(path, "a JSON file", do, do)
     input_px, labels = (card.get("input_px"), card.get("labels")) if isinstance(card, dict) else (None, None)
@@ -66,7 +77,10 @@ def read_card(path: Path) -> tuple[int, tuple[str, ...]]:
         raise Refused("input_px, a whole number of pixels from 8 to 4096", f"{input_px!r} in {path}", do)
     if not isinstance(labels, list) or len(labels) < 2 or not all(isinstance(label, str) for label in labels):
         raise Refused("labels, a list of two or more names", f"other labels in {path}", do)
-    return input_px, tuple(labels)
+    kind = card.get("kind", Classifier.KIND)
+    if kind not in (Classifier.KIND, Detector.KIND):
+        raise Refused(f'kind, "{Classifier.KIND}" or "{Detector.KIND}"', f"{kind!r} in {path}", "write one of these")
+    return Card(input_px, tuple(labels), kind)
 
 
 def _network(stored: bytes, path: Path, digest: Any) -> InBatches:

@@ -31,7 +31,7 @@ from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
-from patchproof.classifier.program import network_bytes, read_card
+from patchproof.classifier.program import Card, network_bytes, read_card
 from patchproof.input import is_file
 from patchproof.strict import Refused
 
@@ -62,7 +62,7 @@ def load_torchvision(name: str) -> Classifier:
         raise Refused("a torchvision classifier or detector", f'"{name}"', do)
     weights = models.get_model_weights(name).DEFAULT
     view = weights.transforms()
-    side_px, labels = (own and own.card) or (int(view.crop_size[0]), weights.meta["categories"])
+    side_px, labels = (own and own.card and own.card[:2]) or (int(view.crop_size[0]), weights.meta["categories"])
     if own is None:
         network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
     else:
@@ -101,7 +101,10 @@ def load_timm(name: str) -> Classifier:
     else:
         network = timm.create_model(name, **({"num_classes": len(own.card[1])} if own.card else {}))
     view = timm.data.resolve_model_data_config(network)
-    side_px, labels = (own and own.card) or (int(view["input_size"][-1]), _timm_labels(timm, network, name))
+    side_px, labels = (own and own.card and own.card[:2]) or (
+        int(view["input_size"][-1]),
+        _timm_labels(timm, network, name),
+    )
     return _with(own, network, view["mean"], view["std"], side_px, labels, f"timm:{name}")
 
 
@@ -126,7 +129,7 @@ class _Own:
     path: Path
     tensors: dict[str, Tensor]
     sha256: str
-    card: tuple[int, tuple[str, ...]] | None  # input size and labels, where they are not the published ones
+    card: Card | None  # input size and labels, where they are not the published ones
 
 
 def _own_weights(name: str) -> tuple[str, _Own | None]:
