@@ -11,6 +11,7 @@ from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.raster import attached_manifest, piece_pixels
 from patchproof.sheets.template import load_template
 from patchproof.strict import Refused, shipped
+from test_sheet_write import words_px
 
 BLANK = shipped("print_templates", "blank_a4.toml")
 FORMER = Path(__file__).parent / "former_sheets"
@@ -39,6 +40,9 @@ def test_all_but_the_markers_stays_white_paper(blank):
     for marker in blank_piece(manifest).markers:
         low, high = (np.array(marker.corners_mm)[[0, 2]] * scale).astype(int) + np.array([[-1], [2]])
         pixels[low[1] : high[1], low[0] : high[0]] = 255
+    words = words_px(blank_piece(manifest), manifest, pixels.shape)
+    assert pixels[words].min() < 100
+    pixels[words] = 255
     # PDFium counts coverage of the dashed line, which lies outside, in 1/256: one code value of it may show
     assert pixels.min() >= 254 and dark > 0.02  # and the markers were there
 

@@ -45,6 +45,28 @@ def test_a4_holds_a_piece_of_its_zone_less_the_cut_line():
     assert largest_piece_mm(load_template("a4")) == pytest.approx((166.6, 179.6))
 
 
+@pytest.mark.parametrize("piece_mm", [(39, 39), (162, 110)])
+def test_a_piece_says_its_top_its_sheet_and_its_name_in_the_scissors_millimeter(piece_mm):
+    template, sizes = load_template("a4"), {}
+    for label, name in (("mug", "DESIGN · MUG"), (None, "DESIGN"), (404, "DESIGN · 404"), ("m" * 99, "DESIGN · MM")):
+        piece = lay_out_piece(piece_mm, marker_size_mm(20.0, piece_mm), ID, "design")
+        settings = {} if label is None else {"target": {"label": label}}
+        page = lay_out_page(template, PrintedPiece(piece, ID, "design", WHITE, settings=settings))
+        x, y, w, h = page.cuts_mm[0]
+        own = [line for line in page.texts if x < line.at_mm[0] < x + w and y < line.at_mm[1] < y + h]
+        top, sheet, last = own
+        assert (top.text, sheet.text) == ("TOP", ID)
+        assert last.text == name or (label == "m" * 99 and last.text.startswith(name) and last.text.endswith("…"))
+        # capitals of 0.72 mm in the middle of the millimeter along the cut, above the upper markers and below a lower
+        assert [line.at_mm[1] - y for line in (top, sheet)] == pytest.approx([0.861, 0.861])
+        assert y + h - last.at_mm[1] == pytest.approx(0.139)
+        assert top.at_mm[0] - x < 2 and last.at_mm[0] - x < 1 and sheet.at_mm[0] - x > w - 1.3 * piece.marker_mm - 1
+        arrow = [line.ends_mm for line in page.ticks if line.ends_mm[0] < x + 1.3 and y < line.ends_mm[3] < y + 1]
+        assert len(arrow) == 3 and all(end[3] < end[1] for end in arrow)  # all end at its tip
+        sizes[name] = len(page.boxes)
+    assert len(set(sizes.values())) == 1
+
+
 def test_kinds_share_no_marker_even_with_the_page_s_own():
     template = load_template("a4")
     ids = [m.id for kind in KINDS for m in page_of(template, (120, 120), kind=kind, bends=True).markers]

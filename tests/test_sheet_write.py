@@ -17,6 +17,7 @@ from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.pdf import srgb_profile
 from patchproof.sheets.piece import control_design, lay_out_piece, marker_image
+from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheets.shop import shop_lines
 from patchproof.sheets.template import load_template
@@ -45,6 +46,17 @@ def reserved_px(manifest):
     """Which of the design's pixels belong to markers."""
     piece = lay_out_piece(manifest.cut_mm[2:], 19.0, ID, "design")
     return marker_image(piece, manifest.design.size_px)[1]
+
+
+def words_px(piece, manifest, shape):
+    """Which pixels of a picture of the piece may have its words: the outer millimeter of three corners."""
+    mask, scale = np.zeros(shape[:2], bool), shape[1] / piece.size_mm[0]
+    for box in piece_words(PrintedPiece(piece, manifest.sheet_id, manifest.kind, None), (0.0, 0.0)).boxes:
+        x, y, w, h = box.rect_mm
+        assert min(y, piece.size_mm[1] - y - h) == pytest.approx(0.139)
+        (left, top), (right, bottom) = ((int(v * scale) for v in p) for p in ((x, y), (x + w, y + h)))
+        mask[max(top - 2, 0) : bottom + 4, max(left - 1, 0) : right + 2] = True
+    return mask
 
 
 @pytest.fixture(scope="module")
@@ -252,6 +264,9 @@ def test_marker_image_agrees_with_the_pdf(tmp_path, marker_mm, mean, most):
     assert fine.shape == (168 * 8, 168 * 8, 3)
     linear = linear_from_srgb(fine / 255).reshape(168, 8, 168, 8, 3).mean((1, 3))
     difference = np.abs(linear - linear_from_srgb(image.astype(float)))
+    words = words_px(lay_out_piece((84, 84), marker_mm, ID, "design", bends=True), manifest, reserved.shape)
+    difference[words] = 0
+    assert words.sum() < 0.01 * words.size
     # PDFium smooths between texels: a pixel from where gray and white meet
     kernel = np.ones((3, 3))
     inner, outer = (cv2.erode(part.astype(np.uint8), kernel, borderValue=1) > 0 for part in (reserved, ~reserved))
@@ -271,6 +286,7 @@ def test_piece_pixels_end_at_the_cut_line(sheet, tmp_path):
     # no ink of the dashed line, which lies outside: a blank piece is white all round
     # (PDFium counts coverage in 1/256: one code value of it may show)
     blank = piece_pixels(tmp_path / "b.pdf", write(tmp_path / "b.pdf", kind="blank", design=None), 200)
+    blank[words_px(lay_out_piece((162, 162), 19.0, ID, "blank"), manifest, blank.shape)] = 255
     assert min(blank[:7].min(), blank[-7:].min(), blank[:, :7].min(), blank[:, -7:].min()) >= 254
     # and the design's outermost texels, 13 px wide, reach up to it
     at, free = ((np.arange(16, 80) + 0.5) * width / 96).astype(int), sample_design()[:, 16:80]

@@ -48,6 +48,12 @@ class PrintedPiece:
         return f"patchproof:{self.sheet_id}:{content}"
 
     @property
+    def name(self) -> str:
+        """What the piece is, for whoever finds it: its kind and the target's label."""
+        label = (self.settings.get("target") or {}).get("label")
+        return self.kind if label is None else f"{self.kind} · {label}"
+
+    @property
     def words(self) -> dict[str, str]:
         """What a template's words stand for on its page."""
         size, kind = size_text(self.piece.size_mm), self.kind

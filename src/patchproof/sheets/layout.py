@@ -6,8 +6,9 @@ boxes lie within the margins and that no two overlap, or refuses. All in page mi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 
 from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheets.piece import PieceMarker
@@ -43,6 +44,11 @@ class Parts:
     lines: tuple[Line, ...] = ()
     texts: tuple[TextLine, ...] = ()
     boxes: tuple[Box, ...] = ()
+
+
+def joined(parts: Sequence[Parts]) -> Parts:
+    """All of them as one."""
+    return Parts(*(tuple(chain(*every)) for every in zip(*((p.lines, p.texts, p.boxes) for p in parts), strict=True)))
 
 
 @dataclass(frozen=True)

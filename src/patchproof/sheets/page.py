@@ -23,6 +23,7 @@ from patchproof.sheets.piece import (
     marker_rect,
     moved_marker,
 )
+from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grown, moved, rounded, size_text
 from patchproof.sheets.template import BoardTemplate, Template, TextLine, template_names
 from patchproof.strict import Refused
@@ -53,7 +54,8 @@ def lay_out_page(template: Template, content: PrintedPiece) -> PageLayout:
     """The page of one piece; refused where that is too large."""
     placed, fixed = place_pieces(template, [content.piece]), len(content.piece.markers)
     ids = marker_ids(content.sheet_id, content.kind, fixed + len(template.marker.corners_mm))[fixed:]
-    return lay_out_parts(template, placed, ids, content.code, content.words)
+    more = piece_words(content, placed[0][1], piece_name(0))
+    return lay_out_parts(template, placed, ids, content.code, content.words, more)
 
 
 def lay_out_parts(
@@ -161,9 +163,14 @@ def _refuse_larger(template: Template, piece: Piece) -> None:
         )
 
 
+def piece_name(number: int) -> str:
+    """The name of a page's piece, from 0, among the page's parts."""
+    return f"piece {number + 1}" if number else "piece"
+
+
 def _piece_boxes(piece: Piece, corner: PointMm, number: int) -> list[Box]:
     """The piece, and in it its markers with their quiet zones."""
-    name = f"piece {number + 1}" if number else "piece"
+    name = piece_name(number)
     quiet = [grown(moved(marker_rect(marker), corner), piece.module_mm) for marker in piece.markers]
     cut = Box(name, grown((*corner, *piece.size_mm), CUT_LINE_MM))
     return [cut, *(Box(f"{name} marker {i}", rect, name) for i, rect in enumerate(quiet, 1))]

@@ -18,11 +18,12 @@ from itertools import chain
 from pathlib import Path
 
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.layout import PageLayout
+from patchproof.sheets.layout import PageLayout, joined
 from patchproof.sheets.manifest import Manifest, design_sha256
-from patchproof.sheets.page import lay_out_parts, place_pieces
+from patchproof.sheets.page import lay_out_parts, piece_name, place_pieces
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import hash_order, moved_marker, sheet_id
+from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, size_text
 from patchproof.sheets.template import Template
 from patchproof.sheets.write import manifest_paths, pdf_name, save_sheets
@@ -42,7 +43,9 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[Pr
     placed = place_pieces(template, [design.piece for design in designs])
     identity = sheet_id({"sheets": [[design.sheet_id, design.kind] for design in designs]}, 0)
     code = _page_code(identity, designs)
-    page = lay_out_parts(template, placed, _page_ids(designs, template), code, _words(identity, designs))
+    named = [piece_words(design, placed[i][1], piece_name(i)) for i, design in enumerate(designs)]
+    ids, words = _page_ids(designs, template), _words(identity, designs)
+    page = lay_out_parts(template, placed, ids, code, words, joined(named))
     manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
     pictures = [design.pictures(rect) for rect, design in zip(page.cuts_mm, designs, strict=True)]
     paths = manifest_paths(pdf_path, len(designs))

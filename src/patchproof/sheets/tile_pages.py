@@ -31,7 +31,7 @@ def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tup
     words = content.words | {"tiles": str(len(tiles))}
     first = lay_out_parts(template, [], ids[fixed:own], content.code, words, more)
     layouts = [
-        lay_out_tile(template, grid, piece, tile, ids[own + MARKERS * i : own + MARKERS * (i + 1)], sheet_id)
+        lay_out_tile(template, grid, content, tile, ids[own + MARKERS * i : own + MARKERS * (i + 1)])
         for i, tile in enumerate(tiles)
     ]
     pages = [Printed(first, tuple((rect, _pale(design)) for rect, design in content.pictures(small)))]

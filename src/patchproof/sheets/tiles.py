@@ -15,11 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.fonts import text_width_mm
 from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
 from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES, place_pieces
 from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, marker_ids, marker_rect, moved_marker
-from patchproof.sheets.rects import PointMm, RectMm, grown, meet, size_text
+from patchproof.sheets.piece_words import piece_words
+from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
 from patchproof.strict import Refused
 
@@ -81,7 +83,7 @@ def refuse_larger_than_page(template: Template, piece: Piece) -> None:
 
 
 def lay_out_tile(
-    template: Template, grid: TileGrid, piece: Piece, tile: TilePlan, ids: Sequence[int], sheet_id: str
+    template: Template, grid: TileGrid, content: PrintedPiece, tile: TilePlan, ids: Sequence[int]
 ) -> PageLayout:
     """One tile's page, proved apart and within the margins; its own markers are the layout's, the piece's lie in
     the window.
@@ -90,9 +92,9 @@ def lay_out_tile(
     window, cut = _extended(tile, BLEED_MM), _extended(tile, grid.overlap_mm)
     own = [marker_at(i, at, grid.marker_mm) for i, at in zip(ids, _places(grid, part), strict=True)]
     quiet = [quiet_box(marker_rect(marker), grid.marker_mm / MODULES, page_mm, margin_mm) for marker in own]
-    texts = _words(template, grid, tile, sheet_id)
+    texts, own_words = _words(template, grid, tile, content.sheet_id), _within(window, piece_words(content, by))
     boxes = [Box(f"tile marker {i}", rect) for i, rect in enumerate(quiet, 1)] + [text_box(line) for line in texts]
-    markers = [moved_marker(marker, by) for marker in piece.markers]
+    markers = [moved_marker(marker, by) for marker in content.piece.markers]
     boxes = (
         Box("tile", grown(cut, CUT_LINE_MM)),
         Box("its picture", window, "tile"),
@@ -103,10 +105,18 @@ def lay_out_tile(
         page_mm=page_mm,
         cuts_mm=(cut,),
         markers=tuple(own),
-        texts=tuple(texts),
+        ticks=own_words.lines,
+        texts=(*texts, *own_words.texts),
         boxes=boxes,
         window=Window(window, tuple(m for m in markers if meet(grown(window, 1e-6), marker_rect(m)))),
     )
+
+
+def _within(window: RectMm, words: Parts) -> Parts:
+    """The piece's words that the window shows: whole ones, since a corner's marker and its white are never cut."""
+    lines = (line for line in words.lines if holds(window, (*line.ends_mm[:2], 0.0, 0.0)))
+    shown = (text for text, box in zip(words.texts, words.boxes, strict=True) if holds(window, box.rect_mm))
+    return Parts(tuple(lines), tuple(shown))
 
 
 def _extended(tile: TilePlan, by_mm: float) -> RectMm:
