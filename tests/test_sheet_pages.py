@@ -8,6 +8,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pikepdf
+import pypdfium2
 import pytest
 
 from patchproof.evidence.camera import view_of
@@ -32,6 +33,7 @@ from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
 from patchproof.sheets.write import check_sheet, write_sheet
 from patchproof.strict import Refused, read_toml, shipped
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
+from test_worth import promise_of
 
 NAMES = template_names()
 DESIGN = cv2.resize(sample_design(12, 12), (120, 120), interpolation=cv2.INTER_CUBIC)
@@ -283,6 +285,46 @@ def test_several_designs_share_a_page_each_with_a_manifest_of_its_own(tmp_path):
         assert len(piece_pixels(tmp_path / "s.pdf", manifest, 50)) > 100
     cuts = [Box(f"piece {i}", m.cut_mm) for i, m in enumerate(manifests)]
     prove_apart(tuple(cuts), manifests[0].page_mm, 7.0)
+
+
+def test_each_of_several_designs_has_a_plan_that_names_its_sheet(tmp_path):
+    plans = [PlanPage(None, (("Here", (word,)),)) for word in ("First.", "Second.")]
+    both = designs(ID, "B1B2C3D4E5", piece_mm=(74, 74))
+    manifests = write_several(tmp_path / "s.pdf", load_template("a4"), both, plans)
+    assert [manifest.plan_page for manifest in manifests] == [2, 3]
+    for manifest, word in zip(manifests, ("First.", "Second."), strict=True):
+        text = words_on(tmp_path / "s.pdf", manifest.plan_page)
+        assert f"plan of sheet {manifest.sheet_id}" in text and word in text
+        assert (
+            f"Page {manifest.plan_page} is for people, on any paper: where the piece of sheet {manifest.sheet_id}"
+            in (" ".join(check_sheet(manifest)))
+        )
+    only = write_several(tmp_path / "t.pdf", load_template("a4"), both, [None, plans[1]])
+    assert [manifest.plan_page for manifest in only] == [None, 2]
+    assert "as its own plan page shows" in words_on(tmp_path / "s.pdf", 1)
+
+
+def words_on(path, page):
+    """A page's words, as PDFium reads them."""
+    with pypdfium2.PdfDocument(path) as pdf:
+        return " ".join(pdf[page - 1].get_textpage().get_text_bounded().split())
+
+
+@pytest.mark.parametrize("name", template_names("piece"))
+@pytest.mark.parametrize("bent", [False, True])
+def test_the_longest_words_fit_every_page(tmp_path, name, bent):
+    """A draft that is no better than noise, on a piece of the most digits, with the widest id and a long label."""
+    template = load_template(name)
+    promise = promise_of(0.5, {"noise": (0.5, -0.1, 0.1)}).changed(draft=True)
+    widest, highest = largest_piece_mm(template)
+    size = (777.7, 888.8) if template.tiles else (round(widest - 1.1, 1), round(highest - 1.1, 1))
+    piece = lay_out_piece(size, 20 if template.tiles else 12.3, "W" * 10, "design", bends=bent)
+    settings = {"target": {"label": "W" * 60}}
+    content = PrintedPiece(piece, "W" * 10, "design", DESIGN, promise, settings, bent)
+    write_sheet(tmp_path / "s.pdf", template, content, PlanPage(None, (("Here", ("First.",)),)))
+    words = words_on(tmp_path / "s.pdf", 1)
+    assert ("Wrap the piece smoothly round" in words) == (bent and template.plan_page and not template.tiles)
+    assert "draft design, no better than noise" in words or template.blank is not None
 
 
 def test_two_times_is_the_same_bytes(tmp_path):

@@ -1,12 +1,14 @@
 """Where the piece goes on the object: a picture of the object's side, and millimeters to its edges.
 
-In: a scene with a mesh and its piece. Out: a `Hung` for the sheet's last page. The picture is rendered by the project's
+In: a scene with a mesh and its piece. Out: a `Hung` for the sheet's last page, with millimeters to the object's edges
+or, of bent paper, along its surface. The picture is rendered by the project's
 own rasterizer from so far away that it is a plan: at 60 times the object's length perspective moves nothing by more
 than 1 % of the object's depth.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from torch import Tensor
 from patchproof.channel.effects import Light, Pose
 from patchproof.color import photo_codes_of, srgb_from_linear
 from patchproof.geometry import rect_corners
+from patchproof.printing.tape import Tape, tapes
 from patchproof.render.photograph import shade
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
@@ -27,7 +30,7 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Frame, patch_frame
 from patchproof.scene.scene import needs_mesh
 from patchproof.settings import BackgroundSettings
-from patchproof.sheets.plan_page import Hung
+from patchproof.sheets.plan_page import Hung, Span
 from patchproof.sheets.template import Template
 from patchproof.sheets.tiles import plan_tiles
 
@@ -58,6 +61,13 @@ def hang(scene: PatchScene, template: Template) -> Hung:
             corners = flat(placement.world(rect_corners(tile.part_mm)))
             seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
             names.append((tuple(corners.mean(0)), tile.name))
+    measured = None
+    if not placement.is_flat:
+        laid_out = tapes(scene.mesh, placement, frame.normal)
+        measured = _spans(laid_out, flat)
+        for tape in laid_out:
+            start, end = flat(tape.points_mm[[0, -1]])
+            seams.append((tuple(start), tuple(end)))
     return Hung(
         picture=straight_picture(set_stage(scene), scene.frame, half),
         picture_mm=(-half[0], -half[1], 2 * half[0], 2 * half[1]),
@@ -65,7 +75,19 @@ def hang(scene: PatchScene, template: Template) -> Hung:
         outline_mm=tuple(map(tuple, outline)),
         seams_mm=tuple(seams),
         names_mm=tuple(names),
+        measured=measured,
     )
+
+
+def _spans(laid_out: Sequence[Tape], flat: Callable[[np.ndarray], np.ndarray]) -> tuple[tuple[Span, ...], ...]:
+    """The tapes that run across the picture, from the left, and those that run down, from the top."""
+    spans = [], []
+    for tape in laid_out:
+        start, end = flat(tape.points_mm[[0, -1]])
+        axis = int(np.abs(end - start).argmax())
+        ends = sorted((float(start[axis]), float(end[axis])))
+        spans[axis].append(Span((ends[0], ends[1]), tape.length_mm, tape.end))
+    return tuple(tuple(sorted(each, key=lambda span: span.ends_mm)) for each in spans)
 
 
 def straight_picture(

@@ -15,13 +15,16 @@ from pathlib import Path
 from patchproof.optimizer.run import Run
 from patchproof.printing.hung import hang
 from patchproof.printing.shots import shot_sections
+from patchproof.printing.tape import tapes
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.placement import patch_frame
 from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
 from patchproof.sheets.blank import blank_sheet, chart_sheet
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
-from patchproof.sheets.plan_page import PlanPage, edges_mm
+from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
 from patchproof.sheets.several import write_several
 from patchproof.sheets.template import Template, load_template
@@ -50,7 +53,9 @@ def sheet_of_several(
     another is named.
     """
     name = template or runs[0].scene.settings.sheet.template
-    return write_several(pdf_path, load_template(name), [_content(run, name, control)[0] for run in runs])
+    page, made = load_template(name), [_content(run, name, control) for run in runs]
+    plans = [_plan(scene, page, content.promise) for content, scene in made] if page.plan_page else []
+    return write_several(pdf_path, page, [content for content, _ in made], plans)
 
 
 def _content(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
@@ -60,12 +65,12 @@ def _content(run: Run, template: str | None, control: str | None) -> tuple[Print
     settings = scene.settings.model_dump(mode="json") | {"seed": scene.seed, "printer_model": run.details["printer"]}
     if (imported := run.details.get("imported")) is not None:
         settings["imported"] = {name: imported[name] for name in ("file", "sha256")}
-    piece = scene.piece
+    piece, bent = scene.piece, isinstance(scene, PatchScene) and not scene.placement.is_flat
     if control is not None:
         piece = with_ids(piece, scene.sheet_id, control)
         design = control_design(control, run.design, scene.sheet_id, piece)
-        return PrintedPiece(piece, scene.sheet_id, control, design, settings=settings), scene
-    return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings), scene
+        return PrintedPiece(piece, scene.sheet_id, control, design, settings=settings, bent=bent), scene
+    return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings, bent), scene
 
 
 def _plan(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
@@ -74,11 +79,10 @@ def _plan(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanP
     """
     hung, sections, imported = None, [], content.settings.get("imported")
     if scene.HAS_OBJECT:
-        hung = hang(needs_patch(scene), template)
-        edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edges_mm(hung).items())
+        patch = needs_patch(scene)
+        hung = hang(patch, template)
         placed = [
-            f"Seen as you face the object's {scene.settings.patch.side} side. From the piece's cut edge to the "
-            f"outermost edges of that side: {edges}.",
+            _seen(patch) + (_edges(hung) if patch.placement.is_flat else _wrapped(patch)),
             f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.lies()['reason']}.",
         ]
         if template.tiles is not None:
@@ -94,6 +98,28 @@ def _plan(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanP
     if content.promise is not None:
         sections += shot_sections(content.promise, scene.settings)
     return PlanPage(hung, tuple(sections)) if sections else None
+
+
+def _seen(scene: PatchScene) -> str:
+    """From where the picture is."""
+    patch = scene.settings.patch
+    facing = f"the object's {patch.side} side" if patch.at_mm is None else "the place where the piece goes"
+    return f"Seen as you face {facing}. "
+
+
+def _edges(hung: Hung) -> str:
+    edges = ", ".join(f"{name} {mm:.0f} mm" for name, mm in edges_mm(hung).items())
+    return f"From the piece's cut edge to the outermost edges of that side: {edges}."
+
+
+def _wrapped(scene: PatchScene) -> str:
+    """How bent paper goes on the object, and what a tape measure says beside it."""
+    laid_out = tapes(scene.mesh, scene.placement, patch_frame(scene.mesh, scene.settings.patch).normal)
+    text = "Wrap the piece round the object from its middle outwards, its top edge up, without folds or air under it."
+    if not laid_out:
+        return text
+    lengths = ", ".join(f"{tape.edge} {tape.length_mm:.0f} mm {tape.end}" for tape in laid_out)
+    return f"{text} Lay a tape on the surface, straight on from the middle of each of the piece's edges: {lengths}."
 
 
 def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:

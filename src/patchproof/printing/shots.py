@@ -122,7 +122,8 @@ def unpaired_power(better: float, worse: float, n: int) -> float:
 def shot_sections(promise: Promise, settings: SceneSettings) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """What to photograph, as (heading, lines)."""
     plan = plan_shots(promise)
-    what = f"Promised before {behind(settings.model_dump())}. The design is {promise.headline}"
+    worth = promise.headline.removeprefix(promise.hint)
+    what = f"{promise.hint or 'The design is '}{worth} Promised before {behind(settings.model_dump())}."
     return (("How many photographs", (what, *_how_many(promise, plan))), ("From where", _from_where(settings)))
 
 
@@ -169,9 +170,14 @@ def _from_where(settings: SceneSettings) -> tuple[str, ...]:
         return ("As the scene's own photographs were taken: the same places, distances and light.",)
     view, low = settings.view, settings.light.ambient
     target = "object" if view.look_at == "object" else "piece"
+    front = (
+        "the place of the piece" if settings.patch.at_mm is not None else f"the piece's side ({settings.patch.side})"
+    )
+    if view.front != "patch":
+        front = f"the object's {view.front} side"
     return (
         f"Spread over all of these, not the best ones: {_degrees(view.azimuth_deg)} to the left (-) and right (+) of "
-        f"facing the piece's side ({settings.patch.side}), {_degrees(view.elevation_deg)} above it, "
+        f"facing {front}, {_degrees(view.elevation_deg)} above it, "
         f"{view.distance_mm[0] / 10:.0f} to {view.distance_mm[1] / 10:.0f} cm from the middle of the {target}, the "
         f"camera turned by {_degrees(view.roll_deg)}.",
         f"The {target} belongs in the middle of the picture, the whole piece in view; classifiers see the picture's "

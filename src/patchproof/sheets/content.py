@@ -32,6 +32,7 @@ class PrintedPiece:
     design_srgb8: np.ndarray | None
     promise: Promise | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+    bent: bool = False  # goes round the object
 
     def __post_init__(self):
         pixels = self.design_srgb8
@@ -61,7 +62,8 @@ class PrintedPiece:
             kind = f"{kind}, {self.promise.worth} than {self.promise.best_control}"
         if self.promise is not None and self.promise.draft:
             kind = f"draft {kind}"
-        return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size}
+        fix = "Wrap the piece smoothly round the object" if self.bent else "Fix the piece flat on the object"
+        return {"sheet_id": self.sheet_id, "kind": kind, "design": size, "piece": size, "fix": fix}
 
     def pictures(self, rect_mm: RectMm) -> tuple[tuple[RectMm, np.ndarray], ...]:
         """The design in that rectangle, or nothing."""

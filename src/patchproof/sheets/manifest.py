@@ -193,14 +193,18 @@ class Promise(Strict):
         return "better" if min(ends) > 0 else "worse" if max(ends) < 0 else "no better"
 
     @property
+    def hint(self) -> str:
+        """How a draft's sentences begin."""
+        return f"Draft of {self.n} views, no more than a hint: " if self.draft else ""
+
+    @property
     def headline(self) -> str:
         """What the design is worth, in a sentence."""
         control = self.controls[self.best_control]
         low, high = (100 * end for end in control.difference_interval)
         advice = "" if self.worth == "better" else " Try another place, size or seed before printing it."
-        draft = f"Draft of {self.n} views, no more than a hint: " if self.draft else ""
         return (
-            f"{draft}{self.worth} than its best control ({self.best_control}): {self.rate:.1%} beside "
+            f"{self.hint}{self.worth} than its best control ({self.best_control}): {self.rate:.1%} beside "
             f"{control.rate:.1%} recognized, {100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}].{advice}"
         )
 

@@ -1,8 +1,8 @@
 """The last page: where the piece goes on the object, and how to photograph it so that the photographs can tell.
 
 In: a `PlanPage`: a picture of the object with its millimeters, the piece's outline on it, and paragraphs. Out: the
-page. Dimension chains above and beside the picture run from edge to edge of the object's side. The picture is passed
-in; this module knows paper only.
+page. Dimension chains above and beside the picture run from edge to edge of the object's side, or say what was measured
+along its surface. The picture is passed in; this module knows paper only.
 """
 
 from __future__ import annotations
@@ -24,6 +24,15 @@ HEADING_MM, TEXT_MM, LEADING = 3.2, 2.6, 1.45
 
 
 @dataclass(frozen=True)
+class Span:
+    """A part of a dimension chain: between two places along one axis of the picture, so many millimeters."""
+
+    ends_mm: tuple[float, float]
+    length_mm: float  # along the surface it is longer than between its ends
+    name: str
+
+
+@dataclass(frozen=True)
 class Hung:
     """The piece on the object, seen straight from its side; millimeters x right, y down."""
 
@@ -31,8 +40,9 @@ class Hung:
     picture_mm: RectMm
     object_mm: RectMm  # the object's extent
     outline_mm: tuple[PointMm, ...]  # the piece's cut line
-    seams_mm: tuple[tuple[PointMm, PointMm], ...] = ()
+    seams_mm: tuple[tuple[PointMm, PointMm], ...] = ()  # thin lines
     names_mm: tuple[tuple[PointMm, str], ...] = ()
+    measured: tuple[tuple[Span, ...], tuple[Span, ...]] | None = None  # across and down, in place of edge to edge
 
 
 @dataclass(frozen=True)
@@ -106,7 +116,8 @@ def _drawing(hung: Hung, room: RectMm):
             TextLine(at_mm=(cx - text_width_mm(name, 2.8, True) / 2, cy + 1.0), size_mm=2.8, text=name, bold=True)
         )
     shown = (*corner, scale * wide, scale * high)
-    for more_lines, more_labels in (_chain_above(hung, at, shown), _chain_beside(hung, at, shown)):
+    across, down = hung.measured or _edge_to_edge(hung)
+    for more_lines, more_labels in (_chain_above(across, at, shown), _chain_beside(down, at, shown)):
         lines, labels = lines + more_lines, labels + more_labels
     box = (x, y, w, ABOVE_MM + scale * high)
     return lines, labels, ((shown, hung.picture),), Box("picture of the object", box)
@@ -119,33 +130,43 @@ def edges_mm(hung: Hung) -> dict[str, float]:
     return {"left": min(xs) - x, "right": x + w - max(xs), "top": min(ys) - y, "bottom": y + h - max(ys)}
 
 
-def _chain_above(hung: Hung, at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
-    xs, (x, _, w, _) = [p[0] for p in hung.outline_mm], hung.object_mm
-    stops, names, row = [x, min(xs), max(xs), x + w], ("left edge", "", "right edge"), shown[1] - 2.0
-    lines, labels = [], []
-    for i, (a, b, name) in enumerate(zip(stops, stops[1:], names, strict=False)):
-        start, end = at((a, 0))[0], at((b, 0))[0]
+def _edge_to_edge(hung: Hung) -> tuple[tuple[Span, ...], tuple[Span, ...]]:
+    """From edge to edge of the object's side, across and down."""
+    (xs, ys), (x, y, w, h) = zip(*hung.outline_mm, strict=True), hung.object_mm
+    across, down = (x, min(xs), max(xs), x + w), (y, min(ys), max(ys), y + h)
+    names = ("from left edge", "piece", "from right edge"), ("from top", "piece", "from bottom")
+    return _spans(across, names[0]), _spans(down, names[1])
+
+
+def _spans(stops: tuple[float, ...], names: tuple[str, ...]) -> tuple[Span, ...]:
+    return tuple(Span((a, b), b - a, name) for a, b, name in zip(stops, stops[1:], names, strict=False))
+
+
+def _chain_above(spans: tuple[Span, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
+    row, lines, labels = shown[1] - 2.0, [], []
+    for i, span in enumerate(spans):
+        start, end = (at((x, 0))[0] for x in span.ends_mm)
         lines += [Line((start, row, end, row), 0.2), *(Line((s, row - 1, s, row + 1), 0.2) for s in (start, end))]
-        text = f"{b - a:.0f} mm {'from ' + name if name else 'piece'}"
+        text = f"{span.length_mm:.0f} mm {span.name}"
         # a row for each, so that narrow parts cannot write over their neighbors
         middle = (start + end) / 2 - text_width_mm(text, 2.3, False) / 2
         middle = min(max(middle, shown[0]), shown[0] + shown[2] + BESIDE_MM - text_width_mm(text, 2.3, False))
-        labels.append(TextLine(at_mm=(middle, row - 1.6 - (2 - i) * 3.1), size_mm=2.3, text=text))
+        labels.append(TextLine(at_mm=(middle, row - 1.6 - (len(spans) - 1 - i) * 3.1), size_mm=2.3, text=text))
     return lines, labels
 
 
-def _chain_beside(hung: Hung, at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
-    ys, (_, y, _, h) = [p[1] for p in hung.outline_mm], hung.object_mm
-    stops, names, column = [y, min(ys), max(ys), y + h], ("from top", "piece", "from bottom"), shown[0] + shown[2] + 2.0
+def _chain_beside(spans: tuple[Span, ...], at, shown: RectMm) -> tuple[list[Line], list[TextLine]]:
+    column = shown[0] + shown[2] + 2.0
     lines, labels, free = [], [], shown[1]
-    for a, b, name in zip(stops, stops[1:], names, strict=False):
-        start, end = at((0, a))[1], at((0, b))[1]
+    for span in spans:
+        start, end = (at((0, y))[1] for y in span.ends_mm)
         lines += [
             Line((column, start, column, end), 0.2),
             *(Line((column - 1, s, column + 1, s), 0.2) for s in (start, end)),
         ]
-        middle = max((start + end) / 2 - 1.2, free)
-        labels.append(TextLine(at_mm=(column + 2, middle + 2.3 * CAP_HEIGHT), size_mm=2.3, text=f"{b - a:.0f} mm"))
-        labels.append(TextLine(at_mm=(column + 2, middle + 2.6 + 2.3 * CAP_HEIGHT), size_mm=2.0, text=name, gray=0.35))
+        text, middle = f"{span.length_mm:.0f} mm", max((start + end) / 2 - 1.2, free)
+        labels.append(TextLine(at_mm=(column + 2, middle + 2.3 * CAP_HEIGHT), size_mm=2.3, text=text))
+        low = middle + 2.6 + 2.3 * CAP_HEIGHT
+        labels.append(TextLine(at_mm=(column + 2, low), size_mm=2.0, text=span.name, gray=0.35))
         free = middle + 2.6 + 2.3 * (CAP_HEIGHT + DESCENT) + 0.6
     return lines, labels

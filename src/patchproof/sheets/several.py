@@ -1,11 +1,11 @@
 """Several designs on one page, each with its own piece, markers and manifest.
 
 In: what `write_sheet` takes, once for each design. Out: SHEET.pdf and SHEET_1.json, SHEET_2.json... in the order of the
-designs, all of which the PDF carries. The page has an id of its own and one code for all of them: a code that lists
-three designs or more is too fine to be read at 150 dpi. Pieces keep the marker ids that they were promised with. Ids
-come from 1000 by hash, so two sheets may share one; the page's own markers avoid all of them, and in a design's
-manifest the others' markers stand among the page's where nothing else has their id, so that a photograph of the uncut
-page is known as one.
+designs, all of which the PDF carries; behind the page follows each design's plan, where it has one. The page has an id
+of its own and one code for all of them: a code that lists three designs or more is too fine to be read at 150 dpi.
+Pieces keep the marker ids that they were promised with. Ids come from 1000 by hash, so two sheets may share one; the
+page's own markers avoid all of them, and in a design's manifest the others' markers stand among the page's where no
+other has their id, so that a photograph of the uncut page is known as one.
 """
 
 from __future__ import annotations
@@ -24,14 +24,22 @@ from patchproof.sheets.page import lay_out_parts, piece_name, place_pieces
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.piece import hash_order, moved_marker, sheet_id
 from patchproof.sheets.piece_words import piece_words
+from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import PointMm, size_text
 from patchproof.sheets.template import Template
 from patchproof.sheets.write import manifest_paths, pdf_name, save_sheets
 from patchproof.strict import Refused
 
 
-def write_several(pdf_path: str | Path, template: Template, designs: Sequence[PrintedPiece]) -> list[Manifest]:
-    """Write the page and a manifest for each design; refused where two of them are the same sheet."""
+def write_several(
+    pdf_path: str | Path,
+    template: Template,
+    designs: Sequence[PrintedPiece],
+    plans: Sequence[PlanPage | None] = (),
+) -> list[Manifest]:
+    """Write the page and a manifest for each design, and behind it the `plans` in the designs' order; refused where two
+    designs are the same sheet.
+    """
     pdf_path = pdf_name(pdf_path)
     if template.tiles is not None:
         raise Refused("a template of one page for several designs", "one with tiles", "make a sheet of each")
@@ -48,8 +56,13 @@ def write_several(pdf_path: str | Path, template: Template, designs: Sequence[Pr
     page = lay_out_parts(template, placed, ids, code, words, joined(named))
     manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
     pictures = [design.pictures(rect) for rect, design in zip(page.cuts_mm, designs, strict=True)]
+    pages = [Printed(page, tuple(chain(*pictures)))]
+    for i, plan in enumerate(plans):
+        if plan is not None:
+            pages.append(lay_out_plan(plan, template, designs[i].sheet_id))
+            manifests[i] = manifests[i].changed(plan_page=len(pages))
     paths = manifest_paths(pdf_path, len(designs))
-    save_sheets(pdf_path, [Printed(page, tuple(chain(*pictures)))], dict(zip(paths, manifests, strict=True)))
+    save_sheets(pdf_path, pages, dict(zip(paths, manifests, strict=True)))
     return manifests
 
 
@@ -69,9 +82,10 @@ def _page_code(identity: str, designs: Sequence[PrintedPiece]) -> str:
 def _words(identity: str, designs: Sequence[PrintedPiece]) -> dict[str, str]:
     return {
         "sheet_id": identity,
-        "kind": f"{len(designs)} designs,",
+        "kind": f"{len(designs)} designs",
         "design": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
         "piece": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
+        "fix": "Put each piece on its object as its own plan page shows",
     }
 
 

@@ -87,7 +87,7 @@ class TileGrid(Strict):
 
 
 class TextLine(Strict):
-    """One line of text; {sheet_id}, {kind}, {design} and {piece} are filled in; gray 0 is black."""
+    """One line of text; {sheet_id}, {kind}, {design}, {piece} and {fix} are filled in; gray 0 is black."""
 
     at_mm: Point  # left end of its baseline
     size_mm: Positive  # of the letters

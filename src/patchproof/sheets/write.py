@@ -100,8 +100,9 @@ def check_sheet(manifest: Manifest) -> list[str]:
         return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
     lines += _cutting(manifest)
     if manifest.plan_page is not None:
+        piece = "the piece" if manifest.page_code is None else f"the piece of sheet {manifest.sheet_id}"
         lines.append(
-            f"Page {manifest.plan_page} is for people, on any paper: where the piece goes and how to photograph it."
+            f"Page {manifest.plan_page} is for people, on any paper: where {piece} goes and how to photograph it."
         )
     if manifest.design is None:
         lines.append("The piece carries no design: between its markers it stays white paper.")
