@@ -213,7 +213,7 @@ def test_doubts_are_about_what_an_image_lets_change(tmp_path):
     for name, columns, warns in (("a.png", [0, 2], "67% of"), ("b.png", [2, 3], None)):
         picture = left.copy()
         picture[:, columns] = 255
-        Image.fromarray(picture).save(tmp_path / name)
+        Image.fromarray(picture.repeat(4, 0).repeat(4, 1)).save(tmp_path / name)  # as large as the texture
         warnings = texture_canvas(mesh, masked(mask=name), tmp_path).warnings
         assert warnings[0].startswith(warns) if warns else warnings == ()
 

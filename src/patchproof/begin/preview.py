@@ -1,9 +1,10 @@
 """`preview`: a look at a scene before anything is optimized, in seconds.
 
 In: a scene file. Out: a folder with `preview.html`, which needs nothing from outside of itself and asks nobody for
-anything, and for a mesh `preview.glb`. Where the piece is refused, the page shows the object without it and says why:
-that is when a look helps most. A piece that is still to be placed is shown in the middle of the side that azimuth 0
-faces. Left out on purpose: anything that a design decides; that is `plan`'s.
+anything, and for a mesh `preview.glb`; where its own texture may change, `uv.png` to draw a mask on. Where the piece is
+refused, the page shows the object without it and says why: that is when a look helps most. A piece that is still to be
+placed is shown in the middle of the side that azimuth 0 faces. Left out on purpose: anything that a design decides;
+that is `plan`'s.
 """
 
 from __future__ import annotations
@@ -16,25 +17,27 @@ import numpy as np
 import torch
 
 from patchproof.begin.sides import SIDE_NAMES, extent_mm, gap_colors, gap_top_mm, side_of, side_views, stretch_colors
+from patchproof.begin.uv_layout import uv_layouts
 from patchproof.begin.views import Look, looks
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.color import codes_of
 from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, Part
-from patchproof.output import new_folder, write_whole
+from patchproof.output import image_bytes, new_folder, write_whole
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
 from patchproof.report.page import page, viewer
 from patchproof.scene.bend import STRETCH_LIMIT
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.mesh_scene import MeshScene, TextureScene
 from patchproof.scene.patch_scene import OpenScene, PatchScene
 from patchproof.scene.scene import Scene, build_scene
 from patchproof.scene.texture import whole_colors
 from patchproof.settings import SceneSettings, load_scene_settings
+from patchproof.sheets.pdf import numbered
 from patchproof.strict import Refused
 
-PAGE, OBJECT = "preview.html", "preview.glb"
+PAGE, OBJECT, LAYOUT = "preview.html", "preview.glb", "uv.png"
 _TEXTURE_PX = 1024  # of the object's textures in the page
 _MOST_BYTES = 16 << 20  # of an object that the page itself turns
 _DESIGN_PX = 256  # of the gray design on the piece, along its longer side
@@ -54,7 +57,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
     """Look at the scene of a file; what cannot be read, and networks that cannot be used, are refused."""
     path = Path(scene_path)
     settings = load_scene_settings(path)
-    with new_folder(out, (PAGE, OBJECT), overwrite) as folder:
+    with new_folder(out, (PAGE, OBJECT, "uv*.png"), overwrite) as folder:
         scene, refused = _scene(settings, path.resolve().parent)
         classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
@@ -63,17 +66,20 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
         mesh = isinstance(scene, MeshScene)
         if mesh:
             _write_object(stage, folder / OBJECT)
-        lines = tuple(f"{name}: {text}" for name, text in _facts(scene, settings)) + tuple(_answers(settings, seen))
+        layouts = _write_layouts(scene, folder)
+        facts = _facts(scene, settings) + [("texture", text) for text, _ in layouts]
+        lines = tuple(f"{name}: {text}" for name, text in facts) + tuple(_answers(settings, seen))
         problems = [text for text in (refused, unknown) if text]
         text = page(
             "preview.html.j2",
             name=path.name,
             target=settings.target,
-            facts=_facts(scene, settings),
+            facts=facts,
             problems=problems,
             warnings=scene.warnings,
             sides=[(view, data_uri(png(view.picture))) for view in side_views(stage)] if mesh else [],
             maps=_maps(scene) if isinstance(scene, PatchScene) else [],
+            layouts=layouts,
             model=_model(folder / OBJECT, scene) if mesh else None,
             viewer=viewer() if mesh else "",
             looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
@@ -193,6 +199,21 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
             }
         )
     return maps
+
+
+def _write_layouts(scene: Scene, folder: Path) -> list[tuple[str, str]]:
+    """A picture beside the page for each texture that may change: what it is, and itself for the page."""
+    layouts, shown = uv_layouts(scene.canvas) if isinstance(scene, TextureScene) else [], []
+    for number, layout in enumerate(layouts):
+        name = LAYOUT if len(layouts) == 1 else numbered(LAYOUT, number)
+        write_whole(folder / name, image_bytes(layout.picture, "PNG"))
+        width, height = layout.texels
+        text = (
+            f'{name} is the layout of "{layout.material}", {width} × {height} texels; {len(layout.numbered)} of its '
+            f"{layout.faces} faces have room for their numbers"
+        )
+        shown.append((text, data_uri(jpeg(_reduced(layout.picture)))))
+    return shown
 
 
 def _model(path: Path, scene: MeshScene) -> dict[str, str] | None:

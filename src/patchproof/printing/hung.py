@@ -79,15 +79,18 @@ def hang(scene: PatchScene, template: Template) -> Hung:
     )
 
 
-def _spans(laid_out: Sequence[Tape], flat: Callable[[np.ndarray], np.ndarray]) -> tuple[tuple[Span, ...], ...]:
+def _spans(
+    laid_out: Sequence[Tape], flat: Callable[[np.ndarray], np.ndarray]
+) -> tuple[tuple[Span, ...], tuple[Span, ...]]:
     """The tapes that run across the picture, from the left, and those that run down, from the top."""
-    spans = [], []
+    spans: tuple[list[Span], list[Span]] = ([], [])
     for tape in laid_out:
         start, end = flat(tape.points_mm[[0, -1]])
         axis = int(np.abs(end - start).argmax())
         ends = sorted((float(start[axis]), float(end[axis])))
         spans[axis].append(Span((ends[0], ends[1]), tape.length_mm, tape.end))
-    return tuple(tuple(sorted(each, key=lambda span: span.ends_mm)) for each in spans)
+    across, down = (tuple(sorted(each, key=lambda span: span.ends_mm)) for each in spans)
+    return across, down
 
 
 def straight_picture(

@@ -70,6 +70,7 @@ def texture_canvas(mesh: Mesh, patch: PatchSettings, base: Path, texels: int = T
     masks = _masks(mesh, chosen)
     if patch.mask is not None:
         image = _read_mask(Path(expand(patch.mask, base)))
+        warnings += _other_size(image, masks)
         masks = tuple(mask & _stretched(image, mask.shape) for mask in masks)
     if not any(mask.any() for mask in masks):
         raise Refused("a mask that is white on some face", "none of that", "compare it with the texture coordinates")
@@ -134,6 +135,17 @@ def _read_mask(path: Path) -> np.ndarray:
     if gray.max() < 128:
         raise Refused("a mask with white where the texture may change", f"none in {path.name}", "paint it white there")
     return gray
+
+
+def _other_size(gray: np.ndarray, masks: tuple[np.ndarray, ...]) -> list[str]:
+    """A sentence where a mask is of another size than a texture that it is laid over."""
+    sizes = dict.fromkeys(f"{m.shape[1]} × {m.shape[0]}" for m in masks if m.any() and m.shape != gray.shape)
+    if not sizes:
+        return []
+    return [
+        f"the mask of {gray.shape[1]} × {gray.shape[0]} pixels is laid over {' and '.join(sizes)} texels: a texel may"
+        " change where the mean of what lies over it is light"
+    ]
 
 
 def _stretched(gray: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
