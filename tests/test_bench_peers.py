@@ -275,6 +275,7 @@ def test_the_chart_holds_ours_against_the_front(scene_file):
 
 def test_the_benchmark_runs_on_the_demo_s_scene_without_art(without_art, monkeypatch):
     monkeypatch.setattr(peers, "_QUICK_STEPS", 1)
+    monkeypatch.setattr(peers, "_QUICK_VIEWS", 4)
     stages = []
     (chart,) = peers.charts(True, lambda *stage: stages.append(stage))
     assert [point.setting for point in chart.series["methods"]] == ["ours", "sign", "flat"]

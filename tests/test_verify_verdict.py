@@ -68,6 +68,14 @@ def test_a_rate_too_low_is_rarely_called_kept_and_the_promised_one_mostly():
     )  # which knows rate and spread
 
 
+@pytest.mark.parametrize(("goal", "rate", "control"), [("assist", 0.85, 0.3), ("deceive", 0.15, 0.7)])
+def test_the_chance_of_kept_is_that_of_all_counts_which_are_called_so(goal, rate, control):
+    for photos in ((40,), (10,) * 4, (5,)):
+        promise = promise_of(rate, control, goal, correlation=0.1)
+        words = [word(count, photos, promise) == "kept" for count in range(sum(photos) + 1)]
+        assert kept_chance(promise, photos) == pytest.approx(promise.spread.chances(photos) @ words, abs=1e-12)
+
+
 def test_photographs_in_one_place_prove_less():
     promise = promise_of(0.85, 0.3, correlation=0.2)
     chances = [kept_chance(promise, photos) for photos in ((40,), (10,) * 4, (5,) * 8)]

@@ -16,6 +16,7 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -185,6 +186,7 @@ def _student(freedom: int) -> float:
     return float(t.ppf(1 - _TAIL, freedom))
 
 
+@lru_cache(maxsize=8)
 def _z(confidence: float) -> float:
     from statistics import NormalDist
 

@@ -48,7 +48,7 @@ PEERS: tuple[Peer, ...] = ("sign", "flat", "art")
 PEERS_ALWAYS: tuple[Peer, ...] = ("sign", "flat")  # those that need no extra
 CONTROLS = ("bare", "gray")
 _TILE_PX = 192
-_QUICK_STEPS = 30
+_QUICK_STEPS, _QUICK_VIEWS = 30, 40
 
 
 class PeersSettings(GridSettings):
@@ -170,7 +170,7 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     """Every method's time against its error on the demo's scene; ART where it is installed."""
     with TemporaryDirectory() as folder:
         base, peers = Path(folder), PEERS if _has_art() else PEERS_ALWAYS
-        seeds, n = (range(2), 40) if quick else (range(5), 400)
+        seeds, n = (range(2), _QUICK_VIEWS) if quick else (range(5), 400)
         settings = PeersSettings(scenes=(demo_scene(base).name,), seeds=tuple(seeds), peers=peers, n=n)
         results = []
         for cell in cells(settings, base):

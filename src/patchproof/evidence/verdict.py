@@ -14,6 +14,7 @@ of them, or all in one place, can prove none.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -80,8 +81,11 @@ def asked_rate(promise: Promise) -> float:
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
     """The chance that the promise is called kept by photographs, so many in each session, where it holds."""
     chances = promise.spread.chances(photos)
-    words = (judge(count, photos, promise).verdict for count in range(len(chances)))
-    return float(sum(chance for chance, word in zip(chances, words, strict=True) if word == "kept"))
+    counts = range(len(chances))[
+        :: promise.target.goal.sign
+    ]  # from the worst to the best: once kept, kept from there on
+    first = bisect_left(counts, True, key=lambda count: judge(count, photos, promise).verdict == "kept")
+    return float(chances[list(counts[first:])].sum())
 
 
 def sessions_needed(promise: Promise) -> int | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -172,7 +173,7 @@ class Promise(Strict):
         """How many sessions it was made of."""
         return -(-self.n // self.per_session)
 
-    @property
+    @cached_property
     def spread(self) -> Spread:
         """What its conditions say of photographs to come."""
         hits = [condition.recognized for condition in self.conditions]
