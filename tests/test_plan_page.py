@@ -11,12 +11,15 @@ import trimesh
 from conftest import SCENE
 from patchproof.printing.hung import hang
 from patchproof.printing.sheet import _wrapped
+from patchproof.printing.shots import shot_sections
 from patchproof.printing.tape import tapes
 from patchproof.scene.placement import patch_frame
+from patchproof.settings import load_scene_settings
 from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
 from patchproof.sheets.template import load_template
 from patchproof.strict import Refused
 from test_scene import scene_of
+from test_worth_shown import promise_with
 
 A4 = load_template("a4")
 OUTLINE = ((-20.0, -45.0), (60.0, -45.0), (60.0, 15.0), (-20.0, 15.0))
@@ -141,3 +144,13 @@ def test_a_piece_that_ends_behind_the_outline_is_measured_where_it_can_be_seen(t
     can.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     found = measured(standing(tmp_path, can, 120, 60, True))  # round 229 degrees
     assert set(found) == {"top", "bottom"} and found["top"][0] == pytest.approx(70, abs=0.3)
+
+
+@pytest.mark.parametrize(("draft", "start"), [(False, "The design is better than"), (True, "Draft of 400 views, no ")])
+def test_the_first_line_is_a_sentence_of_what_the_design_is_worth(scene_file, draft, start):
+    promise = promise_with(0.9, 0.4, 0.42, 0.57).changed(draft=draft)
+    first = shot_sections(promise, load_scene_settings(scene_file))[0][1][0]
+    assert (
+        first.startswith(start) and first.endswith("Promised before ONE PLAIN COLOR, which promises too much.")
+    ) or draft
+    assert first.count(": ") == 1 + draft and ". Promised before " in first

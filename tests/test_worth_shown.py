@@ -119,3 +119,16 @@ def test_what_stood_behind_the_object_is_said_and_a_plain_color_loudly():
     assert any("ONE PLAIN COLOR" in line for line in promise_lines(HELPFUL, plain))
     manifest = {"promise": HELPFUL.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
     assert "ONE PLAIN COLOR" in render(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+
+
+@pytest.mark.parametrize("views", [0, 48])
+def test_that_the_promise_is_a_draft_is_said(views):
+    summary = some_report().summary.changed(background="procedural rooms", draft_views=views)
+    report = some_report().changed(summary=summary)
+    promise = HELPFUL.changed(draft=views > 0)
+    manifest = {"promise": promise.model_dump(mode="json"), "settings": {}, "kind": "design", "page_mm": (210, 297)}
+    page = render(report.model_dump(mode="json"), manifest | {"design": None}, {}, None)
+    assert ("The promise is a draft of 48 views, no more than a hint." in page) == (views > 0)
+    line = "promised before procedural rooms"
+    hint = f"{line}, a draft of 48 views and no more than a hint"
+    assert (hint if views else line) in verdict_lines(report)

@@ -111,7 +111,7 @@ def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
                 float(np.mean([rate_of(result, name) for result in results])),
                 clustered([gain_of(result, name, hardest(result, CONTROLS)) for result in results]),
                 *((None, None) if name == "ours" else (clustered(behind), clustered(by_pair))),
-                float(np.mean([result.answers["passes"][name] for result in results])),
+                round(float(np.mean([result.answers["passes"][name] for result in results]))),
                 float(np.mean([result.answers["seconds"][name] for result in results])),
             )
         )

@@ -233,6 +233,7 @@ class Summary(Strict):
     worth: Worth | None = None  # beside its controls; null where there is nothing to compare
     left_out: tuple[str, ...] = ()
     background: str = ""  # what stood behind the object when the promise was made
+    draft_views: int = 0  # of a promise that is a draft: from how many views
     models: dict[str, ModelRate] = Field(default_factory=dict)
     sessions: tuple[SessionCount, ...] = ()
     sessions_known_from: str = ""

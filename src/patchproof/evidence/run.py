@@ -194,6 +194,7 @@ def report_of(
         next_step=do,
         worth=worth,
         background=behind(manifest.settings),
+        draft_views=manifest.promise.n if manifest.promise is not None and manifest.promise.draft else 0,
         models=rates,
         forecast=forecast,
     )

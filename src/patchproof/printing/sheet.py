@@ -54,7 +54,7 @@ def sheet_of_several(
     """
     name = template or runs[0].scene.settings.sheet.template
     page, made = load_template(name), [_content(run, name, control) for run in runs]
-    plans = [_plan(scene, page, content.promise) for content, scene in made] if page.plan_page else []
+    plans = [_plan(scene, page, content) for content, scene in made] if page.plan_page else []
     return write_several(pdf_path, page, [content for content, _ in made], plans)
 
 

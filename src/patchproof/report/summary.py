@@ -60,7 +60,8 @@ def verdict_lines(report: Any) -> list[str]:
     lines.append(f"verdict: {summary.verdict} (effect: {summary.effect}). {summary.reason}".strip())
     lines += [summary.next_step] if summary.next_step else []
     if summary.background:
-        lines.append(f"promised before {summary.background}")
+        hint = f", a draft of {summary.draft_views} views and no more than a hint" if summary.draft_views else ""
+        lines.append(f"promised before {summary.background}{hint}")
     lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
     if summary.sessions:
         lines.append(f"sessions: {len(summary.sessions)} ({summary.sessions_known_from})")
