@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 
 import pytest
 from safetensors import SafetensorError
@@ -17,7 +18,10 @@ from safetensors import torch as safetensors_torch
 from patchproof.cli import console
 from patchproof.optimizer import run as run_module
 from patchproof.optimizer.run import load_run, optimize_scene
+from patchproof.printing.sheet import sheet_of_several
+from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.raster import page_count
 from patchproof.sheets.template import template_names
 from patchproof.strict import Refused, validated
 from patchproof.study.study import STUDIES, load_study, run_study
@@ -74,6 +78,9 @@ def test_a_draft_says_that_it_is_one(tmp_path, scene_file, capsys):
     assert made.scene.settings.optimize.steps == 2 and (made.promise.n, made.promise.draft) == (8, True)
     assert command("sheet", run, "--out", tmp_path / "s.pdf") == 0 and "Draft of 8 views" in capsys.readouterr().out
     assert load_manifest(tmp_path / "s.json").promise.draft
+    other = replace(made, scene=load_scene(scene_file, seed=5, steps=2))
+    several = sheet_of_several([made, other], tmp_path / "two.pdf", template="a3")
+    assert [manifest.plan_page for manifest in several] == [2, 3] and page_count(tmp_path / "two.pdf") == 3
     with pytest.raises(Refused, match="promise of 8 views, two sessions, at least, got 7"):
         optimize_scene(scene_file, tmp_path / "other", promise_views=7)
 
