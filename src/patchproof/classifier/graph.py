@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -85,7 +86,8 @@ class Program(torch.nn.Module):
             keywords = {name: _filled(argument, values, photos) for name, argument in step.keywords.items()}
             if step.several and photos.is_meta:
                 _check_split(arguments)
-            results = step.compute(*arguments, **keywords)
+            compute = step.compute if limit is None else _WEIGHED.get(step.compute, step.compute)
+            results = compute(*arguments, **keywords)
             for number, result in zip(step.results, results if step.several else [results], strict=True):
                 values[number] = result
             for number in step.spent:  # memory is used again while it is in the cache
@@ -104,6 +106,46 @@ class Program(torch.nn.Module):
         if any(tensor._version for tensor in [*weights, photos]):
             raise ValueError("it changes its weights or its input")
         self.weighed.add(shape)
+
+
+def _like_first(compute: Callable[..., Any]) -> Callable[..., Any]:
+    """`compute` where its result has the shape of its first argument."""
+
+    def weighed(first: Any, *others: Any, **keywords: Any) -> Any:
+        tensors = [first, *(other for other in others if isinstance(other, Tensor))]
+        if all(isinstance(tensor, Tensor) and tensor.dtype == torch.float32 for tensor in tensors):
+            if np.broadcast_shapes(*(tensor.shape for tensor in tensors)) == first.shape:
+                return first.new_empty_strided(first.shape, first.stride())
+        return compute(first, *others, **keywords)
+
+    return weighed
+
+
+def _conv2d(photos: Tensor, weight: Tensor, bias: Any = None, stride=(1, 1), pad=(0, 0), apart=(1, 1), *groups: Any):
+    """Sizes by the formula of torch.nn.Conv2d's documentation."""
+    sizes = (photos.shape[2:], weight.shape[2:], stride, pad, apart)
+    if not all(len(pair) == 2 for pair in sizes):
+        return _ATEN.conv2d.default(photos, weight, bias, stride, pad, apart, *groups)
+    pairs = zip(*sizes, strict=True)
+    rows, columns = ((size + 2 * p - a * (kernel - 1) - 1) // s + 1 for size, kernel, s, p, a in pairs)
+    return photos.new_empty(photos.shape[0], weight.shape[0], rows, columns)
+
+
+def _mean(values: Tensor, over: list[int] | None, keep: bool = False, **_: Any) -> Tensor:
+    gone = {dimension % values.dim() for dimension in over or range(values.dim())}
+    sizes = (1 if at in gone else size for at, size in enumerate(values.shape) if keep or at not in gone)
+    return values.new_empty(*sizes)
+
+
+# On tensors without memory torch computes these in Python, for which it imports its compiler and SymPy: two seconds.
+_ATEN = torch.ops.aten
+_PLAIN = (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div), (_ATEN.relu, _ATEN.relu6, _ATEN.hardtanh, _ATEN.hardswish)
+_WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
+    **{operator.Tensor: _like_first(operator.Tensor) for operator in _PLAIN[0]},
+    **{operator.default: _like_first(operator.default) for operator in _PLAIN[1]},
+    _ATEN.conv2d.default: _conv2d,
+    _ATEN.mean.dim: _mean,
+}
 
 
 def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
