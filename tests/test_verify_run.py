@@ -20,7 +20,7 @@ from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.evidence.task import Options
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.quality import FrameLight, shows_nothing
 from patchproof.photo.read import Photo
 from patchproof.strict import Refused
 from test_photo_synthetic import make_manifest, noisy_design, page_raster, photograph, save, some_design, view
@@ -313,11 +313,47 @@ def test_two_processes_give_the_same_bytes_as_one(folder):
 
 def test_controls_decide_the_effect(folder, tmp_path):
     for i in range(6):
-        save(np.full((100, 100, 3), 20 + i, np.uint8), tmp_path / f"b{i}.jpg")
+        save(half_lit(20 + i), tmp_path / f"b{i}.jpg")
     evidence = verified(folder, controls=tmp_path)
     assert evidence.summary.effect == "shown"
     (control,) = evidence.controls
     assert (control.recognized, control.n, control.pairs) == (0, 6, 6)
+
+
+def half_lit(code):
+    """A picture of something: two tones."""
+    picture = np.full((100, 100, 3), code, np.uint8)
+    picture[:, 50:] += 10
+    return picture
+
+
+def test_controls_that_show_nothing_never_count_and_are_named(folder, tmp_path):
+    """Lens caps, black frames and noise are no bare object: with them alone no effect is tested."""
+    rng = np.random.default_rng(0)
+    nothing = {
+        "b0": rng.integers(0, 256, (100, 100, 3)),
+        "b1": rng.normal(3, 2, (100, 100, 3)).clip(0, 255),
+        "b2": np.zeros((100, 100, 3)),
+        "b3": np.full((100, 100, 3), 255),
+    }
+    for name, picture in nothing.items():
+        save(picture.astype(np.uint8), tmp_path / f"{name}.jpg")
+    (tmp_path / "b9.jpg").write_bytes(b"no picture")
+    evidence = verified(folder, controls=tmp_path)
+    (control,) = evidence.controls
+    assert (control.n, control.shown, evidence.summary.effect) == (0, None, "not_tested")
+    said = evidence.summary.left_out
+    assert sum("one tone or noise" in sentence for sentence in said) == 4 and any("b9.jpg" in each for each in said)
+    save(half_lit(20), tmp_path / "b4.jpg")  # beside one of something
+    (control,) = verified(folder, controls=tmp_path).controls
+    assert (control.recognized, control.n) == (0, 1)
+
+
+@pytest.mark.parametrize(("contrast", "nothing"), [(1, True), (3, False)])
+def test_two_tones_show_something_from_a_code_or_two_on(contrast, nothing):
+    picture = np.full((240, 320, 3), 90, np.uint8)
+    picture[:, 160:] += contrast
+    assert shows_nothing(picture) is nothing
 
 
 def test_only_scans_have_no_rate(tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from typer.testing import CliRunner
 
 from patchproof.claims import wilson
+from patchproof.cli import app
 from patchproof.evidence.results import Control
 from patchproof.evidence.verdict import EACH, judge, next_step, sessions_needed
 from patchproof.evidence.worth import worth_of
@@ -42,6 +44,31 @@ def promise_with(rate, bare, low, high, goal="assist"):
 
 HELPFUL, HARMFUL = promise_with(0.9, 0.4, 0.42, 0.57), promise_with(0.2, 0.6, -0.5, -0.3)
 USELESS = promise_with(0.015, 0.0, -0.01, 0.03)  # keeps what it promises
+
+
+@pytest.mark.parametrize(
+    ("promise", "recognized", "kept", "helps"),
+    [
+        (HELPFUL, 36, True, True),
+        (HELPFUL, 20, False, False),
+        (USELESS, 0, True, False),
+        (HARMFUL, 8, False, False),
+        (promise_with(0.1, 0.6, -0.6, -0.4, "deceive"), 4, True, True),
+    ],
+)
+def test_a_useless_patch_keeps_its_promise_and_is_not_taken_for_one_that_helps(promise, recognized, kept, helps):
+    summary = summary_of(recognized, 40, promise)
+    assert (summary.meets("kept"), summary.meets("helps")) == (kept, helps)
+    assert not summary.changed(worth=None).meets("helps")  # nothing to compare with
+
+
+@pytest.mark.parametrize(("exits", "how"), [(0, ()), (0, ("--require", "kept")), (1, ("--require", "helps"))])
+def test_scripts_can_ask_for_more_than_a_useless_promise_that_held(exits, how, monkeypatch, tmp_path):
+    useless = some_report().changed(summary=summary_of(0, 40, USELESS))
+    monkeypatch.setattr("patchproof.journey.verify.verify_photos", lambda *_, **__: useless)
+    done = CliRunner().invoke(app, ["verify", "photos", "--sheet", "a.json", "--out", str(tmp_path), *how])
+    assert done.exit_code == exits and done.stdout.startswith("No better than the bare object.")
+    assert ("--require helps asks for both" in done.stderr) == ("kept" in how)
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,8 @@ def optimize(
     device: Device = "cpu",
     seed: Seed = None,
     require: Annotated[
-        str | None, typer.Option(help='"better" makes a design exit with 1 that is not better than its best control.')
+        Literal["better"] | None,
+        typer.Option(help='"better" makes a design exit with 1 that is not better than its best control.'),
     ] = None,
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
@@ -64,8 +65,6 @@ def optimize(
     from patchproof.scene.scene import load_scene
     from patchproof.settings import behind
 
-    if require not in (None, "better"):
-        raise typer.BadParameter('takes "better" only', param_hint="--require")
     if draft:
         steps, promise = steps or DRAFT_STEPS, promise or DRAFT_VIEWS
     with progress() as bar:
@@ -215,7 +214,13 @@ def verify(
     ] = None,
     ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
-    require: Annotated[str | None, typer.Option(help='"kept" makes any other verdict exit with 1.')] = None,
+    require: Annotated[
+        Literal["kept", "helps"] | None,
+        typer.Option(
+            help='What else than exits with 1: "kept", a promise that held, however little it promised; "helps", one '
+            "that held of a patch that beats every control."
+        ),
+    ] = None,
     ledger: Annotated[
         int, typer.Option(min=0, help="Photographs in gap ledger and estimated effect at most; 0 for none.")
     ] = 24,
@@ -231,8 +236,6 @@ def verify(
     from patchproof.journey.verify import verify_photos
     from patchproof.report.summary import verdict_lines
 
-    if require not in (None, "kept"):
-        raise typer.BadParameter('takes "kept" only', param_hint="--require")
     with progress() as bar:
         report = verify_photos(
             photos,
@@ -256,4 +259,6 @@ def verify(
     if nothing:
         see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
         print(see, file=sys.stderr)
-    raise typer.Exit(1 if nothing or (require == "kept" and report.summary.verdict != "kept") else 0)
+    if require == "kept" and report.summary.meets("kept") and not report.summary.meets("helps"):
+        print("The promise held, and the patch is not shown to help: --require helps asks for both.", file=sys.stderr)
+    raise typer.Exit(1 if nothing or (require is not None and not report.summary.meets(require)) else 0)

@@ -3,7 +3,7 @@
 In: `Item`s, a `Task` (all that a photograph is measured against), the networks, open workers. Out: a `MeasuredPhoto`
 for each, in order, however they finished, without its pictures and squares. A file that cannot be read, cannot be
 measured or ends its process each time becomes a rejected entry; the others go on. Of a control's photographs only what
-the networks see counts, since a bare object carries no marker.
+the networks see counts, since a bare object carries no marker; one that shows nothing at all is rejected.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
 from patchproof.evidence.camera import view_of
-from patchproof.evidence.classify import Judges, squares_of
+from patchproof.evidence.classify import Judges, square_of, squares_of
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.ledger import usable
 from patchproof.evidence.measure import MeasuredPhoto, measure
@@ -32,7 +32,7 @@ from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.exif import of_a_camera
 from patchproof.photo.limits import limited
-from patchproof.photo.quality import FrameLight
+from patchproof.photo.quality import FrameLight, shows_nothing
 from patchproof.photo.read import Photo, read_photo
 from patchproof.strict import Finite, Share, Strict
 from patchproof.workers import WorkerDied, Workers, result_of
@@ -41,6 +41,7 @@ WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keep
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
+_EMPTY = "it shows one tone or noise and nothing else: take it again"
 _PART = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 
 # linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
@@ -159,6 +160,8 @@ def _measure(task: Task, item: Item) -> MeasuredPhoto:
     photo = read_photo(item.path)
     squares = squares_of(photo.srgb, task.sizes_px)
     if item.control is not None:
+        if shows_nothing(square_of(photo.srgb)[0]):
+            return _rejected(item, Remark(code="empty", advice=_EMPTY))
         return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
     view = view_of(photo, task.camera)
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi)

@@ -18,6 +18,7 @@ from patchproof.strict import Finite, Strict
 Status = Literal["judged", "measured", "rejected"]
 Word = Literal["kept", "broken", "cannot_tell"]
 Effect = Literal["shown", "not_shown", "not_tested"]
+Required = Literal["kept", "helps"]  # of a verification that scripts go on from
 Row = tuple[Finite, Finite, Finite]
 # where the focal length comes from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to
 # check, or contradicts; EXIF of another size or shape of picture, which is not used; nowhere
@@ -239,6 +240,13 @@ class Summary(Strict):
     sessions_known_from: str = ""
     estimated: Estimated | None = None
     forecast: Forecast | None = None
+
+    def meets(self, required: Required) -> bool:
+        """Whether the promise held; for "helps" also whether the patch helps, since a useless one that was promised to
+        be useless keeps its promise.
+        """
+        helps = self.worth is not None and self.worth.word == "helps"
+        return self.verdict == "kept" and (helps or required == "kept")
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,8 @@ def gather_evidence(
             first = others.setdefault(entry.sha256 or item.name, entry)
             if first is not entry:
                 left_out.append(f"{name}/{entry.file} has the bytes of {name}/{first.file}, which counts once")
+            elif entry.status == "rejected" and entry.remark is not None:
+                left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
     controls = {name: list(entries.values()) for name, entries in shown.items()}
     report = report_of(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
     return report.changed(summary=report.summary.changed(estimated=estimated, left_out=tuple(left_out)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 CODES = (
     "unreadable",
     "too_costly",
+    "empty",
     "too_few_markers",
     "blurred",
     "clipped",

@@ -1,4 +1,5 @@
-"""What a photograph lets one see: the blur of markers' borders, the light of paper and ink beside them, clipping.
+"""What a photograph lets one see: anything at all, the blur of markers' borders, the light of paper and ink beside
+them, clipping.
 
 In: a photograph and its fitted markers. Out: `FrameLight`. Paper and ink are read half a module outside and inside of
 every border and corrected for what the blur mixed between them, per channel in linear light.
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.special import ndtr
 
@@ -17,6 +19,9 @@ from patchproof.photo.edges import Borders, border_frame, sample
 
 CLIPPED_CODE = 253  # JPEG and sharpening move full white by a code or two
 _ALONG = 16
+_CELLS = 8  # along each side, whose mean colors are compared
+_LEAST_CODES = 1.0  # standard deviation of those means: lens caps, black frames and burnt-out ones stay below
+_NOISES = 2.0  # times what pixels' noise alone lets the means differ
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,17 @@ class FrameLight:
     ink: np.ndarray
     contrast: float
     clipped: float  # share of paper samples with a channel at full white
+
+
+def shows_nothing(srgb: np.ndarray) -> bool:
+    """Whether a uint8 picture H×W×3 is one tone or noise, by the mean colors of 8 × 8 cells of it. Noise is known from
+    neighboring pixels, which in pictures of anything are much alike.
+    """
+    means = cv2.resize(srgb, (_CELLS, _CELLS), interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    steps = np.diff(srgb[:: max(1, len(srgb) // 200)].astype(np.int16), axis=1).astype(float)
+    noise = np.sqrt((steps**2).mean() / 2) if steps.size else 0.0
+    pixels = srgb.shape[0] * srgb.shape[1] / _CELLS**2
+    return float(means.std(0).max()) < max(_LEAST_CODES, _NOISES * noise / np.sqrt(pixels))
 
 
 def blur_px(markers: Iterable[Borders]) -> float:
