@@ -26,6 +26,7 @@ from patchproof.begin.sides import (
     side_of,
     side_views,
 )
+from patchproof.printing.sheet import blank_page
 from patchproof.render.stage import set_stage
 from patchproof.scene.fitting import largest
 from patchproof.scene.scene import load_scene, make_scene
@@ -206,6 +207,56 @@ def test_a_file_without_units_asks_for_a_length(bottles, suffix):
         length_of(bottles / f"bottle.{suffix}")
 
 
+def test_a_file_without_units_says_how_long_it_is_in_its_own(tmp_path):
+    trimesh.creation.box((300, 200, 100)).export(tmp_path / "carton.stl")
+    with pytest.raises(Refused, match="longest extent: 300 if it is in mm"):
+        length_of(tmp_path / "carton.stl")
+
+
+def test_an_object_that_may_lie_is_turned_by_one_word(bottles, tmp_path):
+    """The scene has the other axis as a comment, the preview says which, `new` writes it whole."""
+    path = tmp_path / "scene.toml"
+    bottle = {"label": "bottle", "overwrite": True}
+    lines = new_scene(str(bottles / "lying.glb"), path, **bottle)
+    assert "write the scene again with --up z" in lines[0] and load_scene_settings(path).object.up == "y"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r'(?m)^up = "y".*\n# (up = "z")', r"\1", text), encoding="utf-8")
+    turned = load_scene(path).mesh
+    assert np.argmax(np.ptp(turned.vertices, axis=0)) == 1
+    assert not [each for each in preview_scene(path, tmp_path / "b").warnings if "may lie" in each]
+    path.write_text(text, encoding="utf-8")
+    (warning,) = [each for each in preview_scene(path, tmp_path / "a").warnings if "may lie" in each]
+    assert warning.endswith('write up = "z" in [object]')
+    lines = new_scene(str(bottles / "lying.glb"), path, up="z", **bottle)
+    assert lines[0] == 'up: "z", as given' and "# up" not in path.read_text(encoding="utf-8")
+    standing = tmp_path / "standing.toml"
+    new_scene(str(bottles / "bottle.glb"), standing, label="bottle")
+    assert load_scene_settings(path).patch == load_scene_settings(standing).patch
+
+
+def test_a_side_is_preferred_to_a_top_that_is_not_twice_as_large(tmp_path):
+    for name, size, side in (("low", (0.3, 0.1, 0.3), "+y"), ("high", (0.225, 0.17, 0.3), "+z")):
+        trimesh.creation.box(size).export(tmp_path / f"{name}.glb")
+        new_scene(str(tmp_path / f"{name}.glb"), tmp_path / f"{name}.toml", label="carton")
+        assert load_scene_settings(tmp_path / f"{name}.toml").patch.side == side
+    assert "of the camera to left and right of straight above" in (tmp_path / "low.toml").read_text(encoding="utf-8")
+
+
+def test_a_name_that_is_no_label_is_answered_with_the_labels_where_they_are_few():
+    with pytest.raises(Refused, match='add --label with what it is to be recognized as: "lamp", "vase"'):
+        label_of(("lamp", "vase"), None, "lantern.glb")
+    with pytest.raises(Refused, match=r"recognized as[.]$"):
+        label_of([f"thing {i}" for i in range(21)], None, "lantern.glb")
+
+
+def test_photographs_beside_two_blanks_ask_which_one_hangs_there(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for name in ("one", "two"):
+        blank_page(tmp_path / f"{name}.pdf", template="blank_a4")
+    with pytest.raises(Refused, match=r"one blank sheet's JSON, got one[.]json, two[.]json"):
+        new_scene(str(tmp_path / "photos"), tmp_path / "scene.toml")
+
+
 def test_a_length_that_makes_no_sense_is_refused(tmp_path):
     trimesh.creation.box((31, 1, 1)).export(tmp_path / "hall.glb")
     trimesh.creation.box((30, 1, 1)).export(tmp_path / "yard.glb")
@@ -252,8 +303,9 @@ def test_what_cannot_be_optimized_is_not_written(tmp_path):
     (tmp_path / "things").mkdir()
     with pytest.raises(Refused, match="a CSV of labels among images, or a blank sheet's JSON"):
         new_scene(str(tmp_path / "things"), path)
-    with pytest.raises(Refused, match="pictures have no length"):
-        new_scene(str(tmp_path / "things"), path, length_mm=30)
+    for given in ({"length_mm": 30}, {"up": "z"}):
+        with pytest.raises(Refused, match="pictures have no length and no axes"):
+            new_scene(str(tmp_path / "things"), path, **given)
     with pytest.raises(Refused, match="no file at"):
         new_scene(str(tmp_path / "mug.glb"), path)
     assert not path.exists()

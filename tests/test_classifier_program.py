@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 import warnings
 import zipfile
 from pathlib import Path
@@ -10,7 +12,7 @@ import pytest
 import torch
 
 from archives import LABELS, ConvNeXt, Hostile, ResNet, Small, ViT, exported, save, seeded
-from patchproof.classifier import center_square, load_classifier, program
+from patchproof.classifier import center_square, graph, load_classifier, program
 from patchproof.classifier.program import load_program
 from patchproof.strict import Refused
 
@@ -124,6 +126,54 @@ EXECUTABLE = {
     shape_expression: 'the shape "__import__',
 }
 HARMLESS = [enum_in_a_tree, default_of_an_argument]  # not read, or only compared with other names
+
+
+def _meta(*shape, dtype=torch.float32):
+    return torch.empty(shape, dtype=dtype, device="meta")
+
+
+ATEN = torch.ops.aten
+PHOTOS, KERNEL = _meta(2, 6, 17, 16), _meta(8, 6, 3, 5)
+
+
+@pytest.mark.parametrize(
+    ("operator", "arguments"),
+    [
+        (ATEN.conv2d.default, (PHOTOS, KERNEL)),
+        (ATEN.conv2d.default, (PHOTOS, KERNEL, _meta(8), [2, 3], [1, 4], [2, 1])),
+        (ATEN.conv2d.default, (PHOTOS, _meta(6, 1, 3, 3), None, [2], [1], [1], 6)),
+        (ATEN.conv2d.default, (PHOTOS[0], KERNEL)),
+        (ATEN.add.Tensor, (PHOTOS, _meta(6, 1, 1))),
+        (ATEN.mul.Tensor, (_meta(6, 1, 1), PHOTOS)),
+        (ATEN.sub.Tensor, (PHOTOS, _meta(16, dtype=torch.float64))),
+        (ATEN.div.Tensor, (PHOTOS, 2.0)),
+        (ATEN.relu6.default, (PHOTOS.permute(0, 2, 3, 1),)),
+        (ATEN.mean.dim, (PHOTOS, [2, -1], True)),
+        (ATEN.mean.dim, (PHOTOS, [-3])),
+        (ATEN.mean.dim, (PHOTOS, None)),
+    ],
+)
+def test_programs_are_weighed_by_the_sizes_that_torch_would_say(operator, arguments):
+    ours, torchs = graph._WEIGHED[operator](*arguments), operator(*arguments)
+    assert (ours.shape, ours.dtype, ours.stride()) == (torchs.shape, torchs.dtype, torchs.stride())
+
+
+def test_a_program_of_common_operators_starts_without_torchs_compiler(tmp_path):
+    """Torch imports it, and SymPy, for tensors without memory: two seconds of every command."""
+
+    class Common(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.first, self.last = torch.nn.Conv2d(3, 4, 3, 2), torch.nn.Conv2d(4, len(LABELS), 1)
+
+        def forward(self, photos):
+            return self.last(torch.nn.functional.relu6(self.first(photos - 0.5))).mean((2, 3))
+
+    path = save(tmp_path, exported(Common()))
+    load = f"load_classifier('file:{path}', Path('.'))"
+    loaded = "assert not {'torch._dynamo', 'sympy'} & sys.modules.keys(), 'imported'"
+    code = f"import sys; from pathlib import Path; from patchproof.classifier import load_classifier; {load}; {loaded}"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("make", [*EXECUTABLE, *HARMLESS], ids=lambda make: make.__name__)

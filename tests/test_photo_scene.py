@@ -280,6 +280,12 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
     )
     with pytest.raises(Refused, match=told):
         load_photo_scene(settings_of(world, object=object_), tmp_path, 0)
+    (tmp_path / "sessions").mkdir()
+    (tmp_path / "mixed").rename(tmp_path / "sessions" / "first")
+    with pytest.raises(
+        Refused, match=r"0 usable of 0 in .*; 7 more in folders there, which are not looked into: lay all"
+    ):
+        load_photo_scene(settings_of(world, object={"photos": "sessions", "sheet": "BLANK.json"}), tmp_path, 0)
 
 
 @pytest.mark.parametrize(

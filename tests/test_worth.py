@@ -30,6 +30,15 @@ def promise_of(rate: float, controls: dict[str, tuple[float, float, float]], goa
     )
 
 
+def test_the_headline_compares_the_views_that_both_were_shown_in():
+    """Controls are shown in some of the views; the whole promise's rate beside theirs contradicts the difference."""
+    promise = promise_of(0.825, {"bare": (0.95, -0.24, 0.13)})
+    claim = promise.controls["bare"].changed(difference=-0.05)
+    headline = promise.changed(controls={"bare": claim}).headline
+    assert "90.0% beside 95.0% recognized in the same views, -5.0 points" in headline and "82.5" not in headline
+    assert "40.0% beside 20.0% recognized, +20.0 points" in promise_of(0.4, {"bare": (0.2, 0.1, 0.3)}).headline
+
+
 @pytest.mark.parametrize(
     ("controls", "goal", "best", "worth"),
     [

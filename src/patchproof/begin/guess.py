@@ -23,19 +23,21 @@ from patchproof.mesh.load_mesh import load_mesh
 from patchproof.strict import Refused
 
 _GLTF = (".glb", ".gltf")
-_HABIT: dict[str, Literal["y", "z"]] = {".obj": "y", ".stl": "z", ".ply": "z"}
+Axis = Literal["y", "z"]
+_HABIT: dict[str, Axis] = {".obj": "y", ".stl": "z", ".ply": "z"}
 _MM_PER_M = 1000.0
 _SENSIBLE_MM = (5.0, 30_000.0)  # what people hang paper on
 _FOOT = 0.005  # of the object's height: what is no higher touches the ground
 _HARDLY = 0.25  # of its footprint: a cylinder that lies touches 14 % by these rules, one that stands 79 %
 _FIRMLY = 2.0  # times as much: where the other axis is clearly the better one
+_FEW_LABELS = 20  # of a network: all of them are said
 
 
 @dataclass(frozen=True)
 class Up:
     """The axis of the file that points up, why, and whether that is odd."""
 
-    axis: Literal["y", "z"]
+    axis: Axis
     reason: str
     odd: str | None = None
 
@@ -45,15 +47,28 @@ def guess_up(path: Path) -> Up:
     other one is taken then.
     """
     kind = path.suffix.lower()
-    axis: Literal["y", "z"] = "y" if kind in _GLTF else _HABIT.get(kind, "z")
-    other: Literal["y", "z"] = "z" if axis == "y" else "y"
-    stands, would = (footing(load_mesh(path, 100.0, up).vertices) for up in (axis, other))
+    axis: Axis = "y" if kind in _GLTF else _HABIT.get(kind, "z")
+    odd = lies_oddly(load_mesh(path, 100.0, axis).vertices, axis)
+    if odd is not None and kind not in _GLTF:
+        return Up(other_axis(axis), f"as it stands: {kind[1:].upper()} files say nothing")
+    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {kind[1:].upper()} files", odd)
+
+
+def lies_oddly(vertices: np.ndarray, up: Axis) -> str | None:
+    """Words for an object (y up here, its file's `up` taken for that) that would stand clearly better with the file's
+    other axis up; None for any other.
+    """
+    x, y, z = vertices.T
+    turned = np.stack([x, z, -y] if up == "y" else [x, -z, y], 1)
+    stands, would = footing(vertices), footing(turned)
     if stands >= _HARDLY or would < max(_HARDLY, _FIRMLY * stands):
-        return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {kind[1:].upper()} files")
-    so = f'it stands on {stands:.0%} of its footprint so, with "{other}" on {would:.0%}'
-    if kind in _GLTF:
-        return Up(axis, "glTF's standard", so)
-    return Up(other, f"as it stands: {kind[1:].upper()} files say nothing")
+        return None
+    return f'it stands on {stands:.0%} of its footprint so, with "{other_axis(up)}" on {would:.0%}'
+
+
+def other_axis(up: Axis) -> Axis:
+    """The other one of those that point up in files."""
+    return "z" if up == "y" else "y"
 
 
 def footing(vertices: np.ndarray) -> float:
@@ -72,7 +87,8 @@ def length_of(path: Path) -> float:
     """The longest extent by the file's own units; refused where it has none, or none that make sense."""
     do = "add --length-mm with the object's longest extent"
     if path.suffix.lower() not in _GLTF:
-        raise Refused("a file that says how large the object is", f"{path.name}, which has no units", do)
+        got = f"{path.name}, which has no units"
+        raise Refused("a file that says how large the object is", got, f"{do}: {file_length(path):.3g} if it is in mm")
     length_mm = file_length(path) * _MM_PER_M
     low, high = _SENSIBLE_MM
     if not low <= length_mm <= high:
@@ -100,8 +116,13 @@ def label_of(labels: Sequence[str], said: str | None, path: str) -> str | int:
             return _written(labels, find_words(labels, text, whole=True))
         except Refused:
             continue
-    do = "add --label"
+    few = f": {', '.join(map(_in_quotes, labels))}" if len(labels) <= _FEW_LABELS else ""
+    do = f"add --label with what it is to be recognized as{few}"
     raise Refused("a file that is called what it shows", f'"{" ".join(words)}", which no label of the network is', do)
+
+
+def _in_quotes(label: str) -> str:
+    return f'"{label}"'
 
 
 def _written(labels: Sequence[str], index: int) -> str | int:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from patchproof.begin.guess import Up, guess_up, label_of, length_of
+from patchproof.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis
 from patchproof.begin.sides import SIDE_NAMES
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
@@ -39,6 +39,7 @@ _SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
 _LARGEST_MM = (165.0, 175.0)  # of a piece on A4, with the chart and the rulers around it
 _LONGER = 1.6  # a piece's longer side over its shorter one at most
 _FRONT = 1.25  # times as large has to be what is preferred to the front, or to a flat card
+_TOP = 0.5  # of a top's size: who looks at it looks from above, as few photographs do
 _ENOUGH = 0.8  # of the largest piece that any side is asked for: a flat card as large is not bent for more
 _HEAD = ("# Written by patchproof new. All keys and their ranges: patchproof keys.", "# Millimeters and degrees.", "")
 _TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
@@ -54,8 +55,9 @@ class _Hang:
 
     @property
     def worth(self) -> float:
-        """Its area, that of a flat card on the front counting more."""
-        return _area(self.size_mm) * (1 if self.bend else _FRONT) * (_FRONT if self.side == "+z" else 1)
+        """Its area, that of a flat card on the front counting more, and on the top less."""
+        sides: dict[Side | None, float] = {"+z": _FRONT, "+y": _TOP}
+        return _area(self.size_mm) * (1 if self.bend else _FRONT) * sides.get(self.side, 1)
 
 
 def new_scene(
@@ -64,17 +66,21 @@ def new_scene(
     *,
     label: str | None = None,
     length_mm: float | None = None,
+    up: Axis | None = None,
     models: Sequence[str] = ("builtin",),
     overwrite: bool = False,
 ) -> list[str]:
-    """Write the scene file `out` for a mesh or a folder; returns what was guessed and warned of."""
+    """Write the scene file `out` for a mesh or a folder; returns what was guessed and warned of. `length_mm` and `up`
+    are in place of what a mesh's file says.
+    """
     out = Path(out)
     check_file(out, overwrite)
     base = out.resolve().parent
     if thing.startswith("primitive:") or not is_folder(Path(thing)):
-        text, lines = _of_mesh(thing, base, label, length_mm, models)
-    elif length_mm is not None:
-        raise Refused("a mesh with --length-mm", f"the folder {thing}", "leave it out: pictures have no length")
+        text, lines = _of_mesh(thing, base, label, length_mm, up, models)
+    elif length_mm is not None or up is not None:
+        do = "leave it out: pictures have no length and no axes"
+        raise Refused("a mesh with --length-mm or --up", f"the folder {thing}", do)
     else:
         text, lines = _of_folder(Path(thing), base, label, models)
     warnings = _checked(text, base)
@@ -82,7 +88,9 @@ def new_scene(
     return [*lines, *(f"warning: {warning}" for warning in warnings)]
 
 
-def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None, models) -> tuple[str, list[str]]:
+def _of_mesh(
+    thing: str, base: Path, label: str | None, length_mm: float | None, axis: Axis | None, models
+) -> tuple[str, list[str]]:
     named = label_of(_labels(models, base), label, thing)
     path = Path(thing)
     if thing.startswith("primitive:"):
@@ -91,7 +99,11 @@ def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None,
         up, said = Up("y", "primitives are"), "the primitive's own"
         own_mm = primitives.longest_mm(thing.partition(":")[2])
     else:
-        up, said, own_mm = guess_up(path), "by the file's units, meters: measure it", None
+        up, said, own_mm = (
+            Up(axis, "as given") if axis else guess_up(path),
+            "by the file's units, meters: measure it",
+            None,
+        )
     if length_mm is None:
         length_mm = own_mm or length_of(path)
     else:
@@ -100,6 +112,9 @@ def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None,
     hang = _place(mesh, length_mm)
     mesh_name = thing if thing.startswith("primitive:") else _path(path, base)
     near, far = (_rounded(times * length_mm) for times in (NEAR, FAR))
+    azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
+    if hang.side == "+y":
+        azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
     lies = "paper follows the surface" if hang.bend else "a flat card lies close enough"
     text = "\n".join(
         [
@@ -108,7 +123,7 @@ def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None,
             f"mesh = {_quoted(mesh_name)}",
             _line(f"length_mm = {length_mm:g}", f"its longest extent, {said}"),
             _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
-            *([f"# It may lie oddly: {up.odd}. Look at the preview's ground line."] if up.odd else []),
+            *_turned(up),
             "",
             "[patch]",
             *_size(*hang.size_mm),
@@ -122,8 +137,8 @@ def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None,
             "",
             "[view]",
             _line(f"distance_mm = [{near:g}, {far:g}]", f"to the object's middle: {NEAR} to {FAR} times its length"),
-            _line("azimuth_deg = [-60, 60]", "of the camera about the vertical; 0 faces the piece"),
-            _line("elevation_deg = [2, 27]", "above the horizontal"),
+            _line("azimuth_deg = [-60, 60]", azimuth),
+            _line("elevation_deg = [2, 27]", elevation),
             "",
             "# [background]",
             _line('# images = "places"', "a folder of photographs of places; procedural rooms without"),
@@ -132,12 +147,25 @@ def _of_mesh(thing: str, base: Path, label: str | None, length_mm: float | None,
     )
     width, height = hang.size_mm
     lines = [
-        f'up: "{up.axis}", {up.reason}' + (f"; {up.odd}: look at the preview" if up.odd else ""),
+        f'up: "{up.axis}", {up.reason}'
+        + (f"; {up.odd}: if the preview shows it lying, {_again(up)}" if up.odd else ""),
         f"length: {length_mm:g} mm, {said}",
         f"piece: {width:g} × {height:g} mm, {_on(hang)}",
         f'label: "{named}" ({models[0]})',
     ]
     return text, lines
+
+
+def _turned(up: Up) -> list[str]:
+    """The other axis as a comment beside the one of an object that may lie."""
+    if up.odd is None:
+        return []
+    other = f'# up = "{other_axis(up.axis)}"'
+    return [_line(other, f"in its place if the preview shows it lying: {up.odd}"), f"# Best of all {_again(up)}."]
+
+
+def _again(up: Up) -> str:
+    return f"write the scene again with --up {other_axis(up.axis)}: sides and sizes change with it"
 
 
 def _on(hang: _Hang) -> str:
@@ -186,6 +214,11 @@ def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str
     if not tables and not manifests:
         expected = "a CSV of labels among images, or a blank sheet's JSON in or beside the folder of photographs"
         raise Refused(expected, f"neither for {folder}", "put one there, or name a mesh")
+    if not tables and len(manifests) > 1:
+        names = ", ".join(path.name for path in manifests)
+        raise Refused(
+            "one blank sheet's JSON", names, "lay the one that hangs there into the folder, the others elsewhere"
+        )
     if not tables:
         named = label_of(_labels(models, base), label, folder.resolve().name)
         sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from patchproof.begin.guess import lies_oddly, other_axis
 from patchproof.begin.sides import SIDE_NAMES, extent_mm, gap_colors, gap_top_mm, side_of, side_views, stretch_colors
 from patchproof.begin.uv_layout import uv_layouts
 from patchproof.begin.views import Look, looks
@@ -63,7 +64,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
         stage = set_stage(scene)
         seen = looks(stage, classifiers, indices)
-        mesh = isinstance(scene, MeshScene)
+        mesh, warnings = isinstance(scene, MeshScene), (*scene.warnings, *_lying(scene, settings))
         if mesh:
             _write_object(stage, folder / OBJECT)
         layouts = _write_layouts(scene, folder)
@@ -76,7 +77,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             target=settings.target,
             facts=facts,
             problems=problems,
-            warnings=scene.warnings,
+            warnings=warnings,
             sides=[(view, data_uri(png(view.picture))) for view in side_views(stage)] if mesh else [],
             maps=_maps(scene) if isinstance(scene, PatchScene) else [],
             layouts=layouts,
@@ -86,7 +87,15 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             summaries=_answers(settings, seen),
         )
         write_whole(folder / PAGE, text)
-    return Preview(Path(out) / PAGE, lines, scene.warnings, " ".join(problems) or None)
+    return Preview(Path(out) / PAGE, lines, warnings, " ".join(problems) or None)
+
+
+def _lying(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
+    """What to do about an object that would stand better with its file's other axis up."""
+    up, name = settings.object.up, settings.object.mesh or ""
+    odd = lies_oddly(scene.mesh.vertices, up) if isinstance(scene, MeshScene) and ":" not in name else None
+    other = other_axis(up)
+    return () if odd is None else (f'the object may lie: {odd}. If it does, write up = "{other}" in [object]',)
 
 
 def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:

@@ -134,7 +134,7 @@ def _conv2d(photos: Tensor, weight: Tensor, bias: Any = None, stride=(1, 1), pad
 def _mean(values: Tensor, over: list[int] | None, keep: bool = False, **_: Any) -> Tensor:
     gone = {dimension % values.dim() for dimension in over or range(values.dim())}
     sizes = (1 if at in gone else size for at, size in enumerate(values.shape) if keep or at not in gone)
-    return values.new_empty(*sizes)
+    return values.new_empty(tuple(sizes))
 
 
 # On tensors without memory torch computes these in Python, for which it imports its compiler and SymPy: two seconds.

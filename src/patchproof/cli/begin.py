@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -24,13 +24,17 @@ def new(
     length_mm: Annotated[
         float | None, typer.Option(min=1e-3, help="The object's longest extent; from the file's units without.")
     ] = None,
+    up: Annotated[
+        Literal["y", "z"] | None, typer.Option(help="The file's axis that points up; by its format without.")
+    ] = None,
     models: Annotated[str, typer.Option(help="Comma-separated classifiers.")] = "builtin",
     overwrite: Overwrite = False,
 ) -> None:
     """Write a commented scene for an object, photographs of it, or a folder of images."""
     from patchproof.begin.new import new_scene
 
-    lines = new_scene(thing, out, label=label, length_mm=length_mm, models=names_of(models) or (), overwrite=overwrite)
+    given = names_of(models) or ()
+    lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=given, overwrite=overwrite)
     say(*lines, f"scene: {out}", f"next: patchproof preview {out}")
 
 
@@ -45,6 +49,8 @@ def preview(
     shown = preview_scene(scene, out, overwrite=overwrite)
     warn(shown.warnings)
     say(*shown.lines, f"page: {shown.page}")
+    if not shown.refused:
+        say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
     if shown.refused:
         print(shown.refused, file=sys.stderr)
         raise typer.Exit(1)

@@ -84,6 +84,8 @@ def optimize(
     place = read_place(out)
     background = behind(run.scene.settings.model_dump())
     say(*promise_lines(run.promise, background), *([] if place is None else place_lines(place)), f"run: {out}")
+    if run.scene.settings.patch.kind == "patch":
+        say(f"next: patchproof sheet {out} --out sheet.pdf")
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
 
 

@@ -203,10 +203,17 @@ def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[
         reasons = f" ({'; '.join(f'{name}: {code}' for name, code in skipped.items())})" if skipped else ""
         raise Refused(
             f"at least {LEAST_PHOTOS} photographs of the blank sheet on the object",
-            f"{len(photos)} usable of {len(files)} in {folder}{reasons}",
+            "; ".join([f"{len(photos)} usable of {len(files)} in {folder}{reasons}", *_in_folders(folder)]),
             "take more, sharp, with the whole flat sheet in view",
         )
     return tuple(photos), skipped
+
+
+def _in_folders(folder: Path) -> list[str]:
+    """Words for photographs in folders in the folder, as sessions of a print lie for `verify`."""
+    inside = [p for p in folder.iterdir() if is_folder(p)] if is_folder(folder) else []
+    count = sum(len(_files(each)) for each in inside)
+    return [f"{count} more in folders there, which are not looked into: lay all in one"] if count else []
 
 
 def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageFit, float]:

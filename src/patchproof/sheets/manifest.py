@@ -200,13 +200,16 @@ class Promise(Strict):
 
     @property
     def headline(self) -> str:
-        """What the design is worth, in a sentence."""
+        """What the design is worth, in a sentence; the rates are those of the views that both were shown in."""
         control = self.controls[self.best_control]
         low, high = (100 * end for end in control.difference_interval)
         advice = "" if self.worth == "better" else " Try another place, size or seed before printing it."
+        rate = control.rate + control.difference
+        shared = "" if abs(rate - self.rate) < 5e-4 else " in the same views"
+        points = f"{100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
         return (
-            f"{self.hint}{self.worth} than its best control ({self.best_control}): {self.rate:.1%} beside "
-            f"{control.rate:.1%} recognized, {100 * control.difference:+.1f} points [{low:+.1f}, {high:+.1f}].{advice}"
+            f"{self.hint}{self.worth} than its best control ({self.best_control}): {rate:.1%} beside "
+            f"{control.rate:.1%} recognized{shared}, {points}.{advice}"
         )
 
 
