@@ -86,8 +86,7 @@ class Program(torch.nn.Module):
             keywords = {name: _filled(argument, values, photos) for name, argument in step.keywords.items()}
             if step.several and photos.is_meta:
                 _check_split(arguments)
-            compute = step.compute if limit is None else _WEIGHED.get(step.compute, step.compute)
-            results = compute(*arguments, **keywords)
+            results = step.compute(*arguments, **keywords)
             for number, result in zip(step.results, results if step.several else [results], strict=True):
                 values[number] = result
             for number in step.spent:  # memory is used again while it is in the cache
@@ -121,11 +120,11 @@ def _like_first(compute: Callable[..., Any]) -> Callable[..., Any]:
     return weighed
 
 
-def _conv2d(photos: Tensor, weight: Tensor, bias: Any = None, stride=(1, 1), pad=(0, 0), apart=(1, 1), *groups: Any):
+def _convolution(photos: Tensor, weight: Tensor, bias, stride, pad, apart, transposed: bool, *others: Any) -> Tensor:
     """Sizes by the formula of torch.nn.Conv2d's documentation."""
     sizes = (photos.shape[2:], weight.shape[2:], stride, pad, apart)
-    if not all(len(pair) == 2 for pair in sizes):
-        return _ATEN.conv2d.default(photos, weight, bias, stride, pad, apart, *groups)
+    if transposed or not all(len(pair) == 2 for pair in sizes):
+        return _ATEN.convolution.default(photos, weight, bias, stride, pad, apart, transposed, *others)
     pairs = zip(*sizes, strict=True)
     rows, columns = ((size + 2 * p - a * (kernel - 1) - 1) // s + 1 for size, kernel, s, p, a in pairs)
     return photos.new_empty(photos.shape[0], weight.shape[0], rows, columns)
@@ -139,11 +138,11 @@ def _mean(values: Tensor, over: list[int] | None, keep: bool = False, **_: Any) 
 
 # On tensors without memory torch computes these in Python, for which it imports its compiler and SymPy: two seconds.
 _ATEN = torch.ops.aten
-_PLAIN = (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div), (_ATEN.relu, _ATEN.relu6, _ATEN.hardtanh, _ATEN.hardswish)
+_PLAIN = (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div), (_ATEN.relu, _ATEN.hardtanh, _ATEN.hardswish)
 _WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
     **{operator.Tensor: _like_first(operator.Tensor) for operator in _PLAIN[0]},
     **{operator.default: _like_first(operator.default) for operator in _PLAIN[1]},
-    _ATEN.conv2d.default: _conv2d,
+    _ATEN.convolution.default: _convolution,
     _ATEN.mean.dim: _mean,
 }
 
@@ -164,8 +163,13 @@ class _Watched(TorchDispatchMode):
         super().__init__()
         self.limit = limit
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing here is compiled; to be told so, torch would import its compiler."""
+        return False
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        results = func(*args, **(kwargs or {}))
+        results = _WEIGHED.get(func, func)(*args, **(kwargs or {}))
         for value in results if isinstance(results, (list, tuple)) else [results]:
             if isinstance(value, Tensor) and (value.numel() > self.limit or value.dim() > MAX_DIMENSIONS):
                 raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(value.shape))}")
