@@ -1,13 +1,14 @@
 """What is called measured is right: photographs degraded in forty ways, against the truth they were made from.
 
 Run as a program it takes as many photographs as wanted and prints a table by kind:
-`python tests/test_photo_degraded.py --photos 1000 [--first 0] [--kinds fold_30 waves]`.
+`python tests/test_photo_degraded.py --photos 1000 [--first 0] [--kinds fold_30 waves] [--rows FILE]`.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections import Counter, defaultdict
+import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +27,7 @@ from patchproof.evidence.results import PhotoEntry
 from patchproof.geometry import rect_corners
 from patchproof.photo.read import read_photo
 
+FIGURES = ("corners", "azimuth", "distance", "tilt")
 CORNERS = rect_corners((0.0, 0.0, SIDE_MM, SIDE_MM))
 USUAL = ("plain", "plain_8_markers", "noise_mild", "jpeg_60", "defocus_1", "motion_2", "shadow", "lens_mild")
 ROLLED = ("roll_60_100_bends", "roll_100_300_bends", "roll_300_1000_bends", "roll_100_300", "roll_any_axis")
@@ -104,21 +106,51 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=len(KINDS))
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
+    parser.add_argument(
+        "--rows", type=Path, help="JSON lines, one for each photograph; those in it are not taken again"
+    )
     asked = parser.parse_args()
-    results: dict[str, list[Outcome]] = defaultdict(list)
+    lines = asked.rows.read_text(encoding="utf-8").splitlines() if asked.rows and asked.rows.is_file() else []
+    rows = {(row["kind"], row["seed"]): row for row in map(json.loads, lines)}
     with TemporaryDirectory() as folder:
         for number in range(asked.photos):
-            seed, kind = divmod(number, len(asked.kinds))
-            results[asked.kinds[kind]].append(outcome(asked.kinds[kind], asked.first + seed, Path(folder)))
-    print(f"{'kind':20s}  n measured; within 1x, within 3x of: corners, azimuth, distance, tilt; codes of the others")
-    for kind, all_of in [*results.items(), ("all", [one for many in results.values() for one in many])]:
-        taken = [one for one in all_of if one.measured]
-        shares = []
-        for name in ("corners", "azimuth", "distance", "tilt"):
-            pairs = [one.off[name] for one in taken if name in one.off]
+            seed, kind = asked.first + number // len(asked.kinds), asked.kinds[number % len(asked.kinds)]
+            if (kind, seed) not in rows:
+                rows[kind, seed] = row_of(kind, seed, outcome(kind, seed, Path(folder)))
+                if asked.rows:
+                    with asked.rows.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(rows[kind, seed]) + "\n")
+    print(*table(list(rows.values())), sep="\n")
+
+
+def row_of(kind: str, seed: int, result: Outcome) -> dict:
+    """An outcome as it is stored: `off` has for each figure how far it is off and the stated 95 % uncertainty."""
+    off = {name: [round(float(value), 5) for value in pair] for name, pair in result.off.items()}
+    return {"kind": kind, "seed": seed, "measured": result.measured, "code": result.entry.code, "off": off}
+
+
+def table(rows: list[dict]) -> list[str]:
+    """A line for each kind and for all, then one for each figure beyond three times what was stated."""
+    lines = [
+        f"{'kind':20s}  n measured; within 1x, within 3x of: corners, azimuth, distance, tilt; codes of the others"
+    ]
+    for kind in [*KINDS, "all"]:
+        own = [row for row in rows if kind in (row["kind"], "all")]
+        taken, shares = [row["off"] for row in own if row["measured"]], []
+        for name in FIGURES:
+            pairs = [off[name] for off in taken if name in off]
             shares.append(f"{sum(a <= b for a, b in pairs)}, {sum(a <= 3 * b for a, b in pairs)} of {len(pairs)}")
-        codes = Counter(one.entry.code for one in all_of if not one.measured)
-        print(f"{kind:20s} {len(all_of):3d} {len(taken):3d}; {'; '.join(shares)}; {dict(codes)}")
+        codes = Counter(row["code"] for row in own if not row["measured"])
+        if own:
+            lines.append(f"{kind:20s} {len(own):4d} {len(taken):4d}; {'; '.join(shares)}; {dict(codes)}")
+    beyond = (
+        f"{row['kind']} {row['seed']}: {name} {a:.3g} off, stated {b:.3g}"
+        for row in rows
+        if row["measured"]
+        for name, (a, b) in row["off"].items()
+        if a > 3 * b
+    )
+    return [*lines, *beyond]
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ _SURE_SIGMAS = 2.0
 _ODD_GROWS = 2.0  # the design's corner beside a marker that does not agree may lie off by as much as that, or more
 MOST_RATIO_ERROR = 0.005  # a less certain x:y ratio is "not measured"
 # Neither are these, 95 %. Beyond some 10° a sheet that is seen from the left may as well be seen from the right.
-MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.1
+MOST_AZIMUTH_ERROR_DEG, MOST_DISTANCE_ERROR = 10.0, 0.2
 
 
 @dataclass(frozen=True)
@@ -137,11 +137,13 @@ def geometry_of(
         cells = register(placed.srgb, fit.px_from_mm, surface.rect_mm, promised.design, px_per_mm, blur)
         shift, corners, at_corners = _shifts(cells, surface)
         uncertainty = float(np.hypot(uncertainty, _SURE_SIGMAS * at_corners))
+    hidden_rad = unrolled.shape.hidden_turn_rad if unrolled else 0.0
+    tilt_by = placed.px, placed.parameters, placed.covariance, surface.center_mm, hidden_rad
     geometry = Geometry(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
         tilt_deg=tilt_deg,
-        tilt_uncertainty_deg=tilt_uncertainty_deg(placed.px, placed.parameters, placed.covariance, surface.center_mm),
+        tilt_uncertainty_deg=tilt_uncertainty_deg(*tilt_by),
         contrast=light.contrast,
         blur_px=blur,
         corner_uncertainty_mm=uncertainty,
@@ -175,10 +177,11 @@ def pose_of(view: View, placed: Placed, surface: Surface) -> tuple[Pose | None, 
     """Where the camera stood, None where its focal length is not known or not to be believed, and which it is."""
     if view.matrix_px is None:
         return None, "cropped" if view.cropped else "unknown"
+    camera = view.matrix_px, view.focal_spread, surface.center_mm, view.calibrated
     if placed.unrolled is None:
-        stance = flat_stance(placed.fit, view.matrix_px, view.focal_spread, surface.center_mm)
+        stance = flat_stance(placed.fit, *camera)
     else:
-        stance = bent_stance(placed.unrolled.shape, view.matrix_px, view.focal_spread, surface.center_mm)
+        stance = bent_stance(placed.unrolled.shape, *camera)
     # a camera file is what stretched prints are measured by, which perspective cannot tell from a wrong focal length
     if stance.agrees is False and not view.calibrated:
         return None, "contradicted"

@@ -26,7 +26,7 @@ _ANY_BEND = [(bend, direction) for direction in np.radians([0, 45, 90, 135]) for
 _LOST_PX = 1.0  # rms of a fit that ended in the wrong place, as 2 of 378 did, all of strong bends, before _ANY_BEND
 
 Project = Callable[[np.ndarray, np.ndarray], np.ndarray]
-Tangent = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Tangent = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,9 @@ class Shape:
     """A fitted model: `project(parameters, mm)`, the parameters with their covariance, what it leaves.
 
     `radius_mm` of the paper is positive where it bulges towards the camera, None where a lens explains the picture.
-    `tangent(parameters, point_mm)` is `camera_from_tangent` 4×4 of the paper's tangent plane there; None for a lens,
-    whose first eight parameters times `unit` are a homography. `bend_px` is what is left and is no noise.
+    `tangent(parameters, point_mm, turned_rad)` is `camera_from_tangent` 4×4 of the paper's tangent plane there, turned
+    about the rulings; None for a lens, whose first eight parameters times `unit` are a homography. `hidden_turn_rad` is
+    by how much the paper turns from its middle to the nearest marker. `bend_px` is what is left and is no noise.
     """
 
     project: Project
@@ -46,6 +47,7 @@ class Shape:
     bend_px: float
     tangent: Tangent | None = None
     unit: np.ndarray | None = None
+    hidden_turn_rad: float = 0.0
 
     def px(self, mm: np.ndarray) -> np.ndarray:
         """Pixels N×2 of page points N×2."""
@@ -71,10 +73,11 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CO
         depth = x * np.sinc(turn / 2 / np.pi) * np.sin(turn / 2)  # (1 - cos t) / t, without its hole at 0
         return np.column_stack([c * across - s * y, s * across + c * y, depth]), turn
 
-    def tangent(p, point):
+    def tangent(p, point, turned_rad):
         (place,), (turn,) = in_space(p, np.asarray(point, float)[None])
         c, s = np.cos(p[8]), np.sin(p[8])
-        along, rulings = np.array([c * np.cos(turn), s * np.cos(turn), np.sin(turn)]), np.array([-s, c, 0.0])
+        slope, rulings = turn + turned_rad, np.array([-s, c, 0.0])
+        along = np.array([c * np.cos(slope), s * np.cos(slope), np.sin(slope)])
         x, y = c * along - s * rulings, s * along + c * rulings
         turned, pose = Rotation.from_rotvec(p[:3]).as_matrix(), np.eye(4)
         pose[:3, :3] = turned @ np.column_stack([x, y, np.cross(x, y)])
@@ -99,7 +102,10 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CO
     bend = best.x[7]
     if abs(bend) < 1e-6 or abs(bend) > np.pi / 2:
         return None
-    return replace(_shape(project, best, mm, px, reach / bend, floor_px), tangent=tangent)
+    turns = in_space(best.x, mm)[1].reshape(-1, 4)
+    hidden = np.maximum(turns.min(1), -turns.max(1)).min()  # of markers to either side of the middle, 0 of one over it
+    shape = _shape(project, best, mm, px, reach / bend, floor_px)
+    return replace(shape, tangent=tangent, hidden_turn_rad=max(0.0, float(hidden)))
 
 
 def _starts(flat, mm, px, camera, center, reach) -> list[tuple[float, float]]:
