@@ -106,9 +106,7 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=len(KINDS))
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
-    parser.add_argument(
-        "--rows", type=Path, help="JSON lines, one for each photograph; those in it are not taken again"
-    )
+    parser.add_argument("--rows", type=Path, help="JSON lines, one a photograph; those in it are not taken again")
     asked = parser.parse_args()
     lines = asked.rows.read_text(encoding="utf-8").splitlines() if asked.rows and asked.rows.is_file() else []
     rows = {(row["kind"], row["seed"]): row for row in map(json.loads, lines)}

@@ -31,18 +31,18 @@ _PAPER = 0.003  # of both, of angles in radians and of lengths: paper that is no
 _TOO_FAR = 9.2  # χ² of two degrees of freedom, 99 %
 _TOO_FAR_SIGMAS = 2.6
 _WEAK = 0.1  # of the focal length's logarithm: perspective that knows it no better cannot confirm it
-# 95 % of what crops to 0.35 to 0.95 of a picture, anywhere in it, turned the azimuth by where perspective could not tell
-# (2,000 drawn with a focal length of 36 mm on film); the most was 16.4
+# 95 % of what crops to 0.35 to 0.95 of a picture, anywhere in it, turned the azimuth by where perspective cannot tell
+# (2,000 drawn, with a focal length of 36 mm on film); the most was 16.4
 _CROPPED_DEG = 7.0
 # one σ, as a share of the turn between the middle and the nearest marker: 95 % are 0.43 of it. A fold right beside the
-# middle turns that by all that the sheet turns to one side of it, 1.28 of it where markers of a tenth lie in the corners
+# middle turns that by all that the sheet turns to one side, 1.28 of it where markers of a tenth lie in the corners
 _HIDDEN_TURN = 0.22
 
 
 @dataclass(frozen=True)
 class Stance:
-    """Azimuth and distance, each with its 95 % uncertainty (infinite: not known), and whether perspective agrees with the
-    focal length: None where it tells too little.
+    """Azimuth and distance, each with its 95 % uncertainty (infinite: not known), and whether perspective agrees with
+    the focal length: None where it tells too little.
     """
 
     azimuth_deg: float
