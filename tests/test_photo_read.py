@@ -139,6 +139,25 @@ def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypat
     assert (caught.value.figure, caught.value.threshold) == (2400, 1000)
 
 
+@pytest.mark.parametrize(("mode", "suffix"), [("RGB", "jpg"), ("I;16", "png")])
+def test_of_too_many_pixels_to_measure_four_become_one(mode, suffix, tmp_path, monkeypatch):
+    """The mean of each four, turned upright, with the focal length in the pixels that there are."""
+    codes = np.kron(np.arange(12, dtype=np.uint8).reshape(3, 4) * 20, np.ones((20, 20), np.uint8))
+    image = Image.fromarray(codes.astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(codes).convert(mode)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 36
+    image.save(tmp_path / f"a.{suffix}", exif=exif, quality=100)
+    monkeypatch.setattr(read, "WHOLE_PX", codes.size)
+    whole = read_photo(tmp_path / f"a.{suffix}")
+    monkeypatch.setattr(read, "WHOLE_PX", codes.size - 1)
+    fewer = read_photo(tmp_path / f"a.{suffix}")
+    assert whole.srgb.shape == (80, 60, 3) and fewer.srgb.shape == (40, 30, 3)
+    expected = np.rot90(codes[::2, ::2], -1)[..., None]
+    assert np.abs(fewer.srgb.astype(int) - expected).max() <= (0 if suffix == "png" else 3)
+    assert fewer.focal_px == pytest.approx(whole.focal_px / 2) and whole.focal_px is not None
+
+
 def test_heic_without_its_extra_says_what_to_install(tmp_path, monkeypatch):
     import sys
 

@@ -20,7 +20,8 @@ import numpy as np
 from patchproof.color import photo_codes_of
 from patchproof.input import readable_formats
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.detect import detector_settings, luminance, printed_markers
+from patchproof.photo.detect import detected, detector_settings, luminance, printed_markers
+from patchproof.photo.limits import limited
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.sheets.board import Board
 from patchproof.sheets.piece import DICTIONARY
@@ -59,7 +60,7 @@ def see_boards(
     places = corner_places_mm(board, ruler_mm)
     for number, path in enumerate(paths, 1):
         try:
-            view, focal_px = _view(path, board, places)
+            view, focal_px = limited(_view, path, board, places)
             views.append(view)
             states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
         except CannotJudge as cannot:
@@ -98,7 +99,7 @@ def find_corners(srgb: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray
     """
     dictionary = printed_markers(DICTIONARY)
     light = photo_codes_of(luminance(srgb))
-    quads, names, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings()).detectMarkers(light)
+    quads, names = detected(light, dictionary, detector_settings())
     none = np.zeros(0, int), np.zeros((0, 2)), len(quads)
     if names is None:
         return none

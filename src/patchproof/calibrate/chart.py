@@ -28,6 +28,7 @@ from patchproof.channel.printer import Printer, load_printer, node_colors, print
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.input import is_file, is_folder
 from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.limits import limited
 from patchproof.photo.read import pictures_in, read_photo
 from patchproof.sheets.manifest import Manifest
 from patchproof.strict import Refused
@@ -227,7 +228,8 @@ def _read_all(
     for number, paths in enumerate(prints):
         for path in paths:
             try:
-                readings.append(Reading(path, number, read_chart(read_photo(path), manifest, camera)))
+                photo = limited(lambda path: read_chart(read_photo(path), manifest, camera), path)
+                readings.append(Reading(path, number, photo))
             except CannotJudge as cannot:
                 warnings.append(f"{path.name} is left out ({cannot})")
             on_photo(len(readings) + len(warnings), total)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from patchproof.channel import lens
+from patchproof.photo.detect import strips
 from patchproof.photo.exif import EXIF_SPREAD
 from patchproof.photo.read import Photo
 
@@ -57,9 +58,13 @@ def _straightened(srgb: np.ndarray, camera: lens.Camera, matrix: np.ndarray) -> 
     """The picture through a pinhole of the same matrix."""
     if not camera.bends:
         return srgb
-    size_px = srgb.shape[1], srgb.shape[0]
     index = matrix.copy()
     index[:2, 2] -= 0.5  # OpenCV counts from pixel centers
     terms = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
-    maps = cv2.initUndistortRectifyMap(index, terms, None, index, size_px, cv2.CV_32FC1)
-    return cv2.remap(srgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    picture = np.empty_like(srgb)
+    for rows in strips(srgb):  # maps of the whole take 8 bytes a pixel
+        part, of_part = picture[rows], index - np.array([[0, 0, 0], [0, 0, rows.start], [0, 0, 0]])
+        size_px = part.shape[1], part.shape[0]
+        maps = cv2.initUndistortRectifyMap(index, terms, None, of_part, size_px, cv2.CV_32FC1)
+        cv2.remap(srgb, *maps, cv2.INTER_CUBIC, part, cv2.BORDER_REPLICATE)
+    return picture

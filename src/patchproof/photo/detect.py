@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from patchproof.color import LIGHT_OF_CODE, LUMINANCE
+from patchproof.input import seconds_left
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import squares_in
@@ -29,9 +30,8 @@ LIGHT = LIGHT_OF_CODE.astype(np.float32)
 COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
 UPSCALE_BELOW_PX = 4_000_000
 LARGEST_LEVEL_PX = 25_000_000  # of what one level looks at: a second of work and 0.3 GB; sharper pictures are halved
-# Each takes up to 3 ms to be looked into, which nothing interrupts; photographs have some hundreds at most, and a
-# million pixels have no room for many more.
-MOST_SQUARES, _FEW_PX = 3000, 1_000_000
+MOST_SQUARES = 2000  # photographs have some hundreds at most
+_SQUARE_S = 0.004  # that it takes to look into one, which nothing interrupts
 MIRROR_PX = 3000  # longer side of the picture in which a mirrored sheet is looked for
 DARK = 70  # median code value below which local contrast helps; in light photos it hurts sharp markers
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least that has been read
@@ -164,7 +164,7 @@ def light_picture(srgb: np.ndarray) -> np.ndarray:
     step = max(1, max(srgb.shape) // 512)
     bright = max(float(np.percentile(luminance(np.ascontiguousarray(srgb[::step, ::step])), 99.9)), 1e-3)
     picture = np.empty(srgb.shape[:2], np.uint8)
-    for rows in _strips(srgb):
+    for rows in strips(srgb):
         cv2.convertScaleAbs(luminance(srgb[rows]), picture[rows], alpha=255 / bright)
     return picture
 
@@ -190,15 +190,12 @@ def detector_settings() -> cv2.aruco.DetectorParameters:
 
 def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int, np.ndarray]]:
     """Ids and corners of one gray picture, part of one whose longer side has `whole_px` pixels."""
-    if picture.size > _FEW_PX and (squares := squares_in(picture)) > MOST_SQUARES:
-        advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
-        raise CannotJudge("too_costly", squares, MOST_SQUARES, advice)
     settings = detector_settings()
     settings.minDistanceToBorder = 0
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3
     settings.minMarkerPerimeterRate = min(0.03 * whole_px, 4 * SMALLEST_MARKER_PX) / max(picture.shape)
-    corners, ids, _ = cv2.aruco.ArucoDetector(printed, settings).detectMarkers(picture)
+    corners, ids = detected(picture, printed, settings)
     if ids is None:
         return
     for marker_id, quad in zip(np.asarray(ids).reshape(-1), corners, strict=True):
@@ -206,6 +203,18 @@ def _detect(picture: np.ndarray, printed, whole_px: float) -> Iterator[tuple[int
         quad = np.asarray(quad, float).reshape(4, 2) + 0.5
         if possible(quad):
             yield int(marker_id), quad
+
+
+def detected(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameters):
+    """OpenCV's (corners, ids or None) of one uint8 gray picture; `CannotJudge("too_costly")` where it shows so much
+    that looks like markers that the detector would not end in time.
+    """
+    squares = squares_in(picture, settings.minMarkerPerimeterRate * max(picture.shape))
+    most = int(min(MOST_SQUARES, seconds_left() / _SQUARE_S))
+    if squares > most:
+        advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
+        raise CannotJudge("too_costly", squares, most, advice)
+    return cv2.aruco.ArucoDetector(printed, settings).detectMarkers(picture)[:2]
 
 
 def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
@@ -221,12 +230,12 @@ def luminance(srgb: np.ndarray) -> np.ndarray:
     table = np.repeat(LIGHT[None, :, None], 3, 2)
     weights = np.array([LUMINANCE], np.float32)
     out = np.empty(srgb.shape[:2], np.float32)
-    for rows in _strips(srgb):  # the table makes 12 bytes of each pixel
+    for rows in strips(srgb):  # the table makes 12 bytes of each pixel
         cv2.transform(cv2.LUT(srgb[rows], table), weights, out[rows])
     return out
 
 
-def _strips(srgb: np.ndarray) -> Iterator[slice]:
-    """Slices of rows of a million pixels or so."""
+def strips(srgb: np.ndarray) -> Iterator[slice]:
+    """Slices of rows of a million pixels or so; the last may pass the end."""
     rows = max(1, 1_000_000 // srgb.shape[1])
     return (slice(y, y + rows) for y in range(0, len(srgb), rows))

@@ -4,7 +4,8 @@ In: any still picture that Pillow reads as one of `FORMATS` (HEIC with the `heic
 orientation is applied, an embedded color profile (phones write Display P3) is converted to sRGB, alpha lies on
 white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, and what takes more
 than `limits` allow "too_costly", so that one bad file never stops a batch. Pixels are converted in strips, since whole
-copies took twice the memory. Ignored on purpose: the DPI that a photograph claims, and sidecar files.
+copies took twice the memory, and of more than `WHOLE_PX` every four become one: to measure takes up to 30 bytes each.
+Ignored on purpose: the DPI that a photograph claims, and sidecar files.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     8: lambda a: np.rot90(a),
 }
 _STRIP_PX = 4_000_000
+WHOLE_PX = 33_000_000  # few cameras but phones give more; markers are looked for in 25 million at once
 # What people copy along with photographs and nobody reads here.
 _OTHERS = (
     (".mov .mp4 .m4v .avi .mkv .webm .3gp .mts", "videos, which are not looked at (take still photographs)"),
@@ -48,7 +50,7 @@ _TOO_DEEP = "folders in folders, which are not looked into (one folder for each 
 
 @dataclass(frozen=True)
 class Photo:
-    """An upright photograph: uint8 H×W×3 sRGB, focal length in its own pixels or None, the standard deviation of its
+    """An upright photograph: uint8 H×W×3 sRGB, focal length in these pixels or None, the standard deviation of its
     logarithm, whether EXIF has one that does not fit this picture, and whether it is a crop or a screenshot as far as
     file and EXIF say.
     """
@@ -80,7 +82,9 @@ def read_photo(path: str | Path) -> Photo:
 
 
 def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, bool], bool]:
-    """(uint8 sRGB H×W×3 as stored, EXIF orientation, what EXIF says of the focal length, whether it is a part)."""
+    """(uint8 sRGB H×W×3 as stored, EXIF orientation, what EXIF says of the focal length, whether it is a part): halved
+    along both sides where there are too many pixels.
+    """
     from PIL import Image
 
     if (size := path.stat().st_size) > MOST_BYTES:
@@ -92,9 +96,10 @@ def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, boo
             pixels = image.width * image.height
             if pixels > LARGEST_PX:
                 raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX)
-            focal, orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
-            part = is_part(image, path.name)
-            return _pixels(image), orientation if isinstance(orientation, int) else 1, focal, part
+            step = 2 if pixels > WHOLE_PX and min(image.size) > 1 else 1
+            (focal_px, *focal), orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
+            focal, part = (focal_px and focal_px / step, *focal), is_part(image, path.name)
+            return _pixels(image, step), orientation if isinstance(orientation, int) else 1, focal, part
 
 
 def list_photos(folder: str | Path) -> list[Path]:
@@ -156,18 +161,27 @@ def _allow_heic(path: Path) -> None:
     pillow_heif.register_heif_opener()
 
 
-def _pixels(image) -> np.ndarray:
-    """uint8 sRGB H×W×3 of an open picture."""
+def _pixels(image, step: int) -> np.ndarray:
+    """uint8 sRGB H×W×3 of an open picture, each the mean of `step` times `step`."""
     image.load()
     if image.mode.startswith("I") or image.mode == "F":
-        return _of_deep_gray(image)
+        return np.repeat(_fewer(_of_deep_gray(image), step)[..., None], 3, axis=2)
     into_srgb = _into_srgb(image)
-    pixels = np.empty((image.height, image.width, 3), np.uint8)
-    rows = max(1, _STRIP_PX // image.width)
-    for top in range(0, image.height, rows):
-        strip = image.crop((0, top, image.width, min(top + rows, image.height)))
-        pixels[top : top + rows] = np.asarray(_opaque_rgb(strip if into_srgb is None else into_srgb(strip)))
+    pixels = np.empty((image.height // step, image.width // step, 3), np.uint8)
+    rows = max(1, _STRIP_PX // image.width // step)
+    for top in range(0, len(pixels), rows):
+        below = min(top + rows, len(pixels))
+        strip = image.crop((0, step * top, image.width, step * below))
+        strip = _opaque_rgb(strip if into_srgb is None else into_srgb(strip))
+        pixels[top:below] = _fewer(np.asarray(strip), step)
     return pixels
+
+
+def _fewer(pixels: np.ndarray, step: int) -> np.ndarray:
+    """Means of `step` times `step` pixels; what is left over at the right and below is dropped."""
+    height, width = (side // step for side in pixels.shape[:2])
+    whole = pixels[: step * height, : step * width]
+    return pixels if step == 1 else cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _into_srgb(image) -> Callable | None:
@@ -189,14 +203,14 @@ def _into_srgb(image) -> Callable | None:
 
 
 def _of_deep_gray(image) -> np.ndarray:
+    """uint8 H×W."""
     values = np.asarray(image)
     if values.dtype.kind == "f":  # floating point TIFF counts from 0 to 1
         values = np.nan_to_num(values.astype(np.float32), posinf=1.0)
         top = max(1.0, float(values.max(initial=0)))
     else:  # 16-bit gray arrives as I;16 or I
         values, top = np.clip(values, 0, 65535).astype(np.uint16), 65535
-    gray = cv2.convertScaleAbs(np.maximum(values, 0), alpha=255 / top)
-    return np.repeat(gray[..., None], 3, axis=2)
+    return cv2.convertScaleAbs(np.maximum(values, 0), alpha=255 / top)
 
 
 def _opaque_rgb(image):

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from patchproof.geometry import apply_homography, fit_homography, rect_corners
+from patchproof.photo.detect import strips
 from patchproof.photo.edges import GRID, REACH, border_frame, meet
 from patchproof.photo.rectify import (
     CORNER_NOISE_PX,
@@ -157,15 +158,17 @@ def _mm_from_px(project: Callable[[np.ndarray], np.ndarray], mm: np.ndarray) -> 
 
 def _straightened(srgb, project, px_from_mm, sheet_mm, margin_px: float) -> np.ndarray:
     """The photograph with the sheet's part resampled as if it were flat."""
-    box = part_around(apply_homography(px_from_mm, rect_corners(sheet_mm)), margin_px, srgb.shape)
-    y, x = np.mgrid[box] + 0.5
-    mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))
+    rows, columns = part_around(apply_homography(px_from_mm, rect_corners(sheet_mm)), margin_px, srgb.shape)
     left, top, width, height = sheet_mm
-    on_sheet = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
-    where = on_sheet.reshape(x.shape)
-    source = np.full((*x.shape, 2), -1, np.float32)
-    source[where] = project(mm[on_sheet]) - 0.5
-    part = cv2.remap(srgb, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     picture = srgb.copy()
-    picture[box][where] = part[where]
+    for strip in strips(srgb[rows]):  # of all of a large picture the coordinates would take gigabytes
+        box = slice(rows.start + strip.start, min(rows.start + strip.stop, rows.stop)), columns
+        y, x = np.mgrid[box] + 0.5
+        mm = apply_homography(np.linalg.inv(px_from_mm), np.column_stack([x.ravel(), y.ravel()]))
+        on_sheet = ((mm >= [left, top]) & (mm <= [left + width, top + height])).all(1)
+        where = on_sheet.reshape(x.shape)
+        source = np.full((*x.shape, 2), -1, np.float32)
+        source[where] = project(mm[on_sheet]) - 0.5
+        part = cv2.remap(srgb, source[..., 0], source[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        picture[box][where] = part[where]
     return picture

@@ -27,6 +27,7 @@ from patchproof.input import is_file, is_folder
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import DICTIONARY, find_markers
+from patchproof.photo.limits import limited
 from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -196,7 +197,7 @@ def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[
     files, photos, skipped = _files(folder), [], {}
     for path in files:
         try:
-            photos.append(see(path, manifest, piece, photo_px))
+            photos.append(limited(see, path, manifest, piece, photo_px))
         except CannotJudge as cannot:
             skipped[path.name] = cannot.code
     if len(photos) < LEAST_PHOTOS:

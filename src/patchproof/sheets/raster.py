@@ -3,15 +3,19 @@
 In: a PDF and a resolution. Out: uint8 H×W×3 sRGB. The page is rendered by PDFium, which did not write it. PDFium
 stretches a page to a whole number of pixels (0.2 mm across A4 at 150 dpi), so the part wanted is first made a page of
 its own whose size is a whole number of pixels; then pixel and millimeter differ by a scale alone.
-Left out on purpose: threads. PDFium is not thread-safe; render in processes.
+Left out on purpose: pages at the same time. PDFium is not thread-safe; render in processes.
 """
 
 from __future__ import annotations
 
+import atexit
+import ctypes
 import json
 import math
+import os
+import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,25 +23,33 @@ from typing import Any
 import numpy as np
 
 from patchproof.geometry import MM_PER_INCH
-from patchproof.input import LARGEST_JSON, is_file
+from patchproof.input import LARGEST_JSON, OutOfTime, Result, is_file, left_behind, within_time
 from patchproof.sheets.manifest import Manifest, Tile
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
 from patchproof.strict import Refused, validated
 
-LARGEST_PX = 20_000  # along a side; more would be gigabytes
+LARGEST_PX = 20_000  # along a side,
+MOST_PX = 160_000_000  # and in all: 0.5 GB, A2 at 600 dpi
+_AT_WORK = threading.Lock()  # of PDFium, which may have been left behind with a page
 
 
-def page_pixels(pdf_path: str | Path, page: int = 1, dpi: float = 150.0) -> np.ndarray:
+def page_pixels(pdf_path: str | Path, number: int = 1, dpi: float = 150.0) -> np.ndarray:
     """A page (from 1) with pixel = mm × dpi / 25.4; the last row and column may pass the page's edge."""
-    with _opened_page(pdf_path, page) as opened:
-        width, height = (math.ceil(side / 72 * dpi - 1e-3) for side in opened.get_size())
-        return _render(opened, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
+    import pypdfium2.raw as pdfium
+
+    def pixels(page) -> np.ndarray:
+        sides = pdfium.FPDF_GetPageWidthF(page), pdfium.FPDF_GetPageHeightF(page)
+        width, height = (math.ceil(side / 72 * dpi - 1e-3) for side in sides)
+        return _render(page, (0.0, 0.0, width * 72 / dpi, height * 72 / dpi), (width, height))
+
+    return _of_page(pdf_path, number, pixels)
 
 
 def page_count(pdf_path: str | Path) -> int:
     """How many pages a PDF has."""
-    with _opened(pdf_path) as pdf:
-        return len(pdf)
+    import pypdfium2.raw as pdfium
+
+    return _within_time(pdf_path, pdfium.FPDF_GetPageCount)
 
 
 def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.ndarray:
@@ -65,8 +77,8 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
 
 
 def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tuple[int, int]) -> np.ndarray:
-    with _opened_page(pdf_path, number) as page:
-        return _render(page, tuple(float(v) * POINTS_PER_MM for v in rect_mm), size_px)
+    rect_points = tuple(float(v) * POINTS_PER_MM for v in rect_mm)
+    return _of_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
 
 
 def _piece_from_page(manifest: Manifest, tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
@@ -112,42 +124,85 @@ def _existing(pdf_path: str | Path) -> None:
 
 @contextmanager
 def _opened(pdf_path: str | Path) -> Iterator[Any]:
-    import pypdfium2
+    """PDFium's handle of a file. Its own calls alone: the package's objects are closed at the end of the process, which
+    a page that is still being drawn does not survive.
+    """
+    import pypdfium2.raw as pdfium
 
     _existing(pdf_path)
+    pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
+    if not pdf:
+        raise _unreadable(pdf_path)
     try:
-        with pypdfium2.PdfDocument(str(pdf_path)) as pdf:
-            yield pdf
-    except pypdfium2.PdfiumError as error:
-        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
+        yield pdf
+    finally:
+        pdfium.FPDF_CloseDocument(pdf)
 
 
-@contextmanager
-def _opened_page(pdf_path: str | Path, page: int) -> Iterator[Any]:
-    with _opened(pdf_path) as pdf:
-        if not 1 <= page <= len(pdf):
-            raise Refused(f"a page from 1 to {len(pdf)} of {pdf_path}", f"{page}", "ask for another page")
-        yield pdf[page - 1]
+def _unreadable(pdf_path: str | Path) -> Refused:
+    return Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again")
+
+
+def _within_time(pdf_path: str | Path, work: Callable[[Any], Result]) -> Result:
+    """What `work` makes of an open PDF; refused where that takes too long: a few lines may draw forms in forms a
+    million times.
+    """
+
+    def done() -> Result:
+        with _AT_WORK, _opened(pdf_path) as pdf:
+            return work(pdf)
+
+    try:
+        return within_time(left_behind, done)
+    except OutOfTime as over:
+        from pypdfium2._library_scope import destroy_lib
+
+        atexit.unregister(destroy_lib)  # the library is still at work, and is not to be taken down
+        raise Refused("a page that is soon drawn", f"{pdf_path}, which takes {over}", "make the sheet again") from None
+
+
+def _of_page(pdf_path: str | Path, number: int, work: Callable[[Any], np.ndarray]) -> np.ndarray:
+    import pypdfium2.raw as pdfium
+
+    def done(pdf) -> np.ndarray:
+        pages = pdfium.FPDF_GetPageCount(pdf)
+        if not 1 <= number <= pages:
+            raise Refused(f"a page from 1 to {pages} of {pdf_path}", f"{number}", "ask for another page")
+        page = pdfium.FPDF_LoadPage(pdf, number - 1)
+        if not page:
+            raise _unreadable(pdf_path)
+        try:
+            return work(page)
+        finally:
+            pdfium.FPDF_ClosePage(page)
+
+    return _within_time(pdf_path, done)
 
 
 def _render(page, rect_points: tuple[float, ...], size_px: tuple[int, int]) -> np.ndarray:
     """The rectangle (x, y, width, height from the page's top-left, in points) as exactly that many pixels."""
-    import pypdfium2
     import pypdfium2.raw as pdfium
 
     _refuse_size(size_px)
-    left, _, _, top = page.get_mediabox()
+    left, bottom, right, top = (ctypes.c_float() for _ in range(4))
+    if not pdfium.FPDFPage_GetMediaBox(page, left, bottom, right, top):
+        top.value = pdfium.FPDF_GetPageHeightF(page)
     x, y, w, h = rect_points
-    box = (left + x, top - y - h, left + x + w, top - y)
-    page.set_mediabox(*box)
-    page.set_cropbox(*box)
-    bitmap = pypdfium2.PdfBitmap.new_native(*size_px, pdfium.FPDFBitmap_BGR)
-    bitmap.fill_rect((255, 255, 255, 255), 0, 0, *size_px)
-    pdfium.FPDF_RenderPageBitmap(bitmap, page, 0, 0, *size_px, 0, pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER)
-    return bitmap.to_numpy().copy()
+    box = (left.value + x, top.value - y - h, left.value + x + w, top.value - y)
+    pdfium.FPDFPage_SetMediaBox(page, *box)
+    pdfium.FPDFPage_SetCropBox(page, *box)
+    width, height = size_px
+    pixels = np.full((height, width, 3), 255, np.uint8)
+    bitmap = pdfium.FPDFBitmap_CreateEx(width, height, pdfium.FPDFBitmap_BGR, pixels.ctypes.data, 3 * width)
+    pdfium.FPDF_RenderPageBitmap(
+        bitmap, page, 0, 0, width, height, 0, pdfium.FPDF_ANNOT | pdfium.FPDF_REVERSE_BYTE_ORDER
+    )
+    pdfium.FPDFBitmap_Destroy(bitmap)
+    return pixels
 
 
 def _refuse_size(size_px: tuple[int, int]) -> None:
-    if not 1 <= min(size_px) <= max(size_px) <= LARGEST_PX:
-        got = f"{size_px[0]} × {size_px[1]}"
-        raise Refused(f"at most {LARGEST_PX} pixels along a side, and one at least", got, "lower the resolution")
+    width, height = size_px
+    if not 1 <= min(size_px) <= max(size_px) <= LARGEST_PX or width * height > MOST_PX:
+        most = f"at most {LARGEST_PX} pixels along a side, one at least, and {MOST_PX / 1e6:g} million in all"
+        raise Refused(most, f"{width} × {height}", "lower the resolution")
