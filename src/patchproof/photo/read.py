@@ -39,7 +39,7 @@ _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     8: lambda a: np.rot90(a),
 }
 _STRIP_PX = 4_000_000
-WHOLE_PX = 33_000_000  # few cameras but phones give more; markers are looked for in 25 million at once
+WHOLE_PX = 30_000_000  # few cameras but phones give more; markers are looked for in 25 million at once
 # What people copy along with photographs and nobody reads here.
 _OTHERS = (
     (".mov .mp4 .m4v .avi .mkv .webm .3gp .mts", "videos, which are not looked at (take still photographs)"),
