@@ -2,7 +2,7 @@
 
 `python tests/test_kill_anywhere.py --kills N [--seed S] [--job NAME]` kills N times. A process of its own imports once,
 starts no thread, and forks for every run; a fork dies at its n-th change to the file system, or after a share of its
-processor time. `optimize` and `verify` are resumed, `sheet` and `reprint` done again.
+processor time. `optimize`, `verify` and `study` are resumed, `sheet` and `reprint` done again.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ import numpy as np
 import pytest
 
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
-JOBS = ("optimize", "verify", "sheet", "reprint")
+JOBS = ("optimize", "verify", "sheet", "reprint", "study")
 IN_THE_SUITE = len(JOBS)
 LATE = """
     kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
     pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz test_optimize test_verify_run fake_networks
+    toy_studies patchproof.study.study patchproof.report.write
     patchproof.journey.verify patchproof.optimizer.run patchproof.printing.sheet patchproof.reprints.reprint
     patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
 
@@ -72,7 +73,14 @@ def reprint(base: Path, out: Path, again: bool) -> None:
     reprint(base / "sheet.pdf", load_run(base / "run"), 3, out)
 
 
-DO = dict(zip(JOBS, (optimize, verify, sheet, reprint), strict=True))
+def study(base: Path, out: Path, again: bool) -> None:
+    import toy_studies as toy
+    from patchproof.study.study import Work, carry_out
+
+    carry_out(toy.STUDY, toy.ToySettings(numbers=(1, 2, 13, 4)), base, out, Work(resume=again))  # one cell fails
+
+
+DO = dict(zip(JOBS, (optimize, verify, sheet, reprint, study), strict=True))
 
 
 def prepare(base: Path) -> None:
@@ -103,6 +111,8 @@ def check_whole(job: str, out: Path, unbroken: dict[str, bytes]) -> None:
         assert all(unbroken[name] == content for name, content in left.items()), sorted(left)
     if job == "reprint":
         assert left in ({}, unbroken), sorted(left)
+    if job == "study":  # toy.json has the settings before it has the tables
+        assert all(unbroken[name] == content for name, content in left.items() if name != "toy.json"), sorted(left)
     for name in ("run.json", "design.png", "views.png", "report.json", "report.csv", "report.html"):
         assert left.get(name) in (None, unbroken.get(name)), name
 

@@ -7,6 +7,7 @@ import signal
 import time
 from pathlib import Path
 
+from patchproof import input as bounds
 from patchproof.claims import rate
 from patchproof.photo import limits
 from patchproof.photo.cannot import CannotJudge
@@ -97,7 +98,7 @@ def spin(seconds):
 
 def given_up(seconds):
     """What a limit of 0.2 s makes of that, in whichever process this is."""
-    limits.SECONDS = 0.2
+    bounds.SECONDS = 0.2
     try:
         return limits.limited(spin, seconds)
     except CannotJudge as cannot:

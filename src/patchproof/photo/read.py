@@ -97,8 +97,8 @@ def _stored(path: Path) -> tuple[np.ndarray, int, tuple[float | None, float, boo
             if pixels > LARGEST_PX:
                 raise _too_large(f"{pixels / 1e6:.0f} megapixels are too many: save it smaller", pixels, LARGEST_PX)
             step = 2 if pixels > WHOLE_PX and min(image.size) > 1 else 1
-            (focal_px, *focal), orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
-            focal, part = (focal_px and focal_px / step, *focal), is_part(image, path.name)
+            (focal_px, spread, dropped), orientation = focal_of(image), image.getexif().get(_ORIENTATION, 1)
+            focal, part = (focal_px and focal_px / step, spread, dropped), is_part(image, path.name)
             return _pixels(image, step), orientation if isinstance(orientation, int) else 1, focal, part
 
 

@@ -155,7 +155,7 @@ def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work:
     """Run a study with settings at hand."""
     out = Path(out)
     if not work.resume:
-        unfinished = (out / "cells").is_dir() and not (out / f"{study.name}.html").is_file()
+        unfinished = (out / f"{study.name}.json").is_file() and not (out / f"{study.name}.html").is_file()
         check_folder(out, _own(study), work.overwrite, unfinished)
     cells = tuple(study.cells(settings, base))
     _check_cells(study, cells)
@@ -211,15 +211,15 @@ def _begin(study: Study, settings: Strict, out: Path, resume: bool) -> None:
         if _read(path).get("settings") != asked:
             do = "give it the same settings, or another --out"
             raise Refused(f"the settings that {out} was begun with, to resume it", "others", do)
-        return
-    if resume:  # nothing was begun: as without it, so that no stranger's files are mistaken for the study's
-        check_folder(out, ())
     else:
+        if resume:  # nothing was begun: as without it, so that no stranger's files are mistaken for the study's
+            check_folder(out, ())
         for pattern in _own(study):
             for old in out.glob(pattern):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
+        make_folder(out)
+        write_json(path, {"study": study.name, "settings": asked})  # first: by it a study is known
     make_folder(out / "cells")
-    write_json(path, {"study": study.name, "settings": asked})
 
 
 def _kept(out: Path, cell: Cell) -> dict[str, Any] | None:
