@@ -19,7 +19,7 @@ from patchproof.evidence.surface import Promised, Surface
 from patchproof.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import MarkersInView
-from patchproof.photo.pose import bent_stance, flat_stance, scale_and_tilt, tilt_uncertainty_deg
+from patchproof.photo.pose import bent_stance, flat_stance, scale_and_tilt, tilt_uncertainty_deg, turn_rad
 from patchproof.photo.quality import FrameLight, blur_px
 from patchproof.photo.ratio import x_over_y
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
@@ -137,8 +137,7 @@ def geometry_of(
         cells = register(placed.srgb, fit.px_from_mm, surface.rect_mm, promised.design, px_per_mm, blur)
         shift, corners, at_corners = _shifts(cells, surface)
         uncertainty = float(np.hypot(uncertainty, _SURE_SIGMAS * at_corners))
-    hidden_rad = unrolled.shape.hidden_turn_rad if unrolled else 0.0
-    tilt_by = placed.px, placed.parameters, placed.covariance, surface.center_mm, hidden_rad
+    tilt_by = placed.px, placed.parameters, placed.covariance, surface.center_mm, _turn_rad(placed, surface)
     geometry = Geometry(
         residual_mm=fit.residual_mm,
         px_per_mm=px_per_mm,
@@ -154,6 +153,10 @@ def geometry_of(
         homography_px_from_mm=None if unrolled else fit.px_from_mm.tolist(),
     )
     return geometry, corners
+
+
+def _turn_rad(placed: Placed, surface: Surface) -> float:
+    return turn_rad(placed.fit.bend_mm / min(surface.rect_mm[2:]), placed.unrolled and placed.unrolled.shape)
 
 
 def _shifts(cells: Registration, surface: Surface) -> tuple[float | None, int, float]:
@@ -177,7 +180,7 @@ def pose_of(view: View, placed: Placed, surface: Surface) -> tuple[Pose | None, 
     """Where the camera stood, None where its focal length is not known or not to be believed, and which it is."""
     if view.matrix_px is None:
         return None, "cropped" if view.cropped else "unknown"
-    camera = view.matrix_px, view.focal_spread, surface.center_mm, view.calibrated
+    camera = view.matrix_px, view.focal_spread, surface.center_mm, _turn_rad(placed, surface), view.calibrated
     if placed.unrolled is None:
         stance = flat_stance(placed.fit, *camera)
     else:

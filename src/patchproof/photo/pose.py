@@ -10,14 +10,15 @@ A page seen with a right matrix has px_from_mm ~ K [r1, r2, t]: r1 · r2 = 0 and
 both as sin² of the tilt, another principal point (a picture cropped aside) likewise, so frontal views tell nothing. A
 crop need leave no trace in a file. So a focal length that EXIF states is believed no further than perspective confirms
 it; where that cannot tell, there is no distance, and the azimuth is as uncertain as crops make it. Rolled paper may
-turn anywhere between its markers, at a fold too, so that the tangent of a middle far from them is uncertain by as much.
+turn anywhere between its markers, at a fold too, so that the tangent of a middle far from them is uncertain by as much,
+and so is that of paper that misses its markers by more than noise.
 
 Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 8.1.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +38,8 @@ _CROPPED_DEG = 7.0
 # one σ, as a share of the turn between the middle and the nearest marker: 95 % are 0.43 of it. A fold right beside the
 # middle turns that by all that the sheet turns to one side, 1.28 of it where markers of a tenth lie in the corners
 _HIDDEN_TURN = 0.22
+# one σ in radians of what misses by a share of its side beyond noise: waves half a side long, seen under 20° or less
+_BEND_TURNS = 50.0
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,17 @@ class Stance:
     agrees: bool | None
 
 
-def flat_stance(fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, whole: bool = False) -> Stance:
-    """Of flat paper seen by that camera; `whole`: the matrix is known to be this picture's."""
+def turn_rad(bend: float, shape: Shape | None) -> float:
+    """One standard deviation of how the paper's middle may be turned against its model: by what markers miss beyond
+    noise, as a share of its side, and by where between markers a `shape` turns.
+    """
+    return float(np.hypot(_BEND_TURNS * bend, 0.0 if shape is None else _HIDDEN_TURN * shape.hidden_turn_rad))
+
+
+def flat_stance(
+    fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, whole: bool = False
+) -> Stance:
+    """Of flat paper seen by that camera, with its `turn_rad`; `whole`: the matrix is known to be this picture's."""
     agrees, told = _agreement(fit, matrix_px, focal_spread)
     entries = np.append(fit.px_from_mm.ravel()[:8], 0.0)
     root = np.zeros((9, 9))
@@ -63,24 +75,29 @@ def flat_stance(fit: PageFit, matrix_px: np.ndarray, focal_spread: float, point_
         homography = np.append(values[:8], 1.0).reshape(3, 3)
         return np.array(view_angles(plane_pose(homography, _longer(matrix_px, values[8])), point_mm))[[0, 2]]
 
-    return _stance(figures, entries, root, agrees, whole)
+    stance = _stance(figures, entries, root, agrees, whole)
+    return replace(
+        stance, azimuth_uncertainty_deg=float(np.hypot(stance.azimuth_uncertainty_deg, 1.96 * np.degrees(turn)))
+    )
 
 
-def bent_stance(shape: Shape, matrix_px: np.ndarray, focal_spread: float, point_mm, whole: bool = False) -> Stance:
+def bent_stance(
+    shape: Shape, matrix_px: np.ndarray, focal_spread: float, point_mm, turn: float = 0.0, whole: bool = False
+) -> Stance:
     """Of paper that a cylinder or a lens explains, by the tangent plane at the point."""
     if shape.unit is not None:
         scale = np.append(shape.unit, 1.0)
         homography = np.append(shape.parameters[:8], 1.0) * scale
         covariance = shape.covariance[:8, :8] * np.outer(shape.unit, shape.unit)
         fit = PageFit(homography.reshape(3, 3), covariance, 0.0, ())
-        return flat_stance(fit, matrix_px, focal_spread, point_mm, whole)
+        return flat_stance(fit, matrix_px, focal_spread, point_mm, turn, whole)
     tangent = shape.tangent
     assert tangent is not None  # a shape is one or the other
 
     def figures(values: np.ndarray) -> np.ndarray:
         return np.array(view_angles(tangent(values[:-1], point_mm, values[-1]), (0, 0)))[[0, 2]]
 
-    off, spread = shape.parameters[6], float(np.sqrt(shape.covariance[6, 6]))
+    off, spread = float(shape.parameters[6]), float(np.sqrt(shape.covariance[6, 6]))
     told = spread < 0.7 * focal_spread
     agrees = abs(off) <= _TOO_FAR_SIGMAS * focal_spread if told or abs(off) > focal_spread else None
     # what the bend says of the focal length, it says of a true cylinder
@@ -89,7 +106,7 @@ def bent_stance(shape: Shape, matrix_px: np.ndarray, focal_spread: float, point_
     more = max(0.0, believed**2 - spread**2)
     root = np.zeros((10, 10))
     root[:9, :9] = root_of_scaled(shape.covariance + more * np.outer(by_focal, by_focal))
-    root[9, 9] = _HIDDEN_TURN * shape.hidden_turn_rad
+    root[9, 9] = turn
     return _stance(figures, np.append(shape.parameters, 0.0), root, agrees, whole)
 
 
@@ -105,9 +122,9 @@ def scale_and_tilt(px: Project, parameters: np.ndarray, point_mm) -> tuple[float
 
 
 def tilt_uncertainty_deg(
-    px: Project, parameters: np.ndarray, covariance: np.ndarray, point_mm, hidden_turn_rad: float
+    px: Project, parameters: np.ndarray, covariance: np.ndarray, point_mm, turn: float = 0.0
 ) -> float:
-    """95 % of that tilt, of paper that turns by so much between the point and the nearest marker."""
+    """95 % of that tilt, of paper with that `turn_rad`."""
     root, here = root_of_scaled(covariance), _stretch(px, parameters, point_mm)
     sides = [[_stretch(px, parameters + sign * axis, point_mm) for axis in root.T] for sign in (1, -1)]
     by_axis = (np.array(sides[0]) - np.array(sides[1])) / 2
@@ -115,8 +132,7 @@ def tilt_uncertainty_deg(
     moved = here + np.einsum("nk,kij->nij", rng.standard_normal((1000, len(by_axis))), by_axis)
     paper = np.eye(2) + _PAPER * rng.standard_normal((1000, 2, 2))
     off = _tilt_deg(moved @ paper) - _tilt_deg(here[None])
-    hidden = 1.96 * np.degrees(_HIDDEN_TURN * hidden_turn_rad)
-    return float(np.hypot(np.percentile(np.abs(off), 95), hidden))
+    return float(np.hypot(np.percentile(np.abs(off), 95), 1.96 * np.degrees(turn)))
 
 
 def _stretch(px: Project, parameters: np.ndarray, point_mm) -> np.ndarray:
