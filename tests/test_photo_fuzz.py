@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from fuzz import PHOTO_KINDS, changed, mutated, whole_photo
+from hostile_bytes import PHOTO_KINDS, changed, mutated, whole_photo
 from patchproof.photo.cannot import CODES, CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.sheets.manifest import dump_manifest, load_manifest

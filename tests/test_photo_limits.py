@@ -14,7 +14,7 @@ from PIL import Image
 
 import toy_studies as toy
 from degraded_photos import take
-from fuzz import peak_bytes, small_task
+from fuzz import small_task
 from patchproof import input as bounds
 from patchproof.calibrate import boards
 from patchproof.calibrate.boards import View, find_corners, see_boards
@@ -30,6 +30,7 @@ from patchproof.photo.limits import finder_lines_in, limited, limited_memory, sq
 from patchproof.photo.read import read_photo
 from patchproof.sheets.board import load_board
 from patchproof.strict import Refused
+from watch import peak_bytes
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
 needs_linux = pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is limited on Linux alone")
