@@ -21,7 +21,8 @@ Effect = Literal["shown", "not_shown", "not_tested"]
 Required = Literal["kept", "helps"]  # of a verification that scripts go on from
 Row = tuple[Finite, Finite, Finite]
 # where the focal length comes from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to
-# check, or contradicts; EXIF of another size or shape of picture, which is not used; nowhere
+# check (so that there is no distance), or contradicts; EXIF of another size or shape of picture, which is not used;
+# nowhere
 Focal = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
 
