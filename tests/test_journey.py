@@ -211,9 +211,9 @@ def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, t
 
 def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_path):
     sheet, run = journey / "sheet.json", journey / "run"
-    arguments = ("--run", run, "--n", 1, "--out", tmp_path / "scans", "--scan-dpi", 300, "--print-scale", "0.97")
+    arguments = ("--run", run, "--n", 1, "--out", tmp_path / "scans", "--scan-dpi", 150, "--print-scale", "0.97")
     assert command("reprint", journey / "sheet.pdf", *arguments) == 0
-    assert command("verify", tmp_path / "scans", "--sheet", sheet, "--out", tmp_path / "scan", "--scan-dpi", 300) == 0
+    assert command("verify", tmp_path / "scans", "--sheet", sheet, "--out", tmp_path / "scan", "--scan-dpi", 150) == 0
     scanned = json.loads((tmp_path / "scan" / "report.json").read_text())
     (photo,) = scanned["photos"]
     assert photo["scale_x"] == pytest.approx(0.97, abs=0.003) and photo["scale_y"] == pytest.approx(0.97, abs=0.003)
@@ -270,7 +270,7 @@ def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):
         assert (tmp_path / "photos" / path.name).read_bytes() == path.read_bytes()
     written = []
     for jobs in (1, 2):
-        assert command("evaluate", run, "--n", 20, "--jobs", jobs, "--overwrite") == 0
+        assert command("evaluate", run, "--n", 8, "--jobs", jobs, "--overwrite") == 0
         written.append((run / "evaluate.json").read_bytes())
     assert written[0] == written[1]
 
