@@ -26,6 +26,7 @@ pytest.importorskip("uvicorn")
 import uvicorn
 
 from browser import Browser
+from patchproof import input
 from patchproof.capture import album as album_module
 from patchproof.capture import app as app_module
 from patchproof.capture import serve
@@ -35,7 +36,6 @@ from patchproof.capture.gathered import Gathered
 from patchproof.capture.views import map_views
 from patchproof.evidence.results import Geometry, PhotoEntry, Pose
 from patchproof.journey.verify import options_of, verify_photos
-from patchproof.photo import limits
 from patchproof.sheets.manifest import ConditionClaim, dump_manifest, load_manifest
 from patchproof.strict import Refused
 from patchproof.workers import open_workers
@@ -384,7 +384,7 @@ def test_the_map_of_views_by_hand():
 
 def has_timer(_: object) -> None:
     """As the process apart begins: photographs are measured in a main thread, where their time is limited."""
-    assert limits._has_timer()
+    assert input.has_timer()
     serve.ready(None)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from patchproof.evidence import measure
-from patchproof.evidence.camera import View
+from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.placed import Placed, pose_of
 from patchproof.evidence.results import Geometry, Scale
 from patchproof.evidence.surface import surface_of
@@ -99,7 +99,7 @@ def test_a_print_more_than_one_percent_off_is_scale_off(scale, code):
 def test_an_azimuth_that_corners_cannot_tell_is_not_measured():
     """The same sheet from 10° to the right: at 1.5 m the corners know it to 1°, at 8 m neither it nor how far it is."""
     matrix = intrinsics(40, (1200, 900))
-    seen = View(np.zeros((900, 1200, 3), np.uint8), matrix, False)
+    seen = View(np.zeros((900, 1200, 3), np.uint8), matrix, True, FOCAL_ERROR / 1.96)
     for distance, tells in ((1500, True), (12000, False)):
         corners = noisy_corners(view(10, 3, distance), 0.045)
         pose, _ = pose_of(seen, Placed(seen.srgb, fit_page(corners, marker_corners()), None), SURFACE)

@@ -173,8 +173,11 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
         conditions = of_fields({k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
         pose = scene.camera_from_world(conditions)[0] @ scene.placement.world_from_piece
         azimuth, _, distance = geometry.view_angles(pose, np.array(scene.placement.size_mm) / 2)
-        assert photo["distance_mm"] == pytest.approx(distance, rel=0.04)
         assert photo["azimuth_deg"] == pytest.approx(azimuth, abs=2)
+        if photo["focal"] == "confirmed":
+            assert photo["distance_mm"] == pytest.approx(distance, rel=0.04)
+        else:  # nearly frontal views, whose perspective tells crops from nothing
+            assert photo["distance_mm"] is None
 
 
 def test_the_sheet_is_the_same_bytes_when_made_twice(journey, tmp_path):

@@ -64,8 +64,8 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
         stage = set_stage(scene)
         seen = looks(stage, classifiers, indices)
-        mesh, warnings = isinstance(scene, MeshScene), (*scene.warnings, *_lying(scene, settings))
-        if mesh:
+        warnings = (*scene.warnings, *_lying(scene, settings))
+        if isinstance(scene, MeshScene):
             _write_object(stage, folder / OBJECT)
         layouts = _write_layouts(scene, folder)
         facts = _facts(scene, settings) + [("texture", text) for text, _ in layouts]
@@ -78,11 +78,13 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             facts=facts,
             problems=problems,
             warnings=warnings,
-            sides=[(view, data_uri(png(view.picture))) for view in side_views(stage)] if mesh else [],
+            sides=[(view, data_uri(png(view.picture))) for view in side_views(stage)]
+            if isinstance(scene, MeshScene)
+            else [],
             maps=_maps(scene) if isinstance(scene, PatchScene) else [],
             layouts=layouts,
-            model=_model(folder / OBJECT, scene) if mesh else None,
-            viewer=viewer() if mesh else "",
+            model=_model(folder / OBJECT, scene) if isinstance(scene, MeshScene) else None,
+            viewer=viewer() if scene.HAS_OBJECT else "",
             looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
             summaries=_answers(settings, seen),
         )

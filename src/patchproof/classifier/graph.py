@@ -169,7 +169,8 @@ class _Watched(TorchDispatchMode):
         return False
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        results = _WEIGHED.get(func, func)(*args, **(kwargs or {}))
+        compute: Any = _WEIGHED.get(func, func)
+        results = compute(*args, **(kwargs or {}))
         for value in results if isinstance(results, (list, tuple)) else [results]:
             if isinstance(value, Tensor) and (value.numel() > self.limit or value.dim() > MAX_DIMENSIONS):
                 raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(value.shape))}")
