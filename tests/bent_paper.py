@@ -17,7 +17,8 @@ from patchproof.channel.printer import load_printer
 from patchproof.color import linear_from_srgb
 from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
 from patchproof.geometry import look_at
-from patchproof.sheets.manifest import Manifest, design_sha256, png_base64
+from patchproof.sheets.content import png_base64
+from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from test_photo_synthetic import noisy_design, some_design
 

@@ -11,7 +11,8 @@ import pytest
 
 from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.geometry import apply_homography, intrinsics, look_at, plane_homography
-from patchproof.sheets.manifest import Manifest, design_sha256, png_base64
+from patchproof.sheets.content import png_base64
+from patchproof.sheets.manifest import Manifest, design_sha256
 
 PX_PER_MM = 10  # of the page raster: every edge of the page lies on a multiple of 0.1 mm
 PAGE_MM = (210.0, 297.0)

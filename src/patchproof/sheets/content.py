@@ -5,13 +5,15 @@ In: a piece, the design's pixels, the promise. Out: the words and the code of it
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from patchproof.output import image_bytes
 from patchproof.sheets.layout import PageLayout
-from patchproof.sheets.manifest import WHOLE_PIECE, Design, Manifest, Promise, Swatch, design_sha256, png_base64
+from patchproof.sheets.manifest import WHOLE_PIECE, Design, Manifest, Promise, Swatch, design_sha256
 from patchproof.sheets.piece import Piece, on_paper, printed
 from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import BoardTemplate, Template
@@ -103,3 +105,8 @@ def page_manifest(
         promise=None,
         settings=settings,
     )
+
+
+def png_base64(pixels: np.ndarray) -> str:
+    """uint8 H×W×3 pixels as a PNG in base64."""
+    return base64.b64encode(image_bytes(pixels, "PNG", {"optimize": True})).decode()

@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from patchproof.goal import Goal
 from patchproof.input import opened_picture, read_json
-from patchproof.output import image_bytes
 from patchproof.sessions import Spread, in_sessions, spread_of
 from patchproof.strict import Finite, Gray, NotNegativeRange, Refused, Share, Strict, validated
 
@@ -284,11 +283,6 @@ class Manifest(Strict):
 def design_sha256(pixels: np.ndarray) -> str:
     """SHA-256 of uint8 H×W×3 pixels, row by row."""
     return hashlib.sha256(np.ascontiguousarray(pixels, np.uint8).tobytes()).hexdigest()
-
-
-def png_base64(pixels: np.ndarray) -> str:
-    """uint8 H×W×3 pixels as a PNG in base64."""
-    return base64.b64encode(image_bytes(pixels, "PNG", {"optimize": True})).decode()
 
 
 def dump_manifest(manifest: Manifest) -> str:
