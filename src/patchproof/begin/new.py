@@ -12,52 +12,26 @@ import json
 import tomllib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from patchproof.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis
+from patchproof.begin.hang import place_for
 from patchproof.begin.sides import SIDE_NAMES
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.input import is_file, is_folder
 from patchproof.mesh.load_mesh import load_mesh
-from patchproof.mesh.mesh import Mesh
 from patchproof.output import check_file, write_whole
-from patchproof.scene.fitting import largest, lies_well
 from patchproof.scene.image_scene import label_rows
 from patchproof.scene.patch_scene import OpenScene
-from patchproof.scene.placement import Frame, side_frame
 from patchproof.scene.places import Ground
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.piece import smallest_piece_mm
-from patchproof.strict import NETWORK_FILE, Refused, Side, validated
+from patchproof.strict import NETWORK_FILE, Refused, validated
 
 NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm
-_SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
-_LARGEST_MM = (165.0, 175.0)  # of a piece on A4, with the chart and the rulers around it
-_LONGER = 1.6  # a piece's longer side over its shorter one at most
-_FRONT = 1.25  # times as large has to be what is preferred to the front, or to a flat card
-_TOP = 0.5  # of a top's size: who looks at it looks from above, as few photographs do
-_ENOUGH = 0.8  # of the largest piece that any side is asked for: a flat card as large is not bent for more
 _HEAD = ("# Written by patchproof new. All keys and their ranges: patchproof keys.", "# Millimeters and degrees.", "")
-_TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
-
-
-@dataclass(frozen=True)
-class _Hang:
-    """Where the piece goes: a side's middle, or wherever the search finds; how large it is, and whether it bends."""
-
-    side: Side | None
-    size_mm: tuple[float, float]
-    bend: bool
-
-    @property
-    def worth(self) -> float:
-        """Its area, that of a flat card on the front counting more, and on the top less."""
-        sides: dict[Side | None, float] = {"+z": _FRONT, "+y": _TOP}
-        return _area(self.size_mm) * (1 if self.bend else _FRONT) * sides.get(self.side, 1)
 
 
 def new_scene(
@@ -109,7 +83,7 @@ def _of_mesh(
     else:
         said = "as given"
     mesh = load_mesh(thing, length_mm, up.axis)
-    hang = _place(mesh, length_mm)
+    hang = place_for(mesh, length_mm)
     mesh_name = thing if thing.startswith("primitive:") else _path(path, base)
     near, far = (_rounded(times * length_mm) for times in (NEAR, FAR))
     azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
@@ -150,7 +124,7 @@ def _of_mesh(
         f'up: "{up.axis}", {up.reason}'
         + (f"; {up.odd}: if the preview shows it lying, {_again(up)}" if up.odd else ""),
         f"length: {length_mm:g} mm, {said}",
-        f"piece: {width:g} × {height:g} mm, {_on(hang)}",
+        f"piece: {width:g} × {height:g} mm, {hang.words}",
         f'label: "{named}" ({models[0]})',
     ]
     return text, lines
@@ -166,44 +140,6 @@ def _turned(up: Up) -> list[str]:
 
 def _again(up: Up) -> str:
     return f"write the scene again with --up {other_axis(up.axis)}: sides and sizes change with it"
-
-
-def _on(hang: _Hang) -> str:
-    where = "wherever the search finds" if hang.side is None else f"on its {SIDE_NAMES[hang.side]} ({hang.side})"
-    return f"{'bent, ' if hang.bend else ''}{where}"
-
-
-def _place(mesh: Mesh, length_mm: float) -> _Hang:
-    """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
-    sides: dict[Side, tuple[float, float]] = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
-    flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
-    if any(_area(hang.size_mm) >= _ENOUGH * max(map(_area, sides.values())) for hang in flat):
-        return max(flat, key=lambda hang: hang.worth)  # bending takes seconds to try
-    hangs = flat + [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, True))]
-    if hangs:
-        return max(hangs, key=lambda hang: hang.worth)
-    least = smallest_piece_mm()
-    if least > length_mm:
-        do = "check --length-mm: markers of 8 mm need that much"
-        raise Refused(f"an object with room for a piece of {least:g} mm", f"one of {length_mm:g} mm", do)
-    return _Hang(None, (least, least), False)
-
-
-def _wanted(frame: Frame) -> tuple[float, float]:
-    """The largest piece that a side is asked for."""
-    width, height = (_SIDE_SHARE * extent for extent in frame.extent_mm)
-    return min(width, _LONGER * height, _LARGEST_MM[0]), min(height, _LONGER * width, _LARGEST_MM[1])
-
-
-def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> _Hang | None:
-    """The largest piece of that shape that lies well in the middle of a side."""
-    frame = side_frame(mesh, side)
-    found = largest(size_mm, lambda trial: lies_well(mesh, frame, trial, 0.0, bend), smallest_piece_mm())
-    return None if found is None else _Hang(side, found, bend)
-
-
-def _area(size_mm: tuple[float, float]) -> float:
-    return size_mm[0] * size_mm[1]
 
 
 def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:
