@@ -16,7 +16,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.goal import Goal
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.goals import target_loss, total_variation
-from patchproof.optimizer.loop import _step, start, steps
+from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, make_promise
@@ -27,6 +27,7 @@ from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
+from patchproof.workers import can_fork, one_thread
 
 SCENE = {
     "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
@@ -163,22 +164,20 @@ def test_networks_that_answer_nan_or_infinity_are_refused_and_large_answers_are_
     """Unseen, one such step would have ended every later one, and a NaN counts as the largest logit."""
     problem = set_problem(scene_with(tmp_path, camera__photo_px=[96, 96]))
     begin, drawn = start(problem), problem.scene.draw("promise", 2)
-    seen = problem.see(problem.subject.shown(begin.design), drawn, 32)
-    assert math.isfinite(_step(spoiled(problem, lambda logits: 1e30 * logits), begin, seen).loss)
+    assert math.isfinite(step_on(spoiled(problem, lambda logits: 1e30 * logits), begin, drawn).loss)
     for spoil in (lambda logits: logits * torch.nan, lambda logits: logits * 1e30 * 1e30):
         with pytest.raises(Refused, match="finite logits, got NaN or infinity from the network"):
-            _step(spoiled(problem, spoil), begin, seen)
+            step_on(spoiled(problem, spoil), begin, drawn)
         with pytest.raises(Refused, match="finite logits"):
             responses(spoiled(problem, spoil), {"design": problem.subject.shown(begin.design)}, drawn)
     with pytest.raises(Refused, match="finite gradients, got nan in step 1"):
-        _step(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, seen)
+        step_on(spoiled(problem, lambda logits: logits + (logits - logits.detach()).sqrt()), begin, drawn)
 
 
 def test_the_penalty_moves_the_design_and_is_not_taken_for_a_gradient_of_the_networks(tmp_path):
     problem = set_problem(scene_with(tmp_path, optimize__tv=1.0, target__models=["module:fake_networks.corner"]))
     noisy = replace(start(problem), design=torch.rand_like(start(problem).design))
-    seen = problem.see(problem.subject.shown(noisy.design), problem.scene.draw("promise", 2), 32)
-    step = _step(problem, noisy, seen)
+    step = step_on(problem, noisy, problem.scene.draw("promise", 2))
     assert step.gradient == 0 and not torch.equal(step.state.design, noisy.design)
 
 
@@ -191,7 +190,7 @@ def test_steps_whose_views_show_no_patch_change_nothing(tmp_path):
     shown = problem.subject.shown(start(problem).design.requires_grad_())
     seen = problem.see(shown, behind, problem.training_px)
     assert len(seen.piece.pixel) == 0
-    step = _step(problem, start(problem), seen)
+    step = step_on(problem, start(problem), behind)
     assert step.gradient == 0 and torch.equal(step.state.design, start(problem).design)
 
 
@@ -339,6 +338,16 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
     assert same_files(tmp_path / "whole", tmp_path / "cut")
     assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 24
     np.testing.assert_array_equal(load_run(tmp_path / "cut").design, resumed.design)
+
+
+@pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
+def test_the_number_of_processes_changes_no_byte(tmp_path, few_views):
+    """A step of 5 views, the selection, promise and controls, and the search for a place."""
+    scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
+    with one_thread():
+        for jobs in (1, 3):
+            optimize_scene(scene, tmp_path / str(jobs), jobs=jobs)
+    assert same_files(tmp_path / "1", tmp_path / "3")
 
 
 def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path, few_views):

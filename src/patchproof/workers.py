@@ -5,17 +5,25 @@ retry, not a result: what was in flight is done again by others, and what was in
 alone, so that only the item that kills its worker is given up.
 
 Other processes work on one thread each, which keeps them from fighting over the machine; with one thread here, too,
-the results are the same wherever they were made. A cluster's machines need this package and see the same files at the
-same paths. Left out on purpose: sharing data between items. Each names files, and workers keep what they load.
+the results are the same wherever they were made. Local processes are forked where that is safe: they start in
+milliseconds, and `sharing` gives them all that this process has loaded. Elsewhere they are spawned and import anew, and
+what shares data stays in this process. A cluster's machines need this package and see the same files at the same paths.
 """
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from patchproof.strict import Refused
@@ -23,6 +31,7 @@ from patchproof.strict import Refused
 Numbered = tuple[int, Any]
 TRIES = 3  # of an item whose worker dies each time
 QUEUED = 1000  # items that a cluster is given at a time: enough to keep it busy, and for it to see what is to come
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of a processor in how many
 _ANSWER_S = 10  # that a cluster's scheduler may take to answer
 
 
@@ -114,22 +123,48 @@ class Workers:
 
 @contextmanager
 def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False) -> Iterator[Workers]:
-    """`jobs` local processes (1: this one, with its own threads, or one `apart`), or the Dask cluster whose scheduler
-    is at `cluster`.
+    """`jobs` local processes (1: this one, with its own threads, or one `apart` that is spawned), or the Dask cluster
+    whose scheduler is at `cluster`.
 
-    Local processes are spawned: a script that calls this with jobs > 1 needs the `if __name__ == "__main__"` guard.
+    Where processes are spawned, a script that calls this needs the `if __name__ == "__main__"` guard.
     """
     if cluster is None:
-        workers = Workers(partial(_processes, jobs), 2 * jobs) if jobs > 1 or apart else Workers(_Here, 1)
-        try:
+        forks = can_fork() and not apart
+        workers = Workers(partial(_processes, jobs, forks), 2 * jobs) if jobs > 1 or apart else Workers(_Here, 1)
+        with one_thread() if forks and jobs > 1 else nullcontext(), closing(workers):
             yield workers
-        finally:
-            workers.close()
         return
     if jobs > 1:
         raise Refused("--jobs or --cluster", "both", "leave one out: a cluster knows how many workers it has")
     with _client(cluster) as client:
         yield Workers(lambda: _OneThreadEach(client.get_executor(pure=False)), QUEUED)
+
+
+@contextmanager
+def sharing(function: Callable[[Any], Any], jobs: int) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
+    """`jobs` forked processes that have a function with everything that it refers to, as it is now, and what to call in
+    them in its place; only items and results are sent. One job, a process that was forked for a share itself, or a
+    system that cannot fork, works here.
+    """
+    if jobs == 1 or _function is not None or not can_fork():
+        yield Workers(_Here, 1), function
+        return
+    with one_thread(), closing(Workers(partial(_processes, jobs, True, function), 2 * jobs)) as workers:
+        yield workers, _shared
+
+
+def can_fork() -> bool:
+    """Whether a forked process can compute: on Linux, unless torch has found a GPU, whose threads do not survive it."""
+    import torch
+
+    return sys.platform == "linux" and not torch.cuda.is_available()
+
+
+def free_cores() -> int:
+    """How many cores this process may use, by its affinity and its container's quota."""
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    quota, period = _QUOTA.read_text("ascii").split() if _QUOTA.is_file() else ("max", "1")
+    return cores if quota == "max" else max(1, min(cores, int(quota) // int(period)))
 
 
 def result_of(future: Future) -> Any:
@@ -191,11 +226,46 @@ def _on_one_thread(function, *args, **kwargs):
         return function(*args, **kwargs)
 
 
-def _processes(jobs: int) -> Executor:
+def _processes(jobs: int, forks: bool, function: Callable[[Any], Any] | None = None) -> Executor:
     import multiprocessing
 
-    # spawn: forking a process that has run torch threads can hang
-    return _OneThreadEach(futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")))
+    context = multiprocessing.get_context("fork" if forks else "spawn")
+    executor = _Quietly(jobs, context, _begin, (os.getpid(), function))
+    return executor if forks else _OneThreadEach(executor)
+
+
+class _Quietly(futures.ProcessPoolExecutor):
+    """Forked from a process with other threads, of which Python warns. Those of torch and OpenCV have ended or rest
+    by then (`one_thread`): a child that wakes them waits forever.
+    """
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*fork", DeprecationWarning)
+            return super().submit(fn, *args, **kwargs)
+
+
+_function: Callable[[Any], Any] | None = None  # what this process was forked for
+
+
+def _shared(item: Any) -> Any:
+    if _function is None:
+        raise RuntimeError("this process was not made to share a function")
+    return _function(item)
+
+
+def _begin(parent: int, function: Callable[[Any], Any] | None) -> None:
+    """In a new process: no part in Ctrl-C, and an end when its parent is gone."""
+    global _function
+    _function = function
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)
 
 
 @contextmanager

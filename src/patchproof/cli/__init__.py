@@ -16,7 +16,7 @@ import typer
 from patchproof.cli.begin import new, plan, preview
 from patchproof.cli.calibrate import camera, printer
 from patchproof.cli.capture import capture
-from patchproof.cli.console import stoppable
+from patchproof.cli.console import carried_out
 from patchproof.cli.designs import evaluate, import_picture
 from patchproof.cli.experiments import ListsStudies, bench, harden, keys, study
 from patchproof.cli.journey import demo, optimize, reprint, sheet, verify
@@ -32,17 +32,17 @@ app = typer.Typer(
 _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
 
 for _verb in (demo, new, preview, plan, optimize):
-    app.command()(stoppable(_verb))
-app.command("import")(stoppable(import_picture))
+    app.command()(carried_out(_verb))
+app.command("import")(carried_out(import_picture))
 for _verb in (evaluate, sheet, reprint, capture, verify):
-    app.command()(stoppable(_verb))
+    app.command()(carried_out(_verb))
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):
-    _calibrate.command()(stoppable(_verb))
-app.command()(stoppable(harden))
-app.command(cls=ListsStudies)(stoppable(study))
+    _calibrate.command()(carried_out(_verb))
+app.command()(carried_out(harden))
+app.command(cls=ListsStudies)(carried_out(study))
 for _verb in (keys, bench):
-    app.command()(stoppable(_verb))
+    app.command()(carried_out(_verb))
 
 
 def _say_version(asked: bool) -> None:

@@ -9,7 +9,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +20,14 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this comma
 Device = Annotated[str, typer.Option(help="cpu or cuda.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where a run that was stopped left off.")]
-Jobs = Annotated[int, typer.Option(min=1, help="Local processes that share the work.")]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Local processes that share the work, by default one for each free core; any number gives "
+        "the same results.",
+    ),
+]
 Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, in place of local processes.")]
 Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
 
@@ -64,18 +71,38 @@ def _line_now_and_then() -> Callable[[str, int, int], None]:
     return advance
 
 
-def stoppable(verb: Callable[..., None]) -> Callable[..., None]:
-    """A verb that, stopped by Ctrl-C, says what is kept and how to go on, and exits with 130."""
+def carried_out(verb: Callable[..., None]) -> Callable[..., None]:
+    """A verb on the cores that are free (`jobs`), which, stopped by Ctrl-C, says what is kept and how to go on, and
+    exits with 130.
+    """
 
     @wraps(verb)
     def carry_out(**given: Any) -> None:
         try:
-            verb(**given)
+            with _on_free_cores(given):
+                verb(**given)
         except KeyboardInterrupt:
             print(_stopped(given), file=sys.stderr)
             raise typer.Exit(130) from None
 
     return carry_out
+
+
+@contextmanager
+def _on_free_cores(given: dict[str, Any]) -> Iterator[None]:
+    """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and spawned
+    processes have the number that is asked for, one by default, and the threads of this process.
+    """
+    if "jobs" not in given:
+        yield
+        return
+    from patchproof.workers import can_fork, free_cores, one_thread
+
+    by_processes = can_fork() and given.get("device", "cpu") == "cpu"
+    if given["jobs"] is None:
+        given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
+    with one_thread() if by_processes else nullcontext():
+        yield
 
 
 def _stopped(given: dict[str, Any]) -> str:

@@ -32,6 +32,7 @@ def import_picture(
     promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
+    jobs: Jobs = None,
 ) -> None:
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
     from patchproof.optimizer.given import import_folder, import_patch
@@ -44,6 +45,7 @@ def import_picture(
             "seed": seed,
             "device": device,
             "overwrite": overwrite,
+            "jobs": jobs or 1,
             "promise_views": promise or (DRAFT_VIEWS if draft else None),
             "on_scene": lambda loaded: warn(loaded.warnings),
             "on_promise": lambda done, total: bar("promise", done, total),
@@ -64,7 +66,7 @@ def evaluate(
     out: Annotated[Path | None, typer.Option(help="Folder for the table and the page of several runs.")] = None,
     seed: Seed = None,
     device: Device = "cpu",
-    jobs: Jobs = 1,
+    jobs: Jobs = None,
     cluster: Cluster = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -81,7 +83,7 @@ def evaluate(
             "n": n,
             "seed": seed,
             "device": device,
-            "jobs": jobs,
+            "jobs": jobs or 1,
             "cluster": cluster,
             "overwrite": overwrite,
             "on_view": lambda done, total: bar("evaluate", done, total),

@@ -25,7 +25,7 @@ def harden(
     attack_eps: Annotated[str, typer.Option(help="Their ε.")] = "0.01,0.02,0.04",
     resume: Resume = False,
     overwrite: Overwrite = False,
-    jobs: Jobs = 1,
+    jobs: Jobs = None,
     cluster: Cluster = None,
 ) -> None:
     """Change labeled images so that classifiers recognize them better, and attack them."""
@@ -47,7 +47,7 @@ def harden(
         "attack_epsilons": names_of(attack_eps),
     }
     with progress() as bar:
-        work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("harden", done, total))
+        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("harden", done, total))
         finished = harden_images(validated(HardenSettings, given, "the options"), out, work)
     say_study(finished)
     say(f"images: {out}, tables: {out / 'harden.html'}")
@@ -74,7 +74,7 @@ def study(
     example: Annotated[bool, typer.Option("--example", help="Print a config to start from.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    jobs: Jobs = 1,
+    jobs: Jobs = None,
     cluster: Cluster = None,
 ) -> None:
     """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
@@ -88,7 +88,7 @@ def study(
         missing = "--config" if config is None else "--out"
         raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
     with progress() as bar:
-        work = Work(resume, overwrite, jobs, cluster, lambda done, total: bar("cells", done, total))
+        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
         finished = run_study(name, config, out, work)
     say_study(finished)
     say(f"page: {out / name}.html")

@@ -32,13 +32,14 @@ def demo(
         "patchproof-demo"
     ),
     detector: Annotated[bool, typer.Option("--detector", help="Before the built-in detector, not classifier.")] = False,
+    jobs: Jobs = None,
     overwrite: Overwrite = False,
 ) -> None:
     """The whole journey, offline, on a built-in object and network."""
     from patchproof.journey.demo import run_demo
 
     with progress() as bar:
-        summary = run_demo(out, detector=detector, overwrite=overwrite, on_stage=bar)
+        summary = run_demo(out, detector=detector, jobs=jobs or 1, overwrite=overwrite, on_stage=bar)
     say(*summary)
 
 
@@ -52,6 +53,7 @@ def optimize(
     promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
+    jobs: Jobs = None,
     require: Annotated[
         Literal["better"] | None,
         typer.Option(help='"better" makes a design exit with 1 that is not better than its best control.'),
@@ -76,6 +78,7 @@ def optimize(
             resume=resume,
             overwrite=overwrite,
             promise_views=promise,
+            jobs=jobs or 1,
             on_scene=lambda loaded: warn(loaded.warnings),
             on_place=lambda done, total: bar("place", done, total),
             on_step=lambda step, total: bar("optimize", step.state.number, total),
@@ -160,7 +163,7 @@ def reprint(
     path_traced: Annotated[
         bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
     ] = False,
-    jobs: Jobs = 1,
+    jobs: Jobs = None,
     cluster: Cluster = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -198,7 +201,7 @@ def reprint(
                 sessions=sessions,
                 seed=seed,
                 overwrite=overwrite,
-                jobs=jobs,
+                jobs=jobs or 1,
                 cluster=cluster,
                 on_photo=lambda done, total: bar("photograph", done, total),
             )
@@ -229,7 +232,7 @@ def verify(
     run: Annotated[
         Path | None, typer.Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
     ] = None,
-    jobs: Jobs = 1,
+    jobs: Jobs = None,
     cluster: Cluster = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -250,7 +253,7 @@ def verify(
             ledger_photos=ledger,
             camera=camera,
             run=run,
-            jobs=jobs,
+            jobs=jobs or 1,
             cluster=cluster,
             resume=resume,
             overwrite=overwrite,

@@ -64,6 +64,7 @@ def run_demo(
     out: str | Path,
     *,
     detector: bool = False,
+    jobs: int = 1,
     overwrite: bool = False,
     on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[str]:
@@ -72,6 +73,7 @@ def run_demo(
         run = optimize_scene(
             demo_scene(folder, detector),
             folder / "run",
+            jobs=jobs,
             on_step=lambda step, total: on_stage("optimize", step.state.number, total),
             on_promise=lambda done, total: on_stage("promise", done, total),
         )
@@ -82,12 +84,14 @@ def run_demo(
             PHOTOS,
             folder / "photos",
             sessions=SESSIONS,
+            jobs=jobs,
             on_photo=lambda done, total: on_stage("photograph", done, total),
         )
         report = verify_photos(
             folder / "photos",
             folder / "sheet.json",
             folder / "report",
+            jobs=jobs,
             on_photo=lambda done, total: on_stage("verify", done, total),
         )
     return [

@@ -76,6 +76,7 @@ def import_patch(
     overwrite: bool = False,
     controls: Sequence[str] = CONTROLS,
     promise_views: int | None = None,
+    jobs: int = 1,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
 ) -> Run:
@@ -88,7 +89,7 @@ def import_patch(
     (file, sha256, pixels), scene = _read(picture), _with_piece(scene, seed)
     fitted, scene = fit(pixels, scene), scene.of_design(sha256)
     on_scene(scene)
-    problem = set_problem(scene, device, models)
+    problem = set_problem(scene, device, models, jobs=jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = _looked_at(problem, file, sha256, pixels, fitted, design)
@@ -107,6 +108,7 @@ def import_folder(
     resume: bool = False,
     overwrite: bool = False,
     promise_views: int | None = None,
+    jobs: int = 1,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
 ) -> list[Run]:
@@ -137,6 +139,7 @@ def import_folder(
                 device=device,
                 overwrite=overwrite,
                 promise_views=promise_views,
+                jobs=jobs,
                 on_promise=lambda done, _, before=before: on_promise(before + done, len(runs) * total),
             )
     return [made[path] for path in runs]

@@ -6,14 +6,17 @@ PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every
 fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
 promise set is never touched here.
 
-A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes.
+A step depends on the state and its own number alone, so that a run that was stopped goes on to the same bytes. Its
+views are seen two at a time by as many processes as the problem has, and gradients are added in the views' order, so
+that their number changes no byte either.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -26,10 +29,12 @@ from patchproof.render.views import Views
 from patchproof.scene.conditions import Conditions
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
+from patchproof.workers import sharing
 
 SELECT_AFTER = 120  # training views
 SELECT_VIEWS = 64
-SELECT_CHUNK = 16
+SELECT_CHUNK = 4
+TOGETHER = 2  # views of a step that one process sees: with one at a time seeing took twice as long
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's own defaults
 
 
@@ -43,6 +48,18 @@ class State:
     square: tuple[Tensor, ...]
     best: Tensor
     best_loss: float = float("inf")
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What some of a step's views say: means over them, and the gradient of their mean loss as float32 3×h×w."""
+
+    views: int
+    loss: float
+    confidence: float
+    rate: float
+    gradient: np.ndarray
+    pictures: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -85,15 +102,26 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
     state = start(problem) if state is None else state
     settings = problem.scene.settings.optimize
     conditions = problem.scene.draw("train", settings.steps * settings.views)
-    selection = _selection(problem)
-    while state.number < settings.steps:
-        first = state.number * settings.views
-        drawn = conditions[first : first + settings.views]
-        step = _step(problem, state, problem.see(problem.subject.shown(state.design), drawn, problem.training_px))
-        if selects(settings, step.state.number):
-            step = _select(problem, selection, step)
-        state = step.state
-        yield step
+    selection = problem.scene.draw("select", SELECT_VIEWS)
+    seen = lru_cache(partial(_seen_for_selection, problem, selection))  # once by each process
+
+    def answer(task: tuple[np.ndarray, Conditions | int, bool]) -> _Part | tuple[float, float]:
+        pixels, of, pictures = task
+        design = torch.as_tensor(pixels, device=problem.device)
+        return _tried(problem, seen(of), design) if isinstance(of, int) else _part(problem, design, of, pictures)
+
+    with sharing(answer, problem.jobs) as (workers, share):
+        while state.number < settings.steps:
+            first = state.number * settings.views
+            drawn, last = conditions[first : first + settings.views], state.number + 1 == settings.steps
+            pixels = state.design.cpu().numpy()
+            step = _step(problem, state, workers.map(share, [(pixels, part, last) for part in _together(drawn)]))
+            if selects(settings, step.state.number):
+                printed = from_pixels(as_pixels(step.state.design), torch.device("cpu")).numpy()
+                parts = [(printed, at, False) for at in range(0, SELECT_VIEWS, SELECT_CHUNK)]
+                step = _select(step, workers.map(share, parts))
+            state = step.state
+            yield step
 
 
 def best_design(problem: Problem) -> np.ndarray:
@@ -108,16 +136,38 @@ def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
     """The design after a step on every `views` rows of the conditions, untried on the selection set."""
     state = start(problem)
     for first in range(0, len(conditions), views):
-        drawn, shown = conditions[first : first + views], problem.subject.shown(state.design)
-        state = _step(problem, state, problem.see(shown, drawn, problem.training_px)).state
+        state = step_on(problem, state, conditions[first : first + views]).state
     return state.design
 
 
-def _step(problem: Problem, state: State, seen: Views) -> Step:
-    design = state.design.clone().requires_grad_()
-    pictures = expose(seen, problem.subject.shown(design))
-    losses, confidences, rates = score(problem, pictures, seen.conditions)
-    (gradient,) = torch.autograd.grad(losses, design)
+def step_on(problem: Problem, state: State, drawn: Conditions) -> Step:
+    """One step on these conditions, in this process."""
+    return _step(problem, state, [_part(problem, state.design, part, False) for part in _together(drawn)])
+
+
+def _together(drawn: Conditions) -> list[Conditions]:
+    """A step's conditions, as many at a time as are seen together."""
+    return [drawn[first : first + TOGETHER] for first in range(0, len(drawn), TOGETHER)]
+
+
+def _part(problem: Problem, design: Tensor, drawn: Conditions, pictures: bool) -> _Part:
+    """Photograph the design under these conditions and ask which way it goes down."""
+    design = design.clone().requires_grad_()
+    shown = problem.subject.shown(design)
+    seen = expose(problem.see(shown, drawn, problem.training_px), shown)
+    loss, confidence, rate = score(problem, seen, drawn)
+    (gradient,) = torch.autograd.grad(loss, design)
+    photos = seen.detach().cpu().numpy() if pictures else None
+    return _Part(len(drawn), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), photos)
+
+
+def _step(problem: Problem, state: State, parts: Sequence[_Part]) -> Step:
+    design, share = state.design.clone().requires_grad_(), [part.views / sum(p.views for p in parts) for part in parts]
+
+    def mean(values):
+        return sum(weight * value for weight, value in zip(share, values, strict=True))
+
+    gradient = torch.as_tensor(mean(part.gradient for part in parts), device=problem.device)
     largest, penalty = float(gradient.abs().max()), problem.subject.penalty(design)
     if not math.isfinite(largest):  # one such step would turn the design into nothing for good
         do = "check its number format: some pictures lead it to infinity"
@@ -125,8 +175,15 @@ def _step(problem: Problem, state: State, seen: Views) -> Step:
     if isinstance(penalty, Tensor):
         gradient = gradient + torch.autograd.grad(penalty, design)[0]
         penalty = float(penalty.detach())
-    loss = float(losses.detach()) + penalty
-    return Step(_descend(state, gradient, problem), loss, confidences, rates, largest, pictures=pictures.detach())
+    photos = [torch.as_tensor(part.pictures) for part in parts if part.pictures is not None]
+    return Step(
+        _descend(state, gradient, problem),
+        mean(part.loss for part in parts) + penalty,
+        mean(part.confidence for part in parts),
+        mean(part.rate for part in parts),
+        largest,
+        pictures=torch.cat(photos) if photos else None,
+    )
 
 
 def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
@@ -159,24 +216,23 @@ def score(problem: Problem, pictures: Tensor, conditions: Conditions) -> tuple[T
     return torch.stack(losses).mean(), confidence / count, rate / count
 
 
-def _selection(problem: Problem) -> list[Views]:
-    """The selection views, seen once and shaded anew for each design."""
-    conditions = problem.scene.draw("select", SELECT_VIEWS)
+def _seen_for_selection(problem: Problem, selection: Conditions, first: int) -> Views:
+    """Some of the selection views, to be shaded anew for each design."""
     shown = problem.subject.shown(start(problem).design)
-    with torch.no_grad():
-        parts = (conditions[i : i + SELECT_CHUNK] for i in range(0, SELECT_VIEWS, SELECT_CHUNK))
-        return [problem.see(shown, part, problem.training_px) for part in parts]
+    return problem.see(shown, selection[first : first + SELECT_CHUNK], problem.training_px)
 
 
-def _select(problem: Problem, selection: list[Views], step: Step) -> Step:
-    """Try the design, as it would be printed, on the selection set and keep it if it is the best so far."""
+@torch.no_grad()
+def _tried(problem: Problem, seen: Views, design: Tensor) -> tuple[float, float]:
+    """Loss and rate of a design in selection views."""
+    loss, _, rate = score(problem, expose(seen, problem.subject.shown(design)), seen.conditions)
+    return float(loss), rate
+
+
+def _select(step: Step, tried: Sequence[tuple[float, float]]) -> Step:
+    """Keep the design if it is the best so far, as it would be printed, on the selection set."""
     state = step.state
-    printed = from_pixels(as_pixels(state.design), problem.device)
-    with torch.no_grad():
-        shown = problem.subject.shown(printed)
-        scores = [score(problem, expose(seen, shown), seen.conditions) for seen in selection]
-    loss = sum(float(score[0]) for score in scores) / len(scores)
-    rate = sum(score[2] for score in scores) / len(scores)
+    loss, rate = (sum(values) / len(values) for values in zip(*tried, strict=True))
     if loss < state.best_loss:
         state = replace(state, best=state.design, best_loss=loss)
     return replace(step, state=state, select_loss=loss, select_rate=rate)

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,6 +35,7 @@ from patchproof.scene.places import APART, Ground, Spot
 from patchproof.scene.scene import Scene, needs_open
 from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused, Side, Strict
+from patchproof.workers import sharing
 
 # Of a default run's passes: pictures that go through a network, and once more those that gradients come back through.
 SHARE = 0.25
@@ -101,13 +104,14 @@ def choose_place(
     models: Sequence[str | Classifier] | None = None,
     loss: Loss | None = None,
     device: str = "cpu",
+    jobs: int = 1,
     on_pass: Callable[[int, int], None] = lambda done, total: None,
 ) -> Place:
     """Search the object of a scene with `patch.place = "auto"` for the piece's place; `models` and `loss` as in
     `optimize`. `scene.at(place.at, place.spin_deg)` has the piece there. Refused where there is no place at all.
     """
     scene = needs_open(scene)
-    search, ground = _Search(scene, models, loss, device, on_pass), Ground(scene)
+    search, ground = _Search(scene, (models, loss, device, jobs), on_pass), Ground(scene)
     trials = search.screened(ground.spots(PLACES))
     leaders = sorted(trials, key=lambda trial: trial.outlook)[:TURNED]
     trials += search.screened([turn for leader in leaders for turn in ground.turned(leader.spot)])
@@ -153,35 +157,37 @@ def default_passes() -> int:
 class _Search:
     """A search under way, which counts its networks' passes."""
 
-    def __init__(self, scene: OpenScene, models, loss: Loss | None, device: str, on_pass: Callable[[int, int], None]):
+    def __init__(self, scene: OpenScene, stated, on_pass: Callable[[int, int], None]):
         self.passes, self._budget = 0, int(SHARE * default_passes())
         self._scene, self._on_pass = scene, on_pass
         self._first: Problem | None = None
         self._bare: float | None = None
-        self._stated = models, loss, device
+        self._stated = stated
 
     def screened(self, spots: Sequence[Spot]) -> list[_Trial]:
         """The spots where the piece can hang, with what gray costs there and its gradient promises."""
         conditions, hung = self._scene.draw("train", SCREEN_VIEWS), self._hung(spots)
         if self._bare is None and hung:
             self._bare = float(self._losses(hung[0][1], None, conditions).mean())
-        return [_Trial(spot, problem, *self._screen(problem, conditions)) for spot, problem in hung]
+        screens = self._shared(partial(_screen, conditions), [problem for _, problem in hung], 2 * len(conditions))
+        bare = self._bare or 0.0
+        return [
+            _Trial(spot, problem, loss - bare, loss - bare - reach)
+            for (spot, problem), (loss, reach) in zip(hung, screens, strict=True)
+        ]
 
     def drafted(self, trials: Sequence[_Trial]) -> list[np.ndarray]:
         """N losses of a draft at each place in the held-out views, less the bare object's there; the drafts take as
         many steps as the budget has left.
         """
-        held_out, losses = self._scene.draw("select", HELD_OUT_VIEWS), []
+        held_out = self._scene.draw("select", HELD_OUT_VIEWS)
         left = self._budget - self.passes - (len(trials) + 1) * HELD_OUT_VIEWS
         steps = max(1, left // (len(trials) * 2 * DRAFT_VIEWS))
         conditions = self._scene.draw("train", steps * DRAFT_VIEWS, start=SCREEN_VIEWS)
         bare = self._losses(trials[0].problem, None, held_out)
-        for problem in (trial.problem for trial in trials):
-            design = draft(problem, conditions, DRAFT_VIEWS)
-            self._count(2 * len(conditions))
-            shown = problem.subject.shown(from_pixels(as_pixels(design), problem.device))
-            losses.append(self._losses(problem, shown, held_out) - bare)
-        return losses
+        problems = [trial.problem for trial in trials]
+        drafts = self._shared(partial(_drafted, conditions, held_out), problems, 2 * len(conditions) + len(held_out))
+        return [losses - bare for losses in drafts]
 
     def end(self) -> None:
         """Say that no more will come."""
@@ -197,34 +203,48 @@ class _Search:
                 refusal = refused
                 continue
             if self._first is None:
-                models, loss, device = self._stated
-                self._first = set_problem(scene, device, models, loss)
+                models, loss, device, jobs = self._stated
+                self._first = set_problem(scene, device, models, loss, jobs)
             hung.append((spot, self._first.hung(scene)))
         if refusal is not None and self._first is None:
             raise refusal
         return hung
 
-    def _screen(self, problem: Problem, conditions: Conditions) -> tuple[float, float]:
-        """(what gray costs, that less the decrease that its gradient promises)."""
-        design = start(problem).design.requires_grad_()
-        shown = problem.subject.shown(design)
-        loss, *_ = score(problem, expose(problem.see(shown, conditions, problem.training_px), shown), conditions)
-        (gradient,) = torch.autograd.grad(loss, design)
-        self._count(2 * len(conditions))
-        coarse = problem.subject.levels(gradient)[-1]
-        promise = _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
-        gray = float(loss.detach()) - (self._bare or 0.0)
-        return gray, gray - promise
+    def _shared(self, look: Callable[[Problem], Any], problems: Sequence[Problem], passes: int) -> list[Any]:
+        """What a look at each problem says, of so many passes; the processes share the problems."""
+        before, jobs = self.passes, min(len(problems), self._stated[-1])
+        with sharing(lambda number: look(problems[number]), max(1, jobs)) as (workers, share):
+            looks = range(len(problems))
+            return workers.map(share, looks, lambda done, _: self._count(before + done * passes - self.passes))
 
     def _losses(self, problem: Problem, shown: Shown, conditions: Conditions) -> np.ndarray:
-        """N losses, means over the networks."""
-        answers = responses(problem, {"": shown}, conditions, problem.training_px)
         self._count(len(conditions))
-        return answers[""].loss.mean(0)
+        return _losses(problem, shown, conditions)
 
     def _count(self, passes: int) -> None:
         self.passes += passes
         self._on_pass(self.passes, self._budget)
+
+
+def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:
+    """The loss of gray, and the decrease that its gradient promises."""
+    design = start(problem).design.requires_grad_()
+    shown = problem.subject.shown(design)
+    loss, *_ = score(problem, expose(problem.see(shown, conditions, problem.training_px), shown), conditions)
+    (gradient,) = torch.autograd.grad(loss, design)
+    coarse = problem.subject.levels(gradient)[-1]
+    return float(loss.detach()), _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
+
+
+def _drafted(conditions: Conditions, held_out: Conditions, problem: Problem) -> np.ndarray:
+    """N losses of a draft in the held-out views."""
+    design = draft(problem, conditions, DRAFT_VIEWS)
+    return _losses(problem, problem.subject.shown(from_pixels(as_pixels(design), problem.device)), held_out)
+
+
+def _losses(problem: Problem, shown: Shown, conditions: Conditions) -> np.ndarray:
+    """N losses, means over the networks."""
+    return responses(problem, {"": shown}, conditions, problem.training_px)[""].loss.mean(0)
 
 
 def _finalists(trials: Sequence[_Trial], edge_mm: float) -> list[_Trial]:

@@ -48,6 +48,7 @@ class Problem:
     indices: tuple[tuple[int, ...], ...]
     subject: Subject
     own_loss: Loss | None  # in place of the goal's
+    jobs: int = 1  # processes that share the views
 
     @property
     def training_px(self) -> int:
@@ -108,9 +109,15 @@ class Problem:
 
 
 def set_problem(
-    scene: Scene, device: str = "cpu", models: Sequence[str | Classifier] | None = None, loss: Loss | None = None
+    scene: Scene,
+    device: str = "cpu",
+    models: Sequence[str | Classifier] | None = None,
+    loss: Loss | None = None,
+    jobs: int = 1,
 ) -> Problem:
-    """The problem that a scene states; `models` replaces the scene's own classifiers, `loss` that of its goal."""
+    """The problem that a scene states; `models` replaces the scene's own classifiers, `loss` that of its goal. `jobs`
+    processes share its views, on a GPU none do.
+    """
     _check_device(device)
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
@@ -124,7 +131,8 @@ def set_problem(
         subject = Patch(hung, printer, hung.design_px(network_px), stage.device)
     else:
         subject = Texture(needs_texture(scene), stage.device)
-    return Problem(scene, stage, printer, classifiers, indices, subject, loss)
+    jobs = jobs if stage.device.type == "cpu" else 1
+    return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 
 
 def _check_device(device: str) -> None:

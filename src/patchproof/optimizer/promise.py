@@ -20,7 +20,7 @@ from patchproof.classifier.detector import Detector
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, joined, responses
+from patchproof.optimizer.responses import Answers, responses
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
@@ -39,7 +39,7 @@ def make_promise(
     design: np.ndarray,
     conditions: Conditions,
     controls: Sequence[str] = CONTROLS,
-    on_views: Callable[[int], None] = lambda n: None,
+    on_views: Callable[[int, int], None] = lambda done, total: None,
     per_session: int = 1,
 ) -> Promise:
     """Show the design in all conditions, `per_session` in a row of one session, and the controls in the first
@@ -47,12 +47,9 @@ def make_promise(
     """
     shown = shown_with_controls(problem, design, controls)
     beside = np.arange(len(conditions)) % per_session < CONTROL_VIEWS
-    compared = responses(problem, shown, conditions[beside], on_views=on_views)
+    compared = responses(problem, shown, conditions, beside=beside, on_views=on_views)
     answers = compared["design"]
-    if not beside.all():
-        rest = responses(problem, {"design": shown["design"]}, conditions[~beside], on_views=on_views)["design"]
-        order = np.argsort(np.concatenate([np.flatnonzero(beside), np.flatnonzero(~beside)]), kind="stable")
-        answers = joined([{"design": compared["design"]}, {"design": rest}])["design"].at(order)
+    compared["design"] = answers.at(np.flatnonzero(beside))
     places = _places(conditions, per_session)
     models = model_claims(problem, answers, per_session, places)
     target = problem.scene.settings.target

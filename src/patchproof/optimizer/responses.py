@@ -1,7 +1,8 @@
 """What networks answer when things are shown to them under the same conditions.
 
 In: a `Problem`, things to show (None: the bare object), conditions. Out: per thing its `Answers`: whether each network
-recognized the target, how sure it was of it, and the loss. Views are seen once for all things, a few at a time.
+recognized the target, how sure it was of it, and the loss. Views are seen once for all things, a few at a time, by as
+many processes as the problem has; the answers do not depend on how many.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
+from patchproof.workers import sharing
 
 AT_A_TIME = 4  # views: before a small network 16 took 1.4 times as long, out of the cache
 Thing = TypeVar("Thing", bound=Hashable)
@@ -40,19 +42,34 @@ def responses(
     shown: Mapping[Thing, Shown],
     conditions: Conditions,
     side_px: int | None = None,
-    on_views: Callable[[int], None] = lambda n: None,
+    beside: np.ndarray | None = None,
+    on_views: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[Thing, Answers]:
     """Show each thing under every condition to every network, in square views of `side_px` (by default the size of
-    figures that people will read); `on_views` gets how many views have been done since its last call.
+    figures that people will read); all but the first only under those that the mask `beside` names. `on_views` gets how
+    many views are done, and how many there are.
     """
     laid_out = next((thing for thing in shown.values() if thing is not None), None)
-    parts: list[dict[Thing, Answers]] = []
-    with torch.no_grad():
-        for part in in_parts(conditions):
-            views, boxes = problem.see(laid_out, part, side_px or problem.figure_px), problem.boxes(part)
-            parts.append({name: ask(problem, expose(views, thing), boxes) for name, thing in shown.items()})
-            on_views(len(part))
-    return joined(parts)
+    first, n = next(iter(shown)), len(conditions)
+    compared = np.ones(n, bool) if beside is None else beside
+
+    @torch.no_grad()
+    def answers(rows: np.ndarray) -> dict[Thing, Answers]:
+        own: dict[Thing, list[Answers]] = {name: [] for name in shown}
+        both, alone = rows[compared[rows]], rows[~compared[rows]]
+        for part, names in ((both, list(shown)), (alone, [first])):
+            if len(part):
+                drawn = conditions[part]
+                views, boxes = problem.see(laid_out, drawn, side_px or problem.figure_px), problem.boxes(drawn)
+                for name in names:
+                    own[name].append(ask(problem, expose(views, shown[name]), boxes))
+        whole = {name: in_a_row(parts) for name, parts in own.items() if parts}
+        whole[first] = whole[first].at(np.argsort(np.concatenate([both, alone])))
+        return whole
+
+    parts = [np.arange(at, min(at + AT_A_TIME, n)) for at in range(0, n, AT_A_TIME)]
+    with sharing(answers, min(problem.jobs, len(parts))) as (workers, share):
+        return joined(workers.map(share, parts, lambda done, _: on_views(min(done * AT_A_TIME, n), n)))
 
 
 def in_parts(conditions: Conditions) -> Iterator[Conditions]:
@@ -78,8 +95,10 @@ def ask(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) -> Answers
 
 def joined(parts: Sequence[Mapping[Thing, Answers]]) -> dict[Thing, Answers]:
     """The answers to parts of the conditions as those to all of them."""
+    return {thing: in_a_row([part[thing] for part in parts if thing in part]) for thing in parts[0]}
+
+
+def in_a_row(parts: Sequence[Answers]) -> Answers:
+    """The answers to one part of the conditions after those to another."""
     names = ("recognized", "confidence", "loss")
-    return {
-        thing: Answers(*(np.concatenate([getattr(part[thing], name) for part in parts], -1) for name in names))
-        for thing in parts[0]
-    }
+    return Answers(*(np.concatenate([getattr(part, name) for part in parts], -1) for name in names))

@@ -77,6 +77,7 @@ def optimize_scene(
     overwrite: bool = False,
     controls: Sequence[str] = CONTROLS,
     promise_views: int | None = None,
+    jobs: int = 1,
     on_step: Callable[[Step, int], None] = lambda step, total: None,
     on_promise: Callable[[int, int], None] = lambda done, total: None,
     on_scene: Callable[[Scene], None] = lambda scene: None,
@@ -87,6 +88,7 @@ def optimize_scene(
     `models` (names, or classifiers in memory) and `loss` replace the scene's networks and its goal's loss; `seed`
     replaces the file's; `resume` goes on from the checkpoint, at the place that was chosen. A page names the best of
     `controls`, one at least. A promise of fewer `promise_views` than usual (two sessions at least) is a draft's.
+    `jobs` processes share the views (`workers.sharing`) and change no byte where this one works on one thread, too.
     `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
     """
     out, views = Path(out), promised_views(promise_views)
@@ -96,10 +98,10 @@ def optimize_scene(
     place = None
     if isinstance(scene, OpenScene):
         place = read_place(out, scene) if resume else None
-        place = place or choose_place(scene, models=models, loss=loss, device=device, on_pass=on_place)
+        place = place or choose_place(scene, models=models, loss=loss, device=device, jobs=jobs, on_pass=on_place)
         scene = scene.at(place.at, place.spin_deg)
     on_scene(scene)
-    problem = set_problem(scene, device, models, loss)
+    problem = set_problem(scene, device, models, loss, jobs)
     if not resume:
         _clear(out)
     make_folder(out)
@@ -243,15 +245,8 @@ def _doubt(moved: float, gradient: float | None) -> None:
 def _promise(
     problem: Problem, design: np.ndarray, controls: Sequence[str], views: int, on_promise: Callable[[int, int], None]
 ) -> Promise:
-    done = 0
-
-    def progress(n: int) -> None:
-        nonlocal done
-        done += n
-        on_promise(done, views)
-
     conditions = problem.scene.draw("promise", views, per_session=PER_SESSION)
-    promise = make_promise(problem, design, conditions, controls, progress, PER_SESSION)
+    promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION)
     return promise.changed(draft=views < PROMISE_VIEWS)
 
 

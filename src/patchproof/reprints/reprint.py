@@ -33,7 +33,7 @@ from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import page_pixels
 from patchproof.strict import Refused
-from patchproof.workers import open_workers, result_of
+from patchproof.workers import Workers, open_workers, result_of, sharing
 
 SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
 OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
@@ -60,9 +60,6 @@ def reprint(
         raise Refused(f"1 to {n} sessions of {n} photographs", f"{sessions}", "ask for fewer")
     with _hung_pdf(pdf_path, run, how.control, Path(out)) as pdf:
         sheet = hang(pdf, run, how)
-        take = sheet.photograph
-        if jobs > 1 or cluster is not None:
-            take = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
         each, done = -(-n // sessions), 0
         conditions = sheet.scene.draw("reprint", n, seed, per_session=each)
         scale = conditions.pose.printed_scale[[0] * n]  # one print, wherever it is photographed
@@ -72,7 +69,9 @@ def reprint(
         names = [f"photo_{i + 1:04d}.jpg" for i in range(n)]
         if sessions > 1:
             names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
-        with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
+        there = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
+        opened = sharing(sheet.photograph, jobs) if cluster is None else _by_name(there, jobs, cluster)
+        with new_folder(out, OWN, overwrite) as folder, opened as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
                 (folder / names[i]).write_bytes(result_of(photo))
@@ -83,6 +82,13 @@ def reprint(
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
             return _write_truth(folder, dict(zip(names, map(sheet.truth, views), strict=True)))
+
+
+@contextmanager
+def _by_name(take: Callable[[Conditions], bytes], jobs: int, cluster: str) -> Iterator[tuple[Workers, Callable]]:
+    """A cluster's workers and what they do: each hangs the sheet for itself."""
+    with open_workers(jobs, cluster) as workers:
+        yield workers, take
 
 
 @contextmanager
