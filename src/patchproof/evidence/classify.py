@@ -81,9 +81,9 @@ def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarra
     planes = {size: [] for size in sizes_px}
     with torch.inference_mode():
         for channel in range(3):  # one by one, since as float each takes 4 times the memory
-            light = torch.from_numpy(np.ascontiguousarray(square[..., channel])).float().div_(255)[None, None]
+            codes = torch.from_numpy(square[..., channel].astype(np.float32))[None, None]
             for size, own in planes.items():
-                own.append(center_square(light, size)[0, 0])
+                own.append(center_square(codes, size)[0, 0] / 255)
         return {size: torch.stack(own).numpy() for size, own in planes.items()}
 
 

@@ -1,4 +1,4 @@
-"""The demo: the whole journey on an object and a network that come with the package, offline, in two minutes.
+"""The demo: the whole journey on an object and a network that come with the package, offline, in about a minute.
 
 In: nothing. Out: scene.toml run/ sheet.pdf sheet.json photos/ report/. Its conditions are hard ones on purpose: far,
 dim, oblique and in cluttered places, so that the bare object and the controls are often misread and there is something
