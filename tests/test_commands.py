@@ -91,7 +91,7 @@ def test_a_stopped_run_says_what_is_kept_and_a_second_try_how_to_go_on(tmp_path,
 
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "_promise", stop)
+        patch.setattr(run_module, "promise_of", stop)
         assert command("optimize", scene_file, "--out", out, "--overwrite") == 130
     again = f"patchproof optimize {scene_file} --out {out} --resume"
     assert capsys.readouterr().err.splitlines()[-1] == f"Stopped: {out} keeps what was finished. Go on with: {again}"

@@ -240,7 +240,7 @@ def test_a_stopped_import_leaves_an_earlier_run_as_it_was(tmp_path, monkeypatch)
     scene, out = scene_with(tmp_path, camera__photo_px=[96, 96]), tmp_path / "run"
     import_patch(noise(64, 64), scene, out, **DRAFT)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    monkeypatch.setattr(run_module, "_promise", stop)
+    monkeypatch.setattr(run_module, "promise_of", stop)
     with pytest.raises(KeyboardInterrupt):
         import_patch(noise(64, 64), scene, out, overwrite=True, **DRAFT)
     assert before == {path.name: path.read_bytes() for path in out.iterdir()}

@@ -20,6 +20,7 @@ from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, make_promise
+from patchproof.optimizer.promise_later import promise_run
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
@@ -347,7 +348,23 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views):
     with one_thread():
         for jobs in (1, 3):
             optimize_scene(scene, tmp_path / str(jobs), jobs=jobs)
-    assert same_files(tmp_path / "1", tmp_path / "3")
+    assert same_files(
+        tmp_path / "1", tmp_path / "3", ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
+    )
+
+
+def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
+    scene = toml(tmp_path / "scene.toml")
+    optimize_scene(scene, tmp_path / "whole")
+    draft = optimize_scene(scene, tmp_path / "draft", promise_views=8)
+    assert draft.promise.draft and not same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",))
+    promised = promise_run(tmp_path / "draft")
+    assert same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",)) and not promised.promise.draft
+    assert load_run(tmp_path / "draft").promise == promised.promise
+    with pytest.raises(Refused, match="a promise of 8 views"):
+        promise_run(tmp_path / "draft", views=4)
+    with pytest.raises(Refused, match="a finished run, got none"):
+        promise_run(tmp_path / "nothing")
 
 
 def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path, few_views):

@@ -19,7 +19,7 @@ from patchproof.cli.capture import capture
 from patchproof.cli.console import carried_out
 from patchproof.cli.designs import evaluate, import_picture
 from patchproof.cli.experiments import ListsStudies, bench, harden, keys, study
-from patchproof.cli.journey import demo, optimize, reprint, sheet, verify
+from patchproof.cli.journey import demo, optimize, promise, reprint, sheet, verify
 from patchproof.output import disk_is_full
 from patchproof.strict import Refused
 from patchproof.version import __version__
@@ -34,7 +34,7 @@ _calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a ca
 for _verb in (demo, new, preview, plan, optimize):
     app.command()(carried_out(_verb))
 app.command("import")(carried_out(import_picture))
-for _verb in (evaluate, sheet, reprint, capture, verify):
+for _verb in (promise, evaluate, sheet, reprint, capture, verify):
     app.command()(carried_out(_verb))
 app.add_typer(_calibrate, name="calibrate")
 for _verb in (printer, camera):

@@ -92,6 +92,26 @@ def optimize(
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
 
 
+def promise(
+    run: Annotated[Path, typer.Argument(help="A finished run, such as a draft's.")],
+    n: Annotated[int | None, typer.Option("--n", min=8, help="Views to promise from, by default 400.")] = None,
+    device: Device = "cpu",
+    jobs: Jobs = None,
+) -> None:
+    """Promise a finished run's rate anew: the full promise of a draft, or one of more views."""
+    from patchproof.optimizer.promise_later import promise_run
+    from patchproof.report.summary import promise_lines
+    from patchproof.settings import behind
+
+    with progress() as bar:
+        made = promise_run(
+            run, views=n, device=device, jobs=jobs or 1, on_promise=lambda done, total: bar("promise", done, total)
+        )
+    say(*promise_lines(made.promise, behind(made.scene.settings.model_dump())))
+    if made.scene.settings.patch.kind == "patch":
+        say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
+
+
 def sheet(
     out: Annotated[Path | None, typer.Option(help="The PDF; its manifest is written beside it.")] = None,
     runs: Annotated[

@@ -44,10 +44,10 @@ from patchproof.sheets.manifest import Promise
 from patchproof.strict import Positive, Refused, validated
 from patchproof.version import __version__
 
-_LOG, _RUN, _VIEWS = ("steps.jsonl", "run.json", "views.png")
+_LOG, RUN_FILE, _VIEWS = ("steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
-OWN = (CHECKPOINT, _LOG, _RUN, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
+OWN = (CHECKPOINT, _LOG, RUN_FILE, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
 
 NotNegativeInt = Annotated[int, Field(ge=0)]
 DRAFT_STEPS, DRAFT_VIEWS = 40, 40  # a first look: ten sessions, and an interval about three times as wide
@@ -93,7 +93,7 @@ def optimize_scene(
     """
     out, views = Path(out), promised_views(promise_views)
     if not resume:
-        check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / _RUN))
+        check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / RUN_FILE))
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     place = None
     if isinstance(scene, OpenScene):
@@ -133,23 +133,23 @@ def finish_run(
     """
     scene = problem.scene
     problem.subject.save(design, out)
-    promise = _promise(problem, design, controls, views, on_promise)
+    promise = promise_of(problem, design, controls, views, on_promise)
     if scene.given_glb is not None:
         write_whole(out / _GIVEN, scene.given_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
-    write_whole(out / _RUN, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
+    write_whole(out / RUN_FILE, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
     return Run(out, scene, design, promise, details)
 
 
 def load_run(folder: str | Path) -> Run:
     """A finished run; refused where it is none, or not finished."""
     folder = Path(folder)
-    if not is_file(folder / _RUN):
+    if not is_file(folder / RUN_FILE):
         begun = is_file(folder / CHECKPOINT)
         do = "finish it with --resume" if begun else "name the folder that optimize wrote"
         raise Refused("a finished run", f"{'an unfinished one' if begun else 'none'} at {folder}", do)
-    details = read_json(folder / _RUN, "a finished run", "optimize again")
-    record = validated(_Record, details, str(folder / _RUN))
+    details = read_json(folder / RUN_FILE, "a finished run", "optimize again")
+    record = validated(_Record, details, str(folder / RUN_FILE))
     settings, promise = record.settings, record.promise
     _refuse_framed(settings, record.placement, folder)
     try:
@@ -242,9 +242,10 @@ def _doubt(moved: float, gradient: float | None) -> None:
     warnings.warn(f"the design is still what it began as: {why}", stacklevel=3)
 
 
-def _promise(
+def promise_of(
     problem: Problem, design: np.ndarray, controls: Sequence[str], views: int, on_promise: Callable[[int, int], None]
 ) -> Promise:
+    """The promise of a finished design; of fewer views than usual it is a draft's."""
     conditions = problem.scene.draw("promise", views, per_session=PER_SESSION)
     promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION)
     return promise.changed(draft=views < PROMISE_VIEWS)

@@ -1,0 +1,34 @@
+"""The promise of a finished run, made later or of more views: a draft's design may deserve a full one.
+
+In: a run's folder. Out: the same run with another promise in its run.json, to the byte the one that `optimize` would
+have made of so many views. Left out on purpose: sheets. One that was written before keeps its promise until it is
+written again, with the same markers and sheet id.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.run import RUN_FILE, Run, load_run, promise_of, promised_views
+from patchproof.output import write_whole
+
+
+def promise_run(
+    run_folder: str | Path,
+    *,
+    views: int | None = None,
+    device: str = "cpu",
+    jobs: int = 1,
+    on_promise: Callable[[int, int], None] = lambda done, total: None,
+) -> Run:
+    """Promise a run's design anew, from so many views (by default as many as `optimize` takes), with its controls."""
+    views, run = promised_views(views), load_run(run_folder)
+    problem = set_problem(run.scene, device, jobs=jobs)
+    promise = promise_of(problem, run.design, tuple(run.promise.controls), views, on_promise)
+    details = run.details | {"promise": promise.model_dump(mode="json")}
+    write_whole(run.folder / RUN_FILE, (json.dumps(details, indent=1) + "\n").encode())
+    return replace(run, promise=promise, details=details)
