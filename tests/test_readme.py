@@ -294,6 +294,27 @@ def test_figures_of_the_ablation_are_the_stored_ones():
         assert any(line.startswith(f"| {name} | {earned} | {traced} | ") for line in lines), name
 
 
+def test_figures_of_hardened_renders_are_the_stored_ones():
+    lines = NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    rows = rows_of("harden/procedural_accuracy.csv")
+
+    def percent(row: dict[str, str], key: str) -> str:
+        value, low, high = (100 * float(row[f"{key}{end}"]) for end in ("", "_low", "_high"))
+        return f"{value:.1f} [{low:.1f}, {high:.1f}]"
+
+    for attack in dict.fromkeys(row["attack"] for row in rows):
+        under = [row for row in rows if row["attack"] == attack]
+        assert [row["epsilon"] for row in under] == ["0.01", "0.02", "0.04"]
+        kind, _, epsilon = attack.partition(" ")
+        under_what = f"{kind.upper()} {epsilon}" if epsilon else "no attack"
+        figures = [percent(under[0], "original"), *(percent(row, "hardened") for row in under)]
+        assert f"| {under_what} | {' | '.join(figures)} |" in lines
+    (best,) = (row for row in rows if row["attack"] == "pgd 0.01" and row["epsilon"] == "0.04")
+    assert f"+{percent(best, 'gain by class').replace(' [', ' points, over the twelve classes [')}" in words(NOTEBOOK)
+    moved = (f"{float(row['RMS']):.3f}, {float(row['SSIM']):.2f}" for row in rows_of("harden/procedural_moved.csv"))
+    assert f"| RMS moved, SSIM | | {' | '.join(moved)} |" in lines
+
+
 def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
     (series,) = stored("bench_detect.json")["charts"]["levels_12mp"]["series"]
     points = {point["setting"]: point for point in series["points"]}
