@@ -151,6 +151,26 @@ def test_the_study_varies_networks_and_epsilons(folder, tmp_path):
     assert json.loads((tmp_path / "out/harden.json").read_text())["settings"]["epsilons"][2] is None
 
 
+def test_gains_by_class_are_means_of_the_classes_means(folder, tmp_path):
+    settings = options(folder, epsilons=[0.1], attacks=["fgsm"])
+    labels, before, after = "aaabcde", [0, 0, 0, 1, 1, 0, 0], [1, 1, 1, 1, 0, 0, 1]
+
+    def result(hits, values):
+        rows = [
+            {"file": str(i), "label": label, "right": {FAKE: [True, bool(hit)]}, "rms": 0.0, "ssim": 1.0}
+            for i, (label, hit) in enumerate(zip(labels, hits, strict=True))
+        ]
+        return Result(Cell("cell", values), {"photos": rows, "unread": []}, tmp_path)
+
+    variant = {"models": [FAKE], "method": "pgd", "epsilon": 0.1}
+    accuracy, *_ = tables(settings, [result(before, {}), result(after, {"variant": variant})])
+    clean, fgsm = (dict(zip(accuracy.head, row, strict=True)) for row in accuracy.rows)
+    assert fgsm["gain"].value == pytest.approx(3 / 7) and fgsm["gain"].n == 7
+    # class a gains 1, b 0, c -1, d 0, e 1
+    assert fgsm["gain by class"].value == pytest.approx(1 / 5) and fgsm["gain by class"].n == 5
+    assert clean["gain by class"].value == 0
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
@@ -194,23 +214,3 @@ def test_steps_that_fall_settle_where_the_loss_is_least():
     photo = np.full((32, 32, 3), 118, np.uint8)
     (picture,) = harden([photo], [[0]], [classifier], "pgd", 0.2, 40)
     assert abs(squares([picture], classifier).mean().item() - 0.6) < 0.006
-
-
-def test_gains_by_class_are_means_of_the_classes_means(folder, tmp_path):
-    settings = options(folder, epsilons=[0.1], attacks=["fgsm"])
-    labels, before, after = "aaabcde", [0, 0, 0, 1, 1, 0, 0], [1, 1, 1, 1, 0, 0, 1]
-
-    def result(hits, values):
-        rows = [
-            {"file": str(i), "label": label, "right": {FAKE: [True, bool(hit)]}, "rms": 0.0, "ssim": 1.0}
-            for i, (label, hit) in enumerate(zip(labels, hits, strict=True))
-        ]
-        return Result(Cell("cell", values), {"photos": rows, "unread": []}, tmp_path)
-
-    variant = {"models": [FAKE], "method": "pgd", "epsilon": 0.1}
-    accuracy, *_ = tables(settings, [result(before, {}), result(after, {"variant": variant})])
-    clean, fgsm = (dict(zip(accuracy.head, row, strict=True)) for row in accuracy.rows)
-    assert fgsm["gain"].value == pytest.approx(3 / 7) and fgsm["gain"].n == 7
-    # class a gains 1, b 0, c -1, d 0, e 1
-    assert fgsm["gain by class"].value == pytest.approx(1 / 5) and fgsm["gain by class"].n == 5
-    assert clean["gain by class"].value == 0

@@ -85,7 +85,7 @@ def survives_fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: fl
 
 
 def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, steps: int = PGD_STEPS) -> Tensor:
-    """N bool: right, and still right all along either loss's steps; what is lost goes no further."""
+    """N bool: right, and still right wherever either loss leads on its way; what is lost goes no further."""
     alive = _right(network, pictures, labels)
     for loss in LOSSES:
         left, x = alive.nonzero()[:, 0], pictures[alive]
