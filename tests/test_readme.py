@@ -294,9 +294,10 @@ def test_figures_of_the_ablation_are_the_stored_ones():
         assert any(line.startswith(f"| {name} | {earned} | {traced} | ") for line in lines), name
 
 
-def test_figures_of_hardened_renders_are_the_stored_ones():
+@pytest.mark.parametrize(("name", "network"), [("procedural", "builtin"), ("levit", "LeViT")])
+def test_figures_of_hardened_renders_are_the_stored_ones(name, network):
     lines = NOTEBOOK.read_text(encoding="utf-8").splitlines()
-    rows = rows_of("harden/procedural_accuracy.csv")
+    rows = rows_of(f"harden/{name}_accuracy.csv")
 
     def percent(row: dict[str, str], key: str) -> str:
         value, low, high = (100 * float(row[f"{key}{end}"]) for end in ("", "_low", "_high"))
@@ -308,11 +309,14 @@ def test_figures_of_hardened_renders_are_the_stored_ones():
         kind, _, epsilon = attack.partition(" ")
         under_what = f"{kind.upper()} {epsilon}" if epsilon else "no attack"
         figures = [percent(under[0], "original"), *(percent(row, "hardened") for row in under)]
-        assert f"| {under_what} | {' | '.join(figures)} |" in lines
-    (best,) = (row for row in rows if row["attack"] == "pgd 0.01" and row["epsilon"] == "0.04")
-    assert f"+{percent(best, 'gain by class').replace(' [', ' points, over the twelve classes [')}" in words(NOTEBOOK)
-    moved = (f"{float(row['RMS']):.3f}, {float(row['SSIM']):.2f}" for row in rows_of("harden/procedural_moved.csv"))
-    assert f"| RMS moved, SSIM | | {' | '.join(moved)} |" in lines
+        assert f"| {network} | {under_what} | {' | '.join(figures)} |" in lines
+    gained = [row for row in rows if row["attack"] == "pgd 0.01" and float(row["gain_low"]) > 0]
+    assert gained
+    for row in gained:
+        value, _, rest = percent(row, "gain by class").partition(" ")
+        assert re.search(rf"\+{value}( points, over the twelve classes)? {re.escape(rest)}", words(NOTEBOOK))
+    moved = (f"{float(row['RMS']):.3f}, {float(row['SSIM']):.2f}" for row in rows_of(f"harden/{name}_moved.csv"))
+    assert f"| {network} | RMS moved, SSIM | | {' | '.join(moved)} |" in lines
 
 
 def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
