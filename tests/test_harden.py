@@ -14,7 +14,7 @@ from PIL import Image
 from fake_networks import RedAgainstBlue
 from patchproof import cli
 from patchproof.classifier.network import Classifier
-from patchproof.harden.attacks import margin
+from patchproof.harden.attacks import margin, survives_pgd
 from patchproof.harden.folder import HardenSettings, harden_images, tables, too_strong
 from patchproof.harden.harden import harden, moved, squares
 from patchproof.photo.read import read_photo
@@ -214,3 +214,28 @@ def test_steps_that_fall_settle_where_the_loss_is_least():
     photo = np.full((32, 32, 3), 118, np.uint8)
     (picture,) = harden([photo], [[0]], [classifier], "pgd", 0.2, 40)
     assert abs(squares([picture], classifier).mean().item() - 0.6) < 0.006
+
+
+def test_through_the_attack_steps_go_where_the_attacked_loss_falls():
+    """The network shouts at a gray of 0.6 and is calm and right above 0.7: attacked by 0.05, one must go there."""
+
+    def peaked(photos):
+        x = photos.mean((1, 2, 3))
+        score = 20 * torch.exp(-(((x - 0.6) / 0.02) ** 2)) + 4 * torch.sigmoid((x - 0.7) * 40) - 2
+        return torch.stack([score, -score], 1)
+
+    classifier = replace(RED, network=peaked)
+    photo = np.full((32, 32, 3), round(0.62 * 255), np.uint8)
+    near, far = (
+        squares(harden([photo], [[0]], [classifier], "pgd", 0.15, 40, through=through), classifier)
+        for through in (None, 0.05)
+    )
+    assert abs(near.mean().item() - 0.6) < 0.01 and far.mean().item() > 0.75
+    labels = torch.tensor([0])
+    assert not survives_pgd(peaked, near, labels, 0.05) and survives_pgd(peaked, far, labels, 0.05)
+
+
+@pytest.mark.parametrize("through", [0, 1.5])
+def test_an_attack_to_go_through_has_an_epsilon(folder, through):
+    with pytest.raises(Refused, match="through"):
+        options(folder, through=through)

@@ -94,18 +94,6 @@ class Before:
             x = (x - step * self.scaled(cross_entropy, x, self.labels).sign()).clamp(0, 1)
         return (x * 255).round() / 255
 
-    def through(self, pictures: Tensor, epsilon: float, steps: int = STEPS, inner: int = 7) -> Tensor:
-        """Hardened at the place where PGD within ATTACK leads to, then in 8 bits."""
-        x, loss = pictures, partial(self.scaled, cross_entropy)
-        for number in range(steps):
-            worst = x
-            for _ in range(inner):
-                moved = worst + ATTACK / 4 * loss(worst, self.labels).sign()
-                worst = torch.clamp(moved, x - ATTACK, x + ATTACK).clamp(0, 1)
-            x = x - epsilon / 4 * (1 - number / steps) * loss(worst, self.labels).sign()
-            x = torch.clamp(x, pictures - epsilon, pictures + epsilon).clamp(0, 1)
-        return (x * 255).round() / 255
-
 
 def measured(name: str, folders: list[Path]) -> dict:
     """Everything of one network."""
@@ -119,9 +107,9 @@ def measured(name: str, folders: list[Path]) -> dict:
     ours, at_margin = (partial(before.scaled, loss) for loss in (cross_entropy, margin))
     found: dict = {"network": name, "pictures": len(rows), "labels": words, "reach": {}, "settings": {}, "walks": {}}
 
-    def hardened(pictures: Tensor, epsilon: float, method="pgd", steps=STEPS) -> Tensor:
+    def hardened(pictures: Tensor, epsilon: float, method="pgd", steps=STEPS, through=None) -> Tensor:
         photos = list((pictures * 255).round().byte().permute(0, 2, 3, 1).numpy())
-        return squares(harden(photos, [labels], [classifier], method, epsilon, steps), classifier)
+        return squares(harden(photos, [labels], [classifier], method, epsilon, steps, through=through), classifier)
 
     def keep(table: str, key: str, alive: Tensor, pictures: Tensor | None = None) -> None:
         kept = {"hits": "".join("01"[int(hit)] for hit in alive)}
@@ -169,7 +157,7 @@ def measured(name: str, folders: list[Path]) -> dict:
     one = hardened(start, EPSILON, "fgsm", 1)
     keep("settings", "hardened in one step", before.attacked(one, ours)[1], one)
     for ball in (EPSILON, 0.1):
-        pictures = before.through(start, ball)
+        pictures = hardened(start, ball, through=ATTACK)
         keep("reach", f"{ball:g} through at 0", before.right(pictures), pictures)
         for reach in REACHES:
             keep("reach", f"{ball:g} through at {reach:g}", before.attacked(pictures, ours, reach)[1])

@@ -57,6 +57,8 @@ class HardenSettings(Strict):
     epsilons: Annotated[tuple[Epsilon, ...], Field(min_length=1)] = (8 / 255, 0.1, None)
     steps: Count = 100  # of hardening
     step_size: Positive | None = None  # in place of the method's own
+    # ε of the PGD that each step goes through: for images that withstand it, at eight times the passes.
+    through: Annotated[Share, Field(gt=0)] | None = None
     attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # that are to be withstood
     attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
 
@@ -109,7 +111,8 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
     if photos and "variant" in values:
         names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
         networks, truth = [_classifier(name, base) for name in names], [_truth(name, base, labels) for name in names]
-        pictures = harden(originals, truth, networks, *how, settings.steps, settings.step_size)
+        steps = settings.steps, settings.step_size, settings.through
+        pictures = harden(originals, truth, networks, *how, *steps)
         for photo, original, picture in zip(photos, originals, pictures, strict=True):
             files[values["folder"] + photo["png"]] = image_bytes(picture, "PNG")
             photo["rms"], photo["ssim"] = moved(original, picture)
