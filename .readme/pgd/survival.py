@@ -214,7 +214,9 @@ def draw() -> None:
         words = [key.replace("as it is", "40 steps of ε/4: as it is").replace("1 steps", "1 step") for key in OTHERWISE]
         bars.set_yticks(rows, words if column == 0 else [""] * len(words), fontsize=8)
         bars.set(xlim=(0, 1), xlabel="recognized; hardened within 0.04, ε of the attack 0.01")
-    plots[0, 0].legend(fontsize=7, frameon=False)
+    figure.legend(
+        *plots[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8, frameon=False
+    )
     figure.savefig(HERE.parent / "pgd.png", dpi=100)
 
 
