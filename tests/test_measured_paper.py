@@ -60,15 +60,42 @@ def test_what_is_ruled_out_left_nothing():
 
 
 def test_stress_is_the_stored_one():
-    with (NOTES / "paper/stress_worst.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    for row in rows:
+    for row in rows_of("stress_worst.csv"):
         if row["test"] in ("worst pose", "black square"):
             there, usual = (f"{100 * float(row[key]):.0f}" for key in ("rate", "rate anywhere"))
             assert f"{there} % (elsewhere {usual})" in PAGE
 
 
-@pytest.mark.parametrize("name", ["stress", "robust", "patch2d"])
-def test_configs_are_read(name):
+def rows_of(name: str) -> list[dict[str, str]]:
+    with (NOTES / "paper" / name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def percent(row: dict[str, str], key: str, sign: str = "") -> tuple[str, str]:
+    value, low, high = (100 * float(row[key + end]) for end in ("", "_low", "_high"))
+    return f"{value:{sign}.1f}", f"[{low:.1f}, {high:.1f}]"
+
+
+def test_gain_and_harm_of_2d_patches_are_the_stored_ones():
+    for row in rows_of("patch2d_pooled.csv"):
+        cells = (" ".join(percent(row, f"patch minus {other}", "+")) for other in ("bare", "gray", "noise"))
+        assert f"| {row['rate']} | {' | '.join(cells)} |" in PAGE
+        assert row["patch minus bare_n"] == "6"
+    assert {row["patch_n"] for row in rows_of("patch2d_harm.csv")} == {"24"}
+
+
+def test_rates_of_the_car_are_the_stored_ones():
+    by_way = {(row["way"], row["trained on"] == "original"): row for row in rows_of("masked_matrix.csv")}
+    for key in by_way:
+        value, interval = percent(by_way[key], "rate")
+        assert f"{value} % {interval}" in PAGE, key
+    value, interval = percent(by_way["small_steps", False], "gain in rate", "+")
+    assert f"({value} points {interval})" in PAGE
+
+
+@pytest.mark.parametrize(
+    ("name", "config"), [(each, each) for each in ("stress", "robust", "patch2d")] + [("transfer", "masked")]
+)
+def test_configs_are_read(name, config):
     study = import_module(STUDIES[name]).STUDY
-    assert validated(study.settings, read_toml(NOTES / f"paper/{name}.toml"), name)
+    assert validated(study.settings, read_toml(NOTES / f"paper/{config}.toml"), name)
