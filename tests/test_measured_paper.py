@@ -84,6 +84,14 @@ def test_gain_and_harm_of_2d_patches_are_the_stored_ones():
     assert {row["patch_n"] for row in rows_of("patch2d_harm.csv")} == {"24"}
 
 
+def test_rates_of_robust_designs_are_the_stored_ones():
+    rows = rows_of("robust_rates.csv")
+    for scene, name in (("suv", "SUV"), ("carton", "carton"), ("postbox", "letter box")):
+        cells = (" ".join(percent(row, "design")) for row in rows if row["scene"] == scene)
+        assert f"| {name} | {' | '.join(cells)} |" in PAGE
+    assert {percent(row, "gray") for row in rows} == {("0.0", "[0.0, 6.0]")}
+
+
 def test_rates_of_the_car_are_the_stored_ones():
     by_way = {(row["way"], row["trained on"] == "original"): row for row in rows_of("masked_matrix.csv")}
     for key in by_way:
