@@ -52,6 +52,14 @@ def test_survivors_are_the_stored_ones(words):
     assert row_of(words) in PAGE
 
 
+def test_hardening_through_the_attack_is_the_stored_one():
+    with (NOTES / "pgd/through.csv").open(encoding="utf-8") as file:
+        _, small, large = csv.DictReader(file)
+    value, interval = percent(small, "hardened")
+    assert f"{value} % {interval} of {small['hardened_n']} under PGD of 0.01" in PAGE
+    assert float(small["original"]) == float(large["hardened"]) == 0
+
+
 def test_what_is_ruled_out_left_nothing():
     found = json.loads((NOTES / "pgd/mobilenet.json").read_text("utf-8"))
     for key in ("steps of ε", "steps of ε/20", "a random start", "plain float32 gradient", "softmax taken twice"):
