@@ -139,3 +139,19 @@ def test_pictures_are_attacked_each_on_its_own():
     alone = torch.cat([survives_pgd(network, pictures[i : i + 1], labels[i : i + 1], 0.003, steps=5) for i in range(4)])
     assert together.tolist() == alone.tolist()
     assert attacks.ATTACKS.keys() == {"fgsm", "pgd"}
+
+
+def test_a_picture_that_was_lost_on_the_way_is_lost():
+    def network(pictures):
+        x = pictures[:, 0, 0, 0]
+        hole = torch.where((x - 0.51).abs() < 0.004, -1000.0, 0.0)  # that steps of 0.0075 from 0.52 fall into
+        score = 100 * (x - 0.4) + hole
+        return torch.stack([score, -score], 1)
+
+    pictures, labels = torch.full((2, 3, 2, 2), 0.52), torch.tensor([0, 1])
+    *_, last = pgd(network, pictures, labels, 0.03, margin)
+    assert right(network(last), labels).tolist() == [True, False]
+    assert survives_pgd(network, pictures, labels, 0.03).tolist() == [False, False]
+    assert survives_pgd(network, pictures, labels, 0.005).tolist() == [True, False]  # does not reach it
+    # what is read wrongly to begin with survives nothing
+    assert survives_fgsm(network, pictures, labels, 0.001).tolist() == [True, False]

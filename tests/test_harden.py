@@ -14,12 +14,12 @@ from PIL import Image
 from fake_networks import RedAgainstBlue
 from patchproof import cli
 from patchproof.classifier.network import Classifier
-from patchproof.harden.attacks import margin
-from patchproof.harden.folder import HardenSettings, harden_images, too_strong
+from patchproof.harden.attacks import margin, survives_pgd
+from patchproof.harden.folder import HardenSettings, harden_images, tables, too_strong
 from patchproof.harden.harden import harden, moved, squares
 from patchproof.photo.read import read_photo
 from patchproof.strict import Refused, validated
-from patchproof.study.study import Work, run_study
+from patchproof.study.study import Cell, Result, Work, run_study
 
 FAKE = "module:fake_networks.red_against_blue"
 RED = Classifier("red", None, 32, RedAgainstBlue.labels, RedAgainstBlue())
@@ -151,6 +151,26 @@ def test_the_study_varies_networks_and_epsilons(folder, tmp_path):
     assert json.loads((tmp_path / "out/harden.json").read_text())["settings"]["epsilons"][2] is None
 
 
+def test_gains_by_class_are_means_of_the_classes_means(folder, tmp_path):
+    settings = options(folder, epsilons=[0.1], attacks=["fgsm"])
+    labels, before, after = "aaabcde", [0, 0, 0, 1, 1, 0, 0], [1, 1, 1, 1, 0, 0, 1]
+
+    def result(hits, values):
+        rows = [
+            {"file": str(i), "label": label, "right": {FAKE: [True, bool(hit)]}, "rms": 0.0, "ssim": 1.0}
+            for i, (label, hit) in enumerate(zip(labels, hits, strict=True))
+        ]
+        return Result(Cell("cell", values), {"photos": rows, "unread": []}, tmp_path)
+
+    variant = {"models": [FAKE], "method": "pgd", "epsilon": 0.1}
+    accuracy, *_ = tables(settings, [result(before, {}), result(after, {"variant": variant})])
+    clean, fgsm = (dict(zip(accuracy.head, row, strict=True)) for row in accuracy.rows)
+    assert fgsm["gain"].value == pytest.approx(3 / 7) and fgsm["gain"].n == 7
+    # class a gains 1, b 0, c -1, d 0, e 1
+    assert fgsm["gain by class"].value == pytest.approx(1 / 5) and fgsm["gain by class"].n == 5
+    assert clean["gain by class"].value == 0
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
@@ -194,3 +214,28 @@ def test_steps_that_fall_settle_where_the_loss_is_least():
     photo = np.full((32, 32, 3), 118, np.uint8)
     (picture,) = harden([photo], [[0]], [classifier], "pgd", 0.2, 40)
     assert abs(squares([picture], classifier).mean().item() - 0.6) < 0.006
+
+
+def test_through_the_attack_steps_go_where_the_attacked_loss_falls():
+    """The network shouts at a gray of 0.6 and is calm and right above 0.7: attacked by 0.05, one must go there."""
+
+    def peaked(photos):
+        x = photos.mean((1, 2, 3))
+        score = 20 * torch.exp(-(((x - 0.6) / 0.02) ** 2)) + 4 * torch.sigmoid((x - 0.7) * 40) - 2
+        return torch.stack([score, -score], 1)
+
+    classifier = replace(RED, network=peaked)
+    photo = np.full((32, 32, 3), round(0.62 * 255), np.uint8)
+    near, far = (
+        squares(harden([photo], [[0]], [classifier], "pgd", 0.15, 40, through=through), classifier)
+        for through in (None, 0.05)
+    )
+    assert abs(near.mean().item() - 0.6) < 0.01 and far.mean().item() > 0.75
+    labels = torch.tensor([0])
+    assert not survives_pgd(peaked, near, labels, 0.05) and survives_pgd(peaked, far, labels, 0.05)
+
+
+@pytest.mark.parametrize("through", [0, 1.5])
+def test_an_attack_to_go_through_has_an_epsilon(folder, through):
+    with pytest.raises(Refused, match="through"):
+        options(folder, through=through)

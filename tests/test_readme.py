@@ -294,6 +294,31 @@ def test_figures_of_the_ablation_are_the_stored_ones():
         assert any(line.startswith(f"| {name} | {earned} | {traced} | ") for line in lines), name
 
 
+@pytest.mark.parametrize(("name", "network"), [("procedural", "builtin"), ("levit", "LeViT")])
+def test_figures_of_hardened_renders_are_the_stored_ones(name, network):
+    lines = NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    rows = rows_of(f"harden/{name}_accuracy.csv")
+
+    def percent(row: dict[str, str], key: str) -> str:
+        value, low, high = (100 * float(row[f"{key}{end}"]) for end in ("", "_low", "_high"))
+        return f"{value:.1f} [{low:.1f}, {high:.1f}]"
+
+    for attack in dict.fromkeys(row["attack"] for row in rows):
+        under = [row for row in rows if row["attack"] == attack]
+        assert [row["epsilon"] for row in under] == ["0.01", "0.02", "0.04"]
+        kind, _, epsilon = attack.partition(" ")
+        under_what = f"{kind.upper()} {epsilon}" if epsilon else "no attack"
+        figures = [percent(under[0], "original"), *(percent(row, "hardened") for row in under)]
+        assert f"| {network} | {under_what} | {' | '.join(figures)} |" in lines
+    gained = [row for row in rows if row["attack"] == "pgd 0.01" and float(row["gain_low"]) > 0]
+    assert gained
+    for row in gained:
+        value, _, rest = percent(row, "gain by class").partition(" ")
+        assert re.search(rf"\+{value}( points, over the twelve classes)? {re.escape(rest)}", words(NOTEBOOK))
+    moved = (f"{float(row['RMS']):.3f}, {float(row['SSIM']):.2f}" for row in rows_of(f"harden/{name}_moved.csv"))
+    assert f"| {network} | RMS moved, SSIM | | {' | '.join(moved)} |" in lines
+
+
 def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
     (series,) = stored("bench_detect.json")["charts"]["levels_12mp"]["series"]
     points = {point["setting"]: point for point in series["points"]}

@@ -20,6 +20,7 @@ def harden(
     eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
     steps: Annotated[int, typer.Option(min=1, help="Steps.")] = 100,
     step_size: Annotated[float | None, typer.Option(help="In place of the method's own.")] = None,
+    through: Annotated[float | None, typer.Option(help="ε of a PGD that each step goes through.")] = None,
     judges: Annotated[str | None, typer.Option(help="Comma-separated classifiers that only judge.")] = None,
     evaluate: Annotated[str, typer.Option(help="Attacks to withstand: fgsm, pgd.")] = "",
     attack_eps: Annotated[str, typer.Option(help="Their ε.")] = "0.01,0.02,0.04",
@@ -43,6 +44,7 @@ def harden(
         "epsilons": (eps,),
         "steps": steps,
         "step_size": step_size,
+        "through": through,
         "attacks": names_of(evaluate),
         "attack_epsilons": names_of(attack_eps),
     }

@@ -60,30 +60,42 @@ def pgd(
     steps: int = PGD_STEPS,
     step: float = PGD_STEP,
 ) -> Iterator[Tensor]:
-    """The pictures after each of `steps` steps x ← clip(Π(x + `step` ε sign ∇L)), Π onto the ε-ball; from x itself."""
+    """The pictures after each of `steps` steps, from x itself."""
     x = pictures
     for _ in range(steps):
-        x = x + step * epsilon * _gradient(network, x, labels, loss).sign()
-        x = torch.clamp(x, pictures - epsilon, pictures + epsilon).clamp(0, 1)
+        x = pgd_step(network, x, pictures, labels, epsilon, loss, step)
         yield x
 
 
+def pgd_step(
+    network: Logits, x: Tensor, pictures: Tensor, labels: Tensor, epsilon: float, loss: Loss, step: float = PGD_STEP
+) -> Tensor:
+    """x ← clip(Π(x + `step` ε sign ∇L)), Π onto the ε-ball round the pictures."""
+    x = x + step * epsilon * _gradient(network, x, labels, loss).sign()
+    return torch.clamp(x, pictures - epsilon, pictures + epsilon).clamp(0, 1)
+
+
 def survives_fgsm(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float) -> Tensor:
-    """N bool: still right after the step along either loss's gradient."""
-    alive = torch.ones(len(pictures), dtype=torch.bool, device=pictures.device)
+    """N bool: right, and still right after the step along either loss's gradient."""
+    alive = _right(network, pictures, labels)
     for loss in LOSSES:
-        alive &= _right(network, fgsm(network, pictures, labels, epsilon, loss), labels)
+        if len(left := alive.nonzero()[:, 0]):
+            alive[left] = _right(network, fgsm(network, pictures[left], labels[left], epsilon, loss), labels[left])
     return alive
 
 
 def survives_pgd(network: Logits, pictures: Tensor, labels: Tensor, epsilon: float, steps: int = PGD_STEPS) -> Tensor:
-    """N bool: still right where either loss's steps have led to."""
-    alive = torch.ones(len(pictures), dtype=torch.bool, device=pictures.device)
+    """N bool: right, and still right wherever either loss leads on its way; what is lost goes no further."""
+    alive = _right(network, pictures, labels)
     for loss in LOSSES:
-        last = pictures
-        for x in pgd(network, pictures, labels, epsilon, loss, steps):
-            last = x
-        alive &= _right(network, last, labels)
+        left, x = alive.nonzero()[:, 0], pictures[alive]
+        for _ in range(steps):
+            if not len(left):
+                break
+            x = pgd_step(network, x, pictures[left], labels[left], epsilon, loss)
+            still = _right(network, x, labels[left])
+            alive[left[~still]] = False
+            left, x = left[still], x[still]
     return alive
 
 

@@ -55,17 +55,23 @@ def pictures(per_class: int, seed: int, size_px: int) -> Pictures:
 
 def _views(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
     """VIEWS_PER_SHAPE pictures and boxes of one shape with one set of materials."""
-    mesh = primitives.build(name, seed)
+    return views_of(dressed(primitives.build(name, seed), rng), VIEWS_PER_SHAPE, rng, size_px)
+
+
+def views_of(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
+    """`count` pictures uint8 and boxes of a mesh, which is made LENGTH_MM long; half of them, rounded down, rendered at
+    `size_px`.
+    """
     scale = LENGTH_MM / np.ptp(mesh.vertices, axis=0).max()
-    mesh = dressed(dataclasses.replace(mesh, vertices=mesh.vertices * scale), rng)
-    behind = Backgrounds(tuple(patterns.background(rng) for _ in range(VIEWS_PER_SHAPE)))
+    mesh = dataclasses.replace(mesh, vertices=mesh.vertices * scale)
+    behind = Backgrounds(tuple(patterns.background(rng) for _ in range(count)))
     scene = bare_scene(_settings(rng, 2 * size_px), mesh, behind)
-    stage, conditions = set_stage(scene), scene.draw("evaluate", VIEWS_PER_SHAPE, int(rng.integers(1 << 30)))
-    half = VIEWS_PER_SHAPE // 2
-    small = photograph(stage, None, conditions[:half], (size_px, size_px))
-    large = photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px))
-    boxes = torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
-    return codes_of(torch.cat([small, center_square(large, size_px)])), boxes
+    stage, conditions = set_stage(scene), scene.draw("evaluate", count, int(rng.integers(1 << 30)))
+    half = count // 2
+    seen = [center_square(photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px)), size_px)]
+    if half:
+        seen.insert(0, photograph(stage, None, conditions[:half], (size_px, size_px)))
+    return codes_of(torch.cat(seen)), torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
 
 
 def _settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
