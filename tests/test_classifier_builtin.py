@@ -13,7 +13,8 @@ from patchproof.mesh import primitives
 from patchproof.strict import Refused
 from patchproof.training import pictures as rendered
 from patchproof.training import train_builtin
-from patchproof.training.pictures import HELD_OUT, Pictures, augmented, pictures
+from patchproof.training.fit import Seconds
+from patchproof.training.pictures import HELD_OUT, Pictures, augmented, pictures, reduced
 
 FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
 
@@ -89,23 +90,60 @@ def test_augmenting_keeps_the_range_and_pastes_as_often_as_said():
     assert (augment(0.0).std((2, 3)) < 1e-6).all()
 
 
-def test_training_is_repeatable_and_what_it_writes_can_be_loaded(tmp_path):
-    recipe = train_builtin.Recipe(epochs=2, batch=24, pasted=0.0)
-    # twelve plain colors are twelve classes that can be learned at once
+def plain_colors() -> Pictures:
+    """Twelve plain colors are twelve classes that can be learned at once."""
     colors = torch.randint(0, 256, (12, 3, 1, 1), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     labels = torch.arange(12).repeat(8)
-    shown = Pictures(colors[labels].expand(-1, -1, 96, 96), labels, torch.zeros(len(labels), 4))
+    return Pictures(colors[labels].expand(-1, -1, 96, 96).contiguous(), labels, torch.zeros(len(labels), 4))
+
+
+def test_training_is_repeatable_and_what_it_writes_can_be_loaded(tmp_path):
+    recipe, shown = train_builtin.Recipe(epochs=2, batch=24, pasted=0.0), plain_colors()
     before = torch.get_num_threads()
     runs = [list(train_builtin.train(shown, recipe)) for _ in range(2)]
     assert torch.get_num_threads() == before
     assert [loss for _, loss, _ in runs[0]] == [loss for _, loss, _ in runs[1]]
-    network = train_builtin.folded(runs[0][-1][2].eval())
-    train_builtin.write(tmp_path, network, recipe, shown, {"render": 1, "train": 2})
+    train_builtin.write(tmp_path, runs[0][-1][2].eval(), recipe, shown, Seconds(1, 2))
     card = json.loads((tmp_path / "builtin.json").read_text())
     assert card["recipe"] == dataclasses.asdict(recipe)
+    assert card["command"].endswith("train_builtin --out DIR --epochs 2 --batch 24 --pasted 0.0")
     loaded = load_builtin(folder=tmp_path)
     by_class = train_builtin.accuracy(loaded.network, shown)
     assert card["held_out_accuracy"] == pytest.approx(by_class.mean(), abs=1e-4)
+
+
+def test_another_network_learns_by_the_same_command_from_pictures_that_are_kept(tmp_path, monkeypatch, capsys):
+    rendered_seeds, shown = [], plain_colors()
+
+    def fake_pictures(per_class, seed, size_px):
+        rendered_seeds.append(seed)
+        return shown
+
+    monkeypatch.setattr(rendered, "pictures", fake_pictures)
+    more = ("--pictures", str(tmp_path / "kept"), "--epochs", "12", "--batch", "8", "--learning-rate", "0.1")
+    network = ("--network", "fake_networks.MeanColor", "--settings", '{"steep": 2}', "--input-px", "32")
+    for name in ("first", "colors"):
+        command = ["train_builtin", "--out", str(tmp_path), "--name", name, "--pasted", "0", *network, *more]
+        monkeypatch.setattr("sys.argv", command)
+        train_builtin.main()
+    assert rendered_seeds == [HELD_OUT, 0]
+    assert "epoch 12 of 12: loss " in capsys.readouterr().out
+    classifier = load_classifier("file:colors.pt2", tmp_path)
+    assert classifier.input_px == 32 and list(classifier.labels) == list(load_builtin().labels)
+    card = json.loads((tmp_path / "colors.json").read_text())
+    right = train_builtin.accuracy(classifier.network, reduced(shown, 32)).mean()
+    assert right == pytest.approx(card["held_out_accuracy"], abs=1e-4) and right > 0.8
+    assert "--network fake_networks.MeanColor --settings '{\"steep\": 2}'" in card["command"]
+
+
+def test_reduced_pictures_are_means_of_what_they_cover():
+    """Stripes a pixel wide are gray at half the size, and pictures of the size asked for stay as they are."""
+    stripes = torch.zeros(1, 3, 8, 8, dtype=torch.uint8)
+    stripes[..., ::2] = 200
+    shown = Pictures(stripes, torch.zeros(1), torch.zeros(1, 4))
+    assert torch.equal(reduced(shown, 8).images, stripes)
+    half = reduced(shown, 4).images.int()
+    assert half.shape == (1, 3, 4, 4) and (half[..., 1:-1] - 100).abs().max() <= 1
 
 
 def test_held_out_shapes_are_none_of_the_training_shapes():

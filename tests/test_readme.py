@@ -126,6 +126,14 @@ def test_figures_of_the_readme_are_those_of_the_notebook():
         assert figure in words(NOTEBOOK), figure
 
 
+def test_other_networks_are_as_good_as_their_cards_say():
+    for card in (NOTEBOOK.parent / "families" / "networks").glob("*.json"):
+        trained = json.loads(card.read_text(encoding="utf-8"))
+        (row,) = (line for line in NOTEBOOK.read_text("utf-8").splitlines() if line.startswith(f"| {card.stem} | "))
+        figures = f"| {trained['weights']:,} | {trained['input_px']} px | {trained['recipe']['epochs']} |"
+        assert row.endswith(f"{figures} {100 * trained['held_out_accuracy']:.1f} % |")
+
+
 def test_figures_of_the_promises_are_the_stored_ones():
     (_, held, width, _, alone, alone_width, _) = stored("promises/promises.json")["tables"]["held"]["rows"][-1]
     count, old = (f"{round(row['value'] * row['n'])} of {row['n']}" for row in (held, alone))

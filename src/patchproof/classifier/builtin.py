@@ -58,9 +58,9 @@ def folded(trained: nn.Module) -> nn.Module:
 
 
 def load_builtin(folder: Path = HERE) -> Classifier:
-    """The network from `builtin.safetensors` with the classes of `builtin.json`."""
+    """The network from `builtin.safetensors` with the labels of `builtin.json`."""
     sha256, card, network = stored_network(SmallNetwork, "builtin", folder)
-    return Classifier("builtin", sha256, INPUT_PX, tuple(card["classes"]), network)
+    return Classifier("builtin", sha256, INPUT_PX, tuple(card["labels"]), network)
 
 
 def stored_network(
@@ -74,7 +74,7 @@ def stored_network(
         raise Refused("the built-in network's weights beside the program", "none", "install patchproof again")
     stored = weights.read_bytes()
     card_says = json.loads(card.read_text(encoding="utf-8"))
-    network = kind(len(card_says["classes"]))
+    network = kind(len(card_says["labels"]))
     network.load_state_dict({key: tensor.float() for key, tensor in load(stored).items()})
     return hashlib.sha256(stored).hexdigest(), card_says, network.eval()
 

@@ -63,6 +63,6 @@ def _boxes(sides: Tensor) -> Tensor:
 
 
 def load_builtin_detector(folder: Path = HERE) -> Detector:
-    """The detector from `builtin_detector.safetensors` with the classes of `builtin_detector.json`."""
+    """The detector from `builtin_detector.safetensors` with the labels of `builtin_detector.json`."""
     sha256, card, network = stored_network(SmallDetector, "builtin_detector", folder)
-    return Detector("builtin-detector", sha256, INPUT_PX, tuple(card["classes"]), network, card["least_score"])
+    return Detector("builtin-detector", sha256, INPUT_PX, tuple(card["labels"]), network, card["least_score"])

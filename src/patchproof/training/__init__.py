@@ -1,1 +1,1 @@
-"""How the built-in network was made."""
+"""How the built-in networks were made, and others on the same pictures."""

@@ -1,4 +1,6 @@
-"""What is stored of a trained network: weights as float16, and a card that says how it was made and how good it is."""
+"""What is stored of a trained network: weights as float16 or a program, and a card that says how it was made and how
+good it is.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import dataclasses
 import datetime
 import json
 import platform
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ import torch
 from torch import nn
 
 from patchproof.mesh import primitives
+from patchproof.training.fit import Recipe, Seconds
 
 HELD_OUT = "renders of other shapes, textures, backgrounds and conditions of the same kinds; nothing real"
 
@@ -33,15 +37,26 @@ def stored(network: nn.Module, path: Path) -> int:
     return sum(tensor.numel() for tensor in weights.values())
 
 
-def write_card(path: Path, figures: dict[str, Any], module: str, recipe: Any, seconds: dict[str, int]) -> None:
-    """The classes, the figures and how to make the network again."""
+def exported(network: nn.Module, path: Path, input_px: int) -> int:
+    """Write the network as a program for any number of pictures; how many weights it has."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    batches = {0: torch.export.Dim("n", min=1, max=4096)}
+    photos = torch.rand(2, 3, input_px, input_px)
+    torch.export.save(torch.export.export(network.eval(), (photos,), dynamic_shapes=(batches,)), path)
+    return sum(weights.numel() for weights in network.parameters())
+
+
+def write_card(path: Path, figures: dict[str, Any], module: str, recipe: Recipe, seconds: Seconds) -> None:
+    """The labels, the figures and how to make the network again."""
+    changed = [field for field in dataclasses.fields(recipe) if getattr(recipe, field.name) != field.default]
+    options = [f"--{field.name.replace('_', '-')} {shlex.quote(str(getattr(recipe, field.name)))}" for field in changed]
     card = {
-        "classes": class_names(),
+        "labels": class_names(),
         **figures,
         "held_out": HELD_OUT,
-        "command": f"python -m patchproof.training.{module} --out DIR",
+        "command": " ".join([f"python -m patchproof.training.{module} --out DIR", *options]),
         "recipe": dataclasses.asdict(recipe),
-        "seconds": seconds,
+        "seconds": seconds._asdict(),
         "date": datetime.date.today().isoformat(),
         "machine": f"{platform.machine()}, torch {torch.__version__}, {recipe.threads} thread(s)",
     }

@@ -9,6 +9,7 @@ Left out on purpose: anything real. The networks serve demos and tests and say n
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +52,25 @@ def pictures(per_class: int, seed: int, size_px: int) -> Pictures:
             boxes.append(around)
             labels += [label] * VIEWS_PER_SHAPE
     return Pictures(torch.cat(images), torch.tensor(labels), torch.cat(boxes))
+
+
+def kept(folder: Path, per_class: int, seed: int, size_px: int) -> Pictures:
+    """The same from a file of the folder, where an earlier call left them, by whatever code."""
+    from safetensors.torch import load_file, save_file
+
+    file = folder / f"{per_class}_{seed}_{size_px}.safetensors"
+    if file.is_file():
+        return Pictures(**load_file(file))
+    rendered = pictures(per_class, seed, size_px)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_file(rendered._asdict(), file)
+    return rendered
+
+
+def reduced(shown: Pictures, size_px: int) -> Pictures:
+    """The same pictures, smaller."""
+    parts = shown.images.split(1024)
+    return shown._replace(images=torch.cat([codes_of(center_square(part.float() / 255, size_px)) for part in parts]))
 
 
 def _views(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:

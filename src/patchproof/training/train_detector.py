@@ -11,10 +11,7 @@ one (Li et al., Generalized focal loss, NeurIPS 2020), their boxes follow the ge
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -28,76 +25,29 @@ from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, cent
 from patchproof.classifier.detector import iou
 from patchproof.classifier.precision import Finding, average_precision, best_score, findings
 from patchproof.mesh import primitives
-from patchproof.scene import patterns
+from patchproof.training import fit
 from patchproof.training.card import by_class, stored, write_card
-from patchproof.training.pictures import HELD_OUT, Pictures, augmented, pictures
+from patchproof.training.pictures import Pictures, augmented
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """Everything that decides the weights, but for the machine's rounding."""
+class Recipe(fit.Recipe):
+    """Fewer pictures than the classifier's, some of them made of four."""
 
-    seed: int = 0
     pictures_per_class: int = 1200
     held_out_per_class: int = 100
-    epochs: int = 20
-    batch: int = 64
-    learning_rate: float = 2e-3
-    weight_decay: float = 0.02
-    pasted: float = 0.3  # share of training pictures with a card pasted on
     mosaics: float = 0.33  # share that is made of four
-    threads: int = 1
 
 
-def main() -> None:
-    """Render, train, measure, and write the network with its card."""
-    parser = argparse.ArgumentParser(description="Train the built-in detector from procedural renders.")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their card")
-    for field in dataclasses.fields(Recipe):
-        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
-    options = vars(parser.parse_args())
-    out, recipe = options.pop("out"), Recipe(**options)
-    torch.set_num_threads(recipe.threads)
-    started = time.time()
-    held_out = pictures(recipe.held_out_per_class, recipe.seed + HELD_OUT, INPUT_PX)
-    training = pictures(recipe.pictures_per_class, recipe.seed, INPUT_PX)
-    rendered = time.time()
-    for epoch, loss, trained in train(training, recipe):
-        shown = (
-            f", held out AP50 {precision(found_by_class(trained, held_out), held_out).mean():.3f}"
-            if epoch % 4 == 3
-            else ""
-        )
-        print(
-            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{shown}, {time.time() - started:.0f} s", flush=True
-        )
-        if epoch + 1 == recipe.epochs:
-            seconds = {"render": round(rendered - started), "train": round(time.time() - rendered)}
-            write(out, folded(trained), recipe, held_out, seconds)
-
-
-def train(shown: Pictures, recipe: Recipe) -> Iterator[tuple[int, float, SmallDetector]]:
+def train(shown: Pictures, recipe: Recipe) -> fit.Epochs:
     """After each epoch: its number, its mean loss, and the network as it is."""
-    torch.manual_seed(recipe.seed)
-    rng = np.random.default_rng([recipe.seed, 1])
-    network = SmallDetector(len(primitives.names()), batch_norm=True).train()
-    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    steps = recipe.epochs * (len(shown.images) // recipe.batch)
-    optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
-    cards = torch.from_numpy(np.stack([patterns.card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
-    for epoch in range(recipe.epochs):
-        losses, order = [], torch.randperm(len(shown.images))
-        for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
-            images, boxes = augmented(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
-            images, labels, boxes = with_mosaics(images, shown.labels[rows], boxes, recipe.mosaics, rng)
-            loss = loss_of(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            losses.append(loss.item())
-        yield epoch, float(np.mean(losses)), network
+
+    def learn(network: torch.nn.Module, rows: Tensor, cards: Tensor, rng: np.random.Generator) -> Tensor:
+        images, boxes = augmented(shown.images[rows], shown.boxes[rows], cards, rng, recipe.pasted, widest=1.4)
+        images, labels, boxes = with_mosaics(images, shown.labels[rows], boxes, recipe.mosaics, rng)
+        return loss_of(network(images.contiguous(memory_format=torch.channels_last)), labels, boxes * INPUT_PX)
+
+    return fit.epochs(lambda: SmallDetector(len(primitives.names()), batch_norm=True), shown, recipe, learn)
 
 
 def with_mosaics(
@@ -172,14 +122,20 @@ def found_by_class(network: torch.nn.Module, shown: Pictures) -> list[list[Findi
     return [findings(candidates, [label], boxes_px, (shown.labels == label).tolist()) for label in labels]
 
 
+def scored(network: torch.nn.Module, shown: Pictures) -> np.ndarray:
+    """AP50 of each class of what a network finds."""
+    return precision(found_by_class(network, shown), shown)
+
+
 def precision(found: Sequence[Sequence[Finding]], shown: Pictures) -> np.ndarray:
     """AP50 of each class."""
     counts = shown.labels.bincount(minlength=len(found)).tolist()
     return np.array([average_precision(each, count) for each, count in zip(found, counts, strict=True)])
 
 
-def write(out: Path, network: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: dict[str, int]) -> None:
+def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: fit.Seconds) -> None:
     """The weights and what is known about them; the precision is that of the stored weights."""
+    network = folded(trained)
     count = stored(network, out / "builtin_detector.safetensors")
     found = found_by_class(network, held_out)
     ap50 = precision(found, held_out)
@@ -192,6 +148,11 @@ def write(out: Path, network: torch.nn.Module, recipe: Recipe, held_out: Picture
     }
     write_card(out / "builtin_detector.json", figures, "train_detector", recipe, seconds)
     print(f"held-out AP50 {figures['held_out_ap50']:.3f}: {figures['held_out_ap50_by_class']}")
+
+
+def main() -> None:
+    """Render, train, measure, and write the network with its card."""
+    fit.run(Recipe, "Train the built-in detector from procedural renders.", INPUT_PX, train, scored, write)
 
 
 if __name__ == "__main__":
