@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from patchproof.claims import student_mean
 from patchproof.optimizer.run import load_run
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
+from patchproof.study.study import load_study
 from test_imports import GROUND, MAY_IMPORT
 from test_journey import command
 
@@ -74,12 +74,18 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
         assert all(option in listed for option in arguments if option.startswith("--")), line
 
 
-@pytest.mark.parametrize(("name", "count"), [("promises", 6 * 2), ("ablation", 4 * (1 + 16))])
-def test_the_studies_that_are_quoted_can_be_run_again(name, count):
-    study = import_module(f"patchproof.validation.{name}").STUDY
-    folder = README.parent / ".readme" / name
-    settings = validated(study.settings, read_toml(folder / f"{name}.toml"), name)
-    assert len({cell.name for cell in study.cells(settings, folder)}) == count
+@pytest.mark.parametrize(
+    ("folder", "name", "count"),
+    [
+        ("promises", "promises", 6 * 2),
+        ("ablation", "ablation", 4 * (1 + 16)),
+        ("families", "transfer", 3 * (1 + 5 + 3)),
+    ],
+)
+def test_the_studies_that_are_quoted_can_be_run_again(folder, name, count):
+    study, path = load_study(name), README.parent / ".readme" / folder / f"{name}.toml"
+    settings = validated(study.settings, read_toml(path), name)
+    assert len({cell.name for cell in study.cells(settings, path.parent)}) == count
 
 
 def test_python(tmp_path, monkeypatch, capsys):
@@ -150,6 +156,20 @@ def test_figures_of_the_detector_are_the_stored_ones():
     assert f"Photographed were {truck}, {carton}, {chair} and {mailbox} of 48." in words(NOTEBOOK)
     card = json.loads((ROOT / "src/patchproof/classifier/builtin_detector.json").read_text(encoding="utf-8"))
     assert f"AP50 {card['held_out_ap50']:.3f}" in words(NOTEBOOK)
+
+
+def test_figures_of_families_are_the_stored_ones():
+    tables, page = stored("families/transfer.json")["tables"], NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    gains: dict[str, list[str]] = {}
+    for _, row, _, seen, _, _, gain, _ in tables["objects"]["rows"]:
+        told = interval(gain["value"], gain["low"], gain["high"])
+        gains.setdefault(row.replace("without_", "all but "), []).append(f"*{told}*" if seen == "yes" else told)
+    assert len(gains) == 5 + 3
+    for row, told in gains.items():
+        assert f"| {row} | {' | '.join(told)} |" in page
+    for _, _, _, _, before, after, gain, _ in tables["families"]["rows"]:
+        told = interval(gain["value"], gain["low"], gain["high"])
+        assert any(line.endswith(f" | {100 * before:.0f} % | {100 * after:.0f} % | {told} |") for line in page)
 
 
 def rows_of(name: str) -> list[dict[str, str]]:
