@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from patchproof.claims import student_mean
 from patchproof.optimizer.run import load_run
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
+from patchproof.study.study import load_study
 from test_imports import GROUND, MAY_IMPORT
 from test_journey import command
 
@@ -74,12 +74,18 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
         assert all(option in listed for option in arguments if option.startswith("--")), line
 
 
-@pytest.mark.parametrize(("name", "count"), [("promises", 6 * 2), ("ablation", 4 * (1 + 16))])
-def test_the_studies_that_are_quoted_can_be_run_again(name, count):
-    study = import_module(f"patchproof.validation.{name}").STUDY
-    folder = README.parent / ".readme" / name
-    settings = validated(study.settings, read_toml(folder / f"{name}.toml"), name)
-    assert len({cell.name for cell in study.cells(settings, folder)}) == count
+@pytest.mark.parametrize(
+    ("folder", "name", "count"),
+    [
+        ("promises", "promises", 6 * 2),
+        ("ablation", "ablation", 4 * (1 + 16)),
+        ("families", "transfer", 3 * (1 + 5 + 3)),
+    ],
+)
+def test_the_studies_that_are_quoted_can_be_run_again(folder, name, count):
+    study, path = load_study(name), README.parent / ".readme" / folder / f"{name}.toml"
+    settings = validated(study.settings, read_toml(path), name)
+    assert len({cell.name for cell in study.cells(settings, path.parent)}) == count
 
 
 def test_python(tmp_path, monkeypatch, capsys):

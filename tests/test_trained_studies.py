@@ -25,6 +25,7 @@ from patchproof.study.trained import TrainedSettings, trained_cells, verdict
 from test_textures_optimized import scene_file
 
 RED, BLUE = "module:fake_networks.red_against_blue", "module:fake_networks.blue_against_red"
+CORNER = "module:fake_networks.corner"
 
 
 @pytest.fixture(autouse=True)
@@ -97,6 +98,54 @@ def test_networks_left_out_get_a_table_of_their_own(tmp_path):
     assert rows[name][3].value == 0 and rows[name][4].value == 1 and rows[name][5].value == 1
     assert rows[name][7] == pytest.approx(0.375) and rows[name][8] == "gain"
     assert rows["builtin"][5].value == 0 and rows["builtin"][8] == "none shown"
+
+
+def test_a_family_is_left_out_as_a_whole_and_gains_count_objects_and_seeds(tmp_path):
+    config = written(tmp_path, config="")
+    networks, families = (RED, BLUE, "builtin", CORNER), {"colors": (RED, BLUE), "places": ("builtin", CORNER)}
+    settings = transfer.TransferSettings(
+        scenes=("texture.toml",), networks=networks, families=families, seeds=(0, 1), n=4
+    )
+    cells = transfer.cells(settings, config.parent)
+    trained = {one.values["row"]: one.values["trained"] for one in cells}
+    assert trained["without_colors"] == ["builtin", CORNER] and trained["without_places"] == [RED, BLUE]
+    assert len(cells) == 2 * (1 + 4 + 2 + 1)
+
+    def hits(one: Cell, network: str) -> str:
+        """Red's designs help the corner's network in all of 4 conditions, the built-in one in 2 or 0 by seed."""
+        if one.values["row"] != short_name(RED) or network not in families["places"]:
+            return "0000"
+        return "1111" if network == CORNER else ("1100", "0000")[one.values["seed"]]
+
+    results = [
+        Result(
+            one,
+            {"hits": {"design": [hits(one, name) for name in networks]}, "confidence": {"design": [[0.5] * 4] * 4}},
+            tmp_path,
+        )
+        for one in cells
+    ]
+    tables = {one.name: one for one in transfer.tables(settings, results)}
+    by_network = {row[1:4]: row for row in tables["objects"].rows}
+    assert by_network[short_name(RED), "builtin", "no"][6] == mean([0.5, 0.0])  # n = 2, not 8
+    assert by_network[short_name(RED), short_name(CORNER), "no"][6] == Estimate(1, 1, 1, 2)
+    by_family = {row[1:4]: row for row in tables["families"].rows}
+    # the mean of two networks' designs on two networks: (1 + 0.5 + 0 + 0) / 4, then (1 + 0 + 0 + 0) / 4
+    assert by_family["colors", "places", "no"][4:8] == (0, 0.3125, mean([0.375, 0.25]), "none shown")
+    assert by_family["places", "colors", "no"][6] == Estimate(0, 0, 0, 2)
+    assert {row[3] for row in tables["families"].rows if row[1] == "without_colors" and row[2] == "colors"} == {"no"}
+    assert {row[3] for row in tables["families"].rows if row[1] == "without_colors" and row[2] == "places"} == {"yes"}
+    left_out = {row[2]: row for row in tables["left_out"].rows}
+    assert left_out["builtin"][7] == pytest.approx(0.125)  # of the colors' designs alone, not of the corner's
+    assert set(left_out) == {short_name(name) for name in networks}
+    kept = [one for one in results if one.cell.values["seed"] == 0]
+    assert not any(one.name == "objects" for one in transfer.tables(settings, kept))  # of one there is no interval
+
+
+def test_every_network_is_in_one_family():
+    for families in ({"a": (RED,)}, {"a": (RED, BLUE), "b": (BLUE,)}, {"a": (RED, BLUE, "builtin")}):
+        with pytest.raises(Refused, match="families in which each of networks is once"):
+            validated(transfer.TransferSettings, {"scenes": ["a"], "networks": [RED, BLUE], "families": families}, "x")
 
 
 def test_a_design_that_did_not_move_gains_exactly_nothing(tmp_path):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
+import patchproof as pp
 from archives import seeded
+from conftest import SCENE
 from patchproof.begin.new import _model
 from patchproof.classifier import load_classifier, zoo
+from patchproof.optimizer import run as run_module
 from patchproof.strict import Refused
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights are noise
@@ -85,6 +90,40 @@ def test_timms_families_from_a_file(name, tmp_path):
     photos = torch.rand(1, 3, 224, 224)
     by_hand = network(normalized(photos, view["mean"], view["std"]))
     torch.testing.assert_close(classifier.logits(photos), by_hand, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "px"),
+    [
+        ("torchvision:resnet18", 64),
+        ("torchvision:vgg11", 32),
+        ("torchvision:densenet121", 64),
+        ("torchvision:googlenet", 64),
+        ("torchvision:shufflenet_v2_x0_5", 64),
+        ("timm:convnext_atto", 64),
+        ("timm:vit_tiny_patch16_224", 224),
+    ],
+)
+def test_each_family_goes_from_a_scene_to_a_verdict(name, px, torchvision, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_module, "PROMISE_VIEWS", 8)
+    library, _, model = name.partition(":")
+    if library == "torchvision":
+        options = {"init_weights": False} if model == "googlenet" else {}  # else seconds, and a warning
+        network = torchvision.models.get_model(model, num_classes=len(LABELS), **options)
+    else:
+        network = pytest.importorskip("timm", reason='needs timm, of the extra "models"').create_model(
+            model, num_classes=12
+        )
+    saved(tmp_path / "w.safetensors", network, input_px=px)
+    text = SCENE.replace('"builtin"', f'"{name}@w.safetensors"').replace('label = "carton"', 'label = "label 3"')
+    (tmp_path / "scene.toml").write_text(text.replace("steps = 3\nviews = 4", "steps = 2\nviews = 2"), encoding="utf-8")
+    run = pp.optimize(pp.load_scene(tmp_path / "scene.toml"), tmp_path / "run")
+    assert np.ptp(run.design) > 0  # gradients came through all of it
+    pp.sheet(run, tmp_path / "sheet.pdf")
+    pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
+    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report")
+    assert report.summary.photos == 3 and report.summary.verdict in ("kept", "broken", "cannot_tell")
+    assert run.promise.models[0].sha256 == hashlib.sha256((tmp_path / "w.safetensors").read_bytes()).hexdigest()
 
 
 def test_weights_that_do_not_fit_are_refused(torchvision, tmp_path):

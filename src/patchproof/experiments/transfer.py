@@ -3,22 +3,26 @@
 In: scenes, ways (full texture, masked, many or few signed steps, patches, ...), networks and seeds. Out: the matrix of
 rates and confidences with intervals, each beside the *original* object's on the same conditions; what a network gains
 from designs that never saw it; three fixed views in changed light; heat maps and contact sheets; each design as a GLB
-that opens elsewhere. A nil transfer is said, with its interval.
+that opens elsewhere. A nil transfer is said, with its interval. Where networks are given families, ensembles leave out
+whole ones, and gains are also said from family to family.
 
 Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε is the signed step, here
 `optimize.step_size`; a ball round the start is `patch.epsilon`. Intervals are over conditions, of the designs that were
-trained: another seed's design may do better or worse.
+trained: another seed's design may do better or worse. Only those over objects are of one figure per object and seed:
+conditions of one object are no evidence of another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from patchproof.claims import rate
+from patchproof.claims import mean, rate
 from patchproof.experiments.sides import sides, three_views
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
@@ -26,13 +30,14 @@ from patchproof.optimizer.responses import responses
 from patchproof.render.photograph import Shown
 from patchproof.report.tables import Drawing, Table
 from patchproof.study.figures import number_grid, picture_sheet
-from patchproof.study.grid import Count, grouped, of_values, problem_of, short_name
+from patchproof.study.grid import Count, Names, grouped, of_values, problem_of, short_name
 from patchproof.study.pictures import contact_sheet, photographs
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
 from patchproof.study.trained import (
     ORIGINAL,
     TrainedSettings,
+    Word,
     alone,
     tested_in,
     trained_cells,
@@ -51,7 +56,21 @@ class TransferSettings(TrainedSettings):
     """As in all studies of trained designs."""
 
     ensembles: bool = True  # also trained on all networks but one, each in turn, and on all
+    # By name: networks of one family, all of `networks` in one or another. Ensembles leave out a whole family; {}: each
+    # network is one of its own.
+    families: dict[Word, Names] = Field({})
     lights: Count = 20  # lights in each of three fixed views
+
+    @model_validator(mode="after")
+    def _know_every_family(self):
+        members = [name for family in self.families.values() for name in family]
+        if self.families and sorted(members) != sorted(self.networks):
+            raise ValueError("takes families in which each of networks is once, and nothing else")
+        return self
+
+    def family_of(self, network: str) -> str:
+        """The name of the family that a network is in."""
+        return next((name for name, family in self.families.items() if network in family), short_name(network))
 
 
 def cells(settings: TransferSettings, base: Path) -> list[Cell]:
@@ -60,8 +79,10 @@ def cells(settings: TransferSettings, base: Path) -> list[Cell]:
     def rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
         ensembles: dict[str, Sequence[str]] = {}
         if settings.ensembles and len(networks) > 1:
-            if len(networks) > 2:  # else one network is left, which is a row already
-                ensembles = {_WITHOUT + short_name(out): [name for name in networks if name != out] for out in networks}
+            for family in dict.fromkeys(map(settings.family_of, networks)):
+                rest = [name for name in networks if settings.family_of(name) != family]
+                if len(rest) > 1:  # else one network is left, which is a row already
+                    ensembles[_WITHOUT + family] = rest
             ensembles[_ALL] = networks
         return {ORIGINAL: (), **alone(networks), **ensembles}
 
@@ -89,9 +110,10 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
-    """The matrix, networks left out, and fixed views."""
+    """The matrix, the same over objects, networks left out, and fixed views."""
     rows = _rows(results)
-    return [_matrix(settings, rows), *_left_out(results, rows), *_views(settings, rows)]
+    left_out = _left_out(settings, results, rows)
+    return [_matrix(settings, rows), *_over_objects(settings, results), *left_out, *_views(settings, rows)]
 
 
 Rows = Mapping[tuple, Mapping[str, Sequence[Result]]]  # results by (scene, way), then by row
@@ -125,30 +147,73 @@ def _matrix(settings: TransferSettings, groups: Rows) -> Table:
     return Table("matrix", "Trained on one, tested on another", head, tuple(rows), about)
 
 
-def _left_out(results: Sequence[Result], groups: Rows) -> list[Table]:
+def _over_objects(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
+    """Mean gains over objects and seeds: network by network and, where families are given, family by family."""
+
+    def family_of_row(result: Result) -> str:
+        trained = result.cell.values["trained"]
+        return settings.family_of(trained[0]) if len(trained) == 1 else result.cell.values["row"]
+
+    title = "Gains over objects"
+    if len({(result.cell.values["name"], result.cell.values["seed"]) for result in results}) < 2:
+        return []
+    tables = [_gains(results, "objects", title, lambda result: result.cell.values["row"], short_name)]
+    if settings.families:
+        tables.append(_gains(results, "families", f"{title}, by family", family_of_row, settings.family_of))
+    return tables
+
+
+def _gains(
+    results: Sequence[Result], name: str, title: str, trainer: Callable[[Result], str], tester: Callable[[str], str]
+) -> Table:
+    """One figure of each object and seed: the mean over rows and networks that are called the same."""
+    place = of_values("way", "name", "seed")
+    originals = {place(result): Record([result], "design") for result in results if not result.cell.values["trained"]}
+    figures: dict[tuple, dict[tuple, list[tuple[float, float]]]] = {}
+    for result, network in product(results, tested_in(results)):
+        trained, here = result.cell.values["trained"], place(result)
+        if trained and here in originals:
+            start = (here[0], trainer(result), tester(network), "yes" if network in trained else "no")
+            before, after = (np.mean(of.hits(network)) for of in (originals[here], Record([result], "design")))
+            figures.setdefault(start, {}).setdefault(here, []).append((float(before), float(after)))
+    rows = []
+    for start, by_place in figures.items():
+        before, after = np.array([np.mean(rates, 0) for rates in by_place.values()]).T
+        gain = mean((after - before).tolist())
+        rows.append((*start, float(before.mean()), float(after.mean()), gain, verdict(gain)))
+    head = ("way", "trained on", "tested on", "seen", "original", "rate", "gain in rate", "shows")
+    about = "Means of one figure per object and seed, with Student's interval over these."
+    return Table(name, title, head, tuple(rows), about)
+
+
+def _left_out(settings: TransferSettings, results: Sequence[Result], groups: Rows) -> list[Table]:
     rows = []
     for key, by_row in groups.items():
         original = Record(by_row.get(ORIGINAL, ()), "design")
         for network in tested_in(results):
-            if (without := by_row.get(_WITHOUT + short_name(network))) is None:
+            if (without := by_row.get(_WITHOUT + settings.family_of(network))) is None:
                 continue
             record = Record(without, "design")
             gain, confidence = record.gain(original, network)
             before, after = original.level(network)[0], record.level(network)[0]
-            single = _from_others(by_row, network)
+            single = _from_others(settings, by_row, network)
             rows.append((*key, short_name(network), before, after, gain, confidence, single, verdict(gain)))
     head = ("scene", "way", "left out", "original", "ensemble of the others", "gain", "gain in confidence")
     head = (*head, "mean rate of one other", "shows")
-    about = "Each network judges a design that was trained on all others together; beside it, those trained on one."
+    about = (
+        "Each network judges a design that was trained on all others together, but for those of its family; beside it,"
+        " those trained on one of these."
+    )
     return [Table("left_out", "Networks left out", head, tuple(rows), about)] if rows else []
 
 
-def _from_others(by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
-    """The mean rate on a network of the designs trained on one of the others."""
+def _from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
+    """The mean rate on a network of the designs trained on one of another family."""
+    family = settings.family_of(network)
     rates = [
         np.mean(Record(results, "design").hits(network))
         for results in by_row.values()
-        if len(trained := results[0].cell.values["trained"]) == 1 and network not in trained
+        if len(trained := results[0].cell.values["trained"]) == 1 and settings.family_of(trained[0]) != family
     ]
     return float(np.mean(rates)) if rates else None
 
