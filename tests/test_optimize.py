@@ -28,7 +28,7 @@ from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
-from patchproof.workers import can_fork, one_thread
+from patchproof.workers import can_fork, threads
 
 SCENE = {
     "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
@@ -341,11 +341,11 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
     np.testing.assert_array_equal(load_run(tmp_path / "cut").design, resumed.design)
 
 
-@pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
+@pytest.mark.skipif(not can_fork(), reason="this torch takes no gradients in forked processes")
 def test_the_number_of_processes_changes_no_byte(tmp_path, few_views):
     """A step of 5 views, the selection, promise and controls, and the search for a place."""
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
-    with one_thread():
+    with threads(1):
         for jobs in (1, 3):
             optimize_scene(scene, tmp_path / str(jobs), jobs=jobs)
     assert same_files(

@@ -131,7 +131,7 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
     if cluster is None:
         forks = can_fork() and not apart
         workers = Workers(partial(_processes, jobs, forks), 2 * jobs) if jobs > 1 or apart else Workers(_Here, 1)
-        with one_thread() if forks and jobs > 1 else nullcontext(), closing(workers):
+        with threads(1) if forks and jobs > 1 else nullcontext(), closing(workers):
             yield workers
         return
     if jobs > 1:
@@ -141,23 +141,32 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
 
 
 @contextmanager
-def sharing(function: Callable[[Any], Any], jobs: int) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
+def sharing(
+    function: Callable[[Any], Any], jobs: int, gradients: bool = False
+) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
     """`jobs` forked processes that have a function with everything that it refers to, as it is now, and what to call in
-    them in its place; only items and results are sent. One job, a process that was forked for a share itself, or a
-    system that cannot fork, works here.
+    them in its place; only items and results are sent. One job, and a process that was forked for a share itself, works
+    here; so does a system that cannot fork (`can_fork`, for functions that take `gradients`), on as many threads.
     """
-    if jobs == 1 or _function is not None or not can_fork():
+    if jobs == 1 or _function is not None:
         yield Workers(_Here, 1), function
         return
-    with one_thread(), closing(Workers(partial(_processes, jobs, True, function), 2 * jobs)) as workers:
+    if not can_fork(gradients):
+        with threads(jobs):
+            yield Workers(_Here, 1), function
+        return
+    with threads(1), closing(Workers(partial(_processes, jobs, True, function), 2 * jobs)) as workers:
         yield workers, _shared
 
 
-def can_fork() -> bool:
-    """Whether a forked process can compute: on Linux, unless torch has found a GPU, whose threads do not survive it."""
+def can_fork(gradients: bool = True) -> bool:
+    """Whether a forked process can compute: on Linux without a GPU. Gradients need a torch that was built without one,
+    too: others refuse them in children of a process that has taken any.
+    """
     import torch
 
-    return sys.platform == "linux" and not torch.cuda.is_available()
+    built_for_gpu = torch.backends.cuda.is_built()
+    return sys.platform == "linux" and not torch.cuda.is_available() and not (gradients and built_for_gpu)
 
 
 def free_cores() -> int:
@@ -181,14 +190,14 @@ def result_of(future: Future) -> Any:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """torch and OpenCV compute on one thread inside, and as before afterwards."""
+def threads(count: int) -> Iterator[None]:
+    """torch and OpenCV compute on so many threads inside, and as before afterwards."""
     import cv2
     import torch
 
     before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
     try:
         yield
     finally:
@@ -215,14 +224,14 @@ class _OneThreadEach(Executor):
         self._executor = executor
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
-        return self._executor.submit(_on_one_thread, fn, *args, **kwargs)
+        return self._executor.submit(_on_a_thread, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._executor.shutdown(wait=wait)
 
 
-def _on_one_thread(function, *args, **kwargs):
-    with one_thread():
+def _on_a_thread(function, *args, **kwargs):
+    with threads(1):
         return function(*args, **kwargs)
 
 
@@ -236,7 +245,7 @@ def _processes(jobs: int, forks: bool, function: Callable[[Any], Any] | None = N
 
 class _Quietly(futures.ProcessPoolExecutor):
     """Forked from a process with other threads, of which Python warns. Those of torch and OpenCV have ended or rest
-    by then (`one_thread`): a child that wakes them waits forever.
+    by then (`threads`): a child that wakes them waits forever.
     """
 
     def submit(self, fn, /, *args, **kwargs) -> Future:

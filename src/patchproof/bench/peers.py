@@ -38,7 +38,7 @@ from patchproof.study.grid import Count, GridSettings, Seeds, grouped, of_values
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import gain_of, hardest, rate_of, recorded
 from patchproof.study.study import Cell, Result, Study
-from patchproof.workers import one_thread
+from patchproof.workers import threads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -176,7 +176,7 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
         for cell in cells(settings, base):
             if quick:
                 cell = replace(cell, values=with_tables(dict(cell.values), {"optimize": {"steps": _QUICK_STEPS}}))
-            with one_thread():
+            with threads(1):
                 results.append(Result(cell, run(settings, base, cell), base))
             on_stage("cells", len(results), len(settings.seeds))
         yield peers_chart(settings, results)

@@ -90,18 +90,19 @@ def carried_out(verb: Callable[..., None]) -> Callable[..., None]:
 
 @contextmanager
 def _on_free_cores(given: dict[str, Any]) -> Iterator[None]:
-    """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and spawned
-    processes have the number that is asked for, one by default, and the threads of this process.
+    """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and processes that
+    would import everything anew have the number that is asked for, one by default, and the threads of this one.
     """
     if "jobs" not in given:
         yield
         return
-    from patchproof.workers import can_fork, free_cores, one_thread
+    from patchproof.workers import can_fork, free_cores, threads
 
-    by_processes = can_fork() and given.get("device", "cpu") == "cpu"
+    shares = "cluster" not in given  # what is open here, and imports nothing
+    by_processes = can_fork(gradients=not shares) and given.get("device", "cpu") == "cpu"
     if given["jobs"] is None:
         given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
-    with one_thread() if by_processes else nullcontext():
+    with threads(1) if by_processes else nullcontext():
         yield
 
 

@@ -29,7 +29,7 @@ from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.report.results import Results, write_json, write_results
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict, nearest, read_toml, validated
-from patchproof.workers import one_thread, open_workers, result_of
+from patchproof.workers import open_workers, result_of
 
 # by name the module whose STUDY it is; the first line of its docstring says what it is about
 STUDIES: dict[str, str] = {
@@ -242,7 +242,7 @@ Outcome = tuple[dict[str, Any], dict[str, bytes], str | None]  # (JSON values, b
 def _run_cell(run: Callable[[Any, Path, Cell], dict[str, Any]], settings: Strict, base: Path, cell: Cell) -> Outcome:
     """What a cell gave; errors do not travel, since not every one survives it."""
     try:
-        with one_thread():
+        with threads(1):
             answers = run(settings, base, cell)
         files = {key: value for key, value in answers.items() if isinstance(value, bytes)}
         return _through_json({key: value for key, value in answers.items() if key not in files}), files, None
