@@ -20,7 +20,7 @@ FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
 
 
 @pytest.fixture(scope="module", autouse=True)
-def threads(1):
+def one_thread():
     """Pictures this small gain nothing from threads, and lose much where another process wants the cores."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -25,7 +25,7 @@ import onnx_files
 
 
 @pytest.fixture(scope="module", autouse=True)
-def threads(1):
+def one_thread():
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

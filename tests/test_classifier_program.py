@@ -18,7 +18,7 @@ from patchproof.strict import Refused
 
 
 @pytest.fixture(scope="module", autouse=True)
-def threads(1):
+def one_thread():
     """Small batches gain nothing from threads, and lose much where another process wants the cores."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

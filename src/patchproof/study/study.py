@@ -29,7 +29,7 @@ from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.report.results import Results, write_json, write_results
 from patchproof.report.tables import Drawing, Table
 from patchproof.strict import Refused, Strict, nearest, read_toml, validated
-from patchproof.workers import open_workers, result_of
+from patchproof.workers import open_workers, result_of, threads
 
 # by name the module whose STUDY it is; the first line of its docstring says what it is about
 STUDIES: dict[str, str] = {
