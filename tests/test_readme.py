@@ -166,6 +166,20 @@ def test_figures_of_the_detector_are_the_stored_ones():
     assert f"AP50 {card['held_out_ap50']:.3f}" in words(NOTEBOOK)
 
 
+def test_figures_of_families_are_the_stored_ones():
+    tables, page = stored("families/transfer.json")["tables"], NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    gains: dict[str, list[str]] = {}
+    for _, row, _, seen, _, _, gain, _ in tables["objects"]["rows"]:
+        told = interval(gain["value"], gain["low"], gain["high"])
+        gains.setdefault(row.replace("without_", "all but "), []).append(f"*{told}*" if seen == "yes" else told)
+    assert len(gains) == 5 + 3
+    for row, told in gains.items():
+        assert f"| {row} | {' | '.join(told)} |" in page
+    for _, _, _, _, before, after, gain, _ in tables["families"]["rows"]:
+        told = interval(gain["value"], gain["low"], gain["high"])
+        assert any(line.endswith(f" | {100 * before:.0f} % | {100 * after:.0f} % | {told} |") for line in page)
+
+
 def rows_of(name: str) -> list[dict[str, str]]:
     with (NOTEBOOK.parent / name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
