@@ -135,9 +135,9 @@ def test_figures_of_the_readme_are_those_of_the_notebook():
 def test_other_networks_are_as_good_as_their_cards_say():
     for card in (NOTEBOOK.parent / "families" / "networks").glob("*.json"):
         trained = json.loads(card.read_text(encoding="utf-8"))
-        (row,) = (line for line in NOTEBOOK.read_text("utf-8").splitlines() if line.startswith(f"| {card.stem} | "))
+        rows = [line for line in NOTEBOOK.read_text("utf-8").splitlines() if line.startswith(f"| {card.stem} | ")]
         figures = f"| {trained['weights']:,} | {trained['input_px']} px | {trained['recipe']['epochs']} |"
-        assert row.endswith(f"{figures} {100 * trained['held_out_accuracy']:.1f} % |")
+        assert sum(row.endswith(f"{figures} {100 * trained['held_out_accuracy']:.1f} % |") for row in rows) == 1
 
 
 def test_figures_of_the_promises_are_the_stored_ones():
