@@ -24,8 +24,8 @@ Jobs = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Local processes that share the work, by default one for each free core; any number gives "
-        "the same results.",
+        help="Local processes that share the work, by default one for each free core where they can be forked; any "
+        "number of them gives the same results.",
     ),
 ]
 Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, in place of local processes.")]
