@@ -353,6 +353,23 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views):
     )
 
 
+def test_an_odd_view_counts_as_much_as_those_that_are_seen_together(tmp_path):
+    problem = set_problem(scene_with(tmp_path))
+    begin, drawn = start(problem), problem.scene.draw("train", 3)
+    alone = [step_on(problem, begin, drawn[i : i + 1]).loss for i in range(3)]
+    assert len(set(alone)) == 3 and step_on(problem, begin, drawn).loss == pytest.approx(np.mean(alone), rel=1e-5)
+
+
+def test_controls_beside_some_views_are_those_of_these_views_and_the_design_keeps_its_order(tmp_path):
+    problem = set_problem(scene_with(tmp_path))
+    drawn, beside = problem.scene.draw("promise", 7), np.array([0, 1, 0, 0, 1, 1, 0], bool)
+    shown = {"design": problem.subject.shown(start(problem).design), "bare": None}
+    whole, part = responses(problem, shown, drawn), responses(problem, shown, drawn, beside=beside)
+    np.testing.assert_allclose(part["design"].loss, whole["design"].loss, rtol=1e-4)
+    np.testing.assert_allclose(part["bare"].loss, whole["bare"].loss[:, beside], rtol=1e-4)
+    assert len(np.unique(whole["design"].loss)) == 7
+
+
 def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml")
     optimize_scene(scene, tmp_path / "whole")

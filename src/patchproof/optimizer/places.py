@@ -23,11 +23,10 @@ import torch
 from patchproof.claims import student_mean
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import draft, score, start, views_seen
+from patchproof.optimizer.loop import draft, part_of, start, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
-from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import At, OpenScene
@@ -228,12 +227,10 @@ class _Search:
 
 def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:
     """The loss of gray, and the decrease that its gradient promises."""
-    design = start(problem).design.requires_grad_()
-    shown = problem.subject.shown(design)
-    loss, *_ = score(problem, expose(problem.see(shown, conditions, problem.training_px), shown), conditions)
-    (gradient,) = torch.autograd.grad(loss, design)
+    part = part_of(problem, start(problem).design, conditions, pictures=False)
+    gradient = torch.as_tensor(part.gradient)
     coarse = problem.subject.levels(gradient)[-1]
-    return float(loss.detach()), _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
+    return part.loss, _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
 
 
 def _drafted(conditions: Conditions, held_out: Conditions, problem: Problem) -> np.ndarray:
