@@ -191,15 +191,12 @@ class PrinterSettings(Strict):
     dot_gain: Annotated[Range, within(-0.25, 0.25)] = (-0.04, 0.04)  # added tone value at 50 %
     density: Annotated[Range, within(-0.9, 3)] = (-0.05, 0.05)  # added ink, as a share of the ink's own
     black: Annotated[Range, within(-0.1, 0.5)] = (-0.004, 0.004)  # added light of printed black; paper is 1
-    # Papers differ by 0.92 to 1.03 (L* 92 to 96 beside 95) and by b* -8 to 7. Free, but off: either moved the demo's
-    # confidence by 0.004, without bias.
+    # Off: papers differ by 0.92 to 1.03 (L* 92 to 96 beside 95) and b* -8 to 7, which moved the confidence by 0.004.
     paper_white: PositiveRange = (1.0, 1.0)  # the paper's light beside that of the sheet that the light is measured by
     paper_b: Annotated[Range, within(-40, 40)] = (0.0, 0.0)  # the paper's b* beside it
-    # Off: 0.1 mm moved the demo's confidence by 0.001 (0.3 mm: 0.006), and steps take 1.25
-    # times as long, as each view shows a print of its own.
+    # Off: 0.1 mm moved the demo's confidence by 0.001 (0.3 mm: 0.006); a print for each view takes a quarter more.
     misregistration_mm: Annotated[NotNegativeRange, within(0, 5)] = (0.0, 0.0)  # shift of the color planes
-    # "Fit to page" makes 0.94 to 0.97. Off: sheets ask for 100 % and are measured. (0.97 to
-    # 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05 with a bias of -0.006.)
+    # Off: sheets ask for 100 % and are measured. 0.97 to 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05.
     scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # size over the sheet's own
 
 
@@ -232,8 +229,7 @@ class OptimizeSettings(Strict):
     # 69 % of unseen views; a step that decays over the run did no better.
     step_size: Annotated[Positive, Field(le=1)] = 0.015  # of sRGB's range
     tv: NotNegative = 0.0  # loss for the design's total variation
-    # At 0, 0.1, 1 and 10 (two seeds of one scene) 83, 80, 58 and
-    # 5 % of the pixels were more than ΔE00 2 off, at a confidence of 0.505, 0.506, 0.518 and 0.498 (± 0.005, paired).
+    # At 0, 0.1, 1 and 10 (one scene) 83, 80, 58 and 5 % of the pixels were over ΔE00 2 off, confidences within 0.02.
     gamut: NotNegative = 1.0  # loss for colors that the printer misses, per 100 ΔE00
 
     @model_validator(mode="before")
@@ -244,6 +240,13 @@ class OptimizeSettings(Strict):
         if not isinstance(data, dict):
             return data
         return {key: value for key, value in data.items() if key not in former or value != former[key]}
+
+
+class PromiseSettings(Strict):
+    """How well a promise has to be known; no part of what is printed."""
+
+    # Of the rate's interval, which is looked at after half and three quarters of the views; none: all are taken.
+    half_width: Annotated[Share, Field(ge=0.005)] | None = None
 
 
 class SceneSettings(Strict):
@@ -259,19 +262,17 @@ class SceneSettings(Strict):
     printer: PrinterSettings = PrinterSettings()
     camera: CameraSettings = CameraSettings()
     optimize: OptimizeSettings = OptimizeSettings()
+    promise: PromiseSettings = PromiseSettings()
 
     @model_validator(mode="after")
     def _has_its_parts(self):
         if self.patch.kind != "patch" and self.object.mesh is None:
-            raise ValueError(
-                f'name object.mesh, or leave out patch.kind = "{self.patch.kind}": only a mesh has a texture'
-            )
+            raise ValueError(f'name object.mesh, or leave out patch.kind = "{self.patch.kind}": only a mesh has one')
         if self.patch.place == "auto" and self.object.mesh is None:
             raise ValueError('name object.mesh, or leave out patch.place = "auto": only a mesh has other places')
         if self.patch.place == "auto" and (self.view.look_at != "object" or self.view.front != "patch"):
             raise ValueError(
-                'leave out view.look_at and view.front with patch.place = "auto": all places share the views of'
-                " patch.side"
+                'leave out view.look_at and view.front with patch.place = "auto": places share the views of patch.side'
             )
         if self.patch.kind == "patch" and self.object.photos is None and self.patch.width_mm is None:
             raise ValueError("add patch.width_mm and patch.height_mm")
@@ -290,10 +291,10 @@ def behind(settings: Mapping[str, Any]) -> str:
 
 
 def load_scene_settings(path: str | Path) -> SceneSettings:
-    """The settings of a scene file as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
+    """A scene file's settings as written, `${VAR}` unexpanded: a run must not depend on where its files lie."""
     return validated(SceneSettings, read_toml(path), str(path))
 
 
 def identifying(settings: Strict) -> dict[str, Any]:
     """What a sheet id is made of: settings that differ from their defaults, so that a key more changes no sheet."""
-    return settings.model_dump(mode="json", exclude_defaults=True)
+    return settings.model_dump(mode="json", exclude={"promise"}, exclude_defaults=True)

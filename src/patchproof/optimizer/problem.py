@@ -32,10 +32,10 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
-# Sides at which views are rendered. Against 200 full photographs each, the mean confidence was off by -0.016 at 96 px,
-# -0.001 at 192 and -0.004 at 384 before the built-in network (box truck); by +0.15 at 224 and -0.07 at 448 (SUV), +0.04
-# and 0.00 (carton), +0.07 at 192 and -0.06 at 384 (letter box) before others.
-TRAINING_PX, FIGURE_PX = 192, 384
+# Sides at which views are rendered: for training of this many pixels at least, for figures so many times the largest
+# input. FIGURES
+TRAINING_PX, FIGURE_SCALE = 192, 2
+TRAINING_TAPS, FIGURE_TAPS = 1, 2  # of the object's own texture, `render.texture`
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +53,15 @@ class Problem:
 
     @property
     def training_px(self) -> int:
-        """The side at which views are rendered for training and selection."""
-        return self._view_px(TRAINING_PX)
+        """The side at which views are rendered for training and selection: the smallest whole multiple of the largest
+        input size that is large enough.
+        """
+        return self._at_most_photo(self.network_px * math.ceil(TRAINING_PX / self.network_px))
 
     @property
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
-        return self._view_px(FIGURE_PX)
+        return self._at_most_photo(FIGURE_SCALE * self.network_px)
 
     def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N losses to descend on, of what a network answers."""
@@ -73,7 +75,8 @@ class Problem:
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
-        return see(self.stage, shown, conditions, (side_px, side_px))
+        taps = FIGURE_TAPS if side_px >= self.figure_px else TRAINING_TAPS
+        return see(self.stage, shown, conditions, (side_px, side_px), taps=taps)
 
     def before(self, chosen: Sequence[int]) -> Problem:
         """The same before some of its networks, by number."""
@@ -98,10 +101,8 @@ class Problem:
         """The largest input size."""
         return max(classifier.input_px for classifier in self.classifiers)
 
-    def _view_px(self, at_least: int) -> int:
-        """The smallest whole multiple of the largest input size that is no smaller, at most the photograph's."""
-        multiple = self.network_px * math.ceil(at_least / self.network_px)
-        return min(multiple, min(self.scene.settings.camera.photo_px))
+    def _at_most_photo(self, side_px: int) -> int:
+        return min(side_px, min(self.scene.settings.camera.photo_px))
 
     @property
     def device(self) -> torch.device:

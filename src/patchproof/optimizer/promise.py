@@ -4,13 +4,16 @@ controls.
 In: a `Problem`, the design's pixels, and conditions in sessions: a few photographs each that share print, light, camera
 and place. Out: the manifest's `Promise`. Controls are shown in some of each session's conditions, so that differences
 are paired: the bare object, and a mean-color, a gray and a noise design in the same printed markers. The set is drawn
-and looked at once, after the design is frozen.
+after the design is frozen, and looked at once; twice or three times where a promise may stop as soon as its interval is
+as narrow as asked.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -20,7 +23,7 @@ from patchproof.classifier.detector import Detector
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, responses
+from patchproof.optimizer.responses import Answers, joined, responses
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
@@ -41,17 +44,29 @@ def make_promise(
     controls: Sequence[str] = CONTROLS,
     on_views: Callable[[int, int], None] = lambda done, total: None,
     per_session: int = 1,
+    half_width: float | None = None,
 ) -> Promise:
     """Show the design in all conditions, `per_session` in a row of one session, and the controls in the first
-    `CONTROL_VIEWS` of each; rate, interval and controls are those of the primary (first) network.
+    `CONTROL_VIEWS` of each; rate, interval and controls are those of the primary (first) network. A `half_width` of the
+    rate's interval stops it after half or three quarters of the sessions, if it is no wider there.
     """
     shown = shown_with_controls(problem, design, controls)
     beside = np.arange(len(conditions)) % per_session < CONTROL_VIEWS
-    compared = responses(problem, shown, conditions, beside=beside, on_views=on_views)
+    looks = [0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)
+    parts: list[dict[str, Answers]] = []
+    for first, last in pairwise(looks):
+        part, on_part = slice(first, last), partial(_counted, on_views, first, len(conditions))
+        parts.append(responses(problem, shown, conditions[part], beside=beside[part], on_views=on_part))
+        hits = joined(parts)["design"].recognized[0]
+        counts = in_sessions(hits, per_session, _places(conditions[:last], per_session))
+        if half_width is not None and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
+            break
+    compared = joined(parts)
     answers = compared["design"]
-    compared["design"] = answers.at(np.flatnonzero(beside))
+    conditions, beside = conditions[: answers.recognized.shape[1]], beside[: answers.recognized.shape[1]]
     places = _places(conditions, per_session)
     models = model_claims(problem, answers, per_session, places)
+    compared["design"] = answers.at(np.flatnonzero(beside))
     target = problem.scene.settings.target
     return Promise(
         target=Target(label=str(target.label), indices=problem.indices[0], goal=target.goal),
@@ -65,6 +80,19 @@ def make_promise(
         conditions=_condition_claims(problem, conditions, answers.recognized[0]),
         outermost_mm=_outermost_mm(problem),
     )
+
+
+def _looks(total: int, per_session: int) -> list[int]:
+    """Where the parts of a promise begin and end that may stop between them: the sooner it may, the more often it stops
+    by luck. Its interval held in 94 to 97 % of 1,000 simulated promises with a first look after half of the sessions,
+    as that of a full promise did (94 to 96 %), in 91 to 95 % with one after a quarter.
+    """
+    sessions = math.ceil(total / per_session)
+    return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
+
+
+def _counted(on_views: Callable[[int, int], None], before: int, total: int, done: int, _: int) -> None:
+    on_views(before + done, total)
 
 
 def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:

@@ -247,7 +247,8 @@ def promise_of(
 ) -> Promise:
     """The promise of a finished design; of fewer views than usual it is a draft's."""
     conditions = problem.scene.draw("promise", views, per_session=PER_SESSION)
-    promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION)
+    enough = problem.scene.settings.promise.half_width
+    promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION, enough)
     return promise.changed(draft=views < PROMISE_VIEWS)
 
 

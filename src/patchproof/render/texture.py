@@ -113,8 +113,9 @@ def footprint(
 ) -> Footprint:
     """What P fragments of `texture` (P, index into the layout) see; `uv_dx`, `uv_dy` P×2: uv change per pixel.
 
-    At most `taps` along the footprint's shorter side and twice as many along the longer one; one in all where `taps` is
-    1. Texels are points to interpolate between, or `blocks` of one color, as printed pixels are.
+    At most `taps` along the footprint's shorter side and twice as many along the longer one; where `taps` is 1 one in
+    all, for up to two texels, which is how far it reaches. Texels are points to interpolate between, or `blocks` of one
+    color, as printed pixels are.
     """
     most = 2 * taps if taps > 1 else 1
     size, _ = where.place(texture, 0)
@@ -153,8 +154,9 @@ def _length(vectors: Tensor) -> Tensor:
 
 
 def _levels(shorter: Tensor, longer: Tensor, taps: int, most: int) -> Tensor:
-    """The finest level on which the taps are no more than a texel apart."""
-    coarse = torch.maximum((shorter / taps).log2(), (longer / most).log2()).ceil()
+    """The finest level on which the taps are no more than a texel apart, a single one alone for no more than two."""
+    each = 2 if most == 1 else 1
+    coarse = torch.maximum((shorter / (each * taps)).log2(), (longer / (each * most)).log2()).ceil()
     return coarse.clamp_min(0).long()
 
 

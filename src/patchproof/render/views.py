@@ -25,7 +25,6 @@ from patchproof.channel.light import Lighting, highlight, irradiance, lighting_o
 from patchproof.color import LIGHT_OF_CODE, linear_from_srgb, srgb_from_linear
 from patchproof.render.fragments import Cameras, Fragments
 from patchproof.render.pixels import (
-    OBJECT_LEARNED_TAPS,
     OBJECT_TAPS,
     ObjectPixels,
     PiecePicture,
@@ -155,9 +154,16 @@ class Views:
         return None if shine is None else shine[:, None]
 
 
-def see(stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], supersample: int = 1) -> Views:
+def see(
+    stage: Stage,
+    shown: Shown,
+    conditions: Conditions,
+    size_px: tuple[int, int],
+    supersample: int = 1,
+    taps: int = OBJECT_TAPS,
+) -> Views:
     """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
-    be shown in them; the object behind it is seen, too.
+    be shown in them; the object behind it is seen, too, in so many `taps` of its texture unless that is learned.
     """
     piece = shown if isinstance(shown, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
@@ -176,7 +182,7 @@ def see(stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, 
         return rasterize(surface.vertices, surface.faces, placed, near_mm(scene))
 
     fine = drawn(stage.object_surface, poses, supersample)
-    parts, taps = None, OBJECT_LEARNED_TAPS if scene.LEARNED else OBJECT_TAPS
+    parts, taps = None, OBJECT_TAPS if scene.LEARNED else taps
     if piece is not None:
         printed = scene.camera_from_print(conditions)
         surface = drawn(stage.piece_surface, printed, 1)
