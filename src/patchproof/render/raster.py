@@ -257,8 +257,8 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     planes, volume = _planes(corners, near)
     second, third, inverse = (_at_center(plane, rank, x, y) for plane in planes)
     # a center may lie up to 1/362 pixel outside of the unsnapped face, which near its horizon is far away
-    deepest = max(float(corner[2].max()) for corner in corners)
-    z = inverse.clamp_(0.5 / deepest, 1 / near).reciprocal_()
+    deepest = torch.stack([corner[2].max() for corner in corners]).max()
+    z = inverse.clamp_min_(0.5 / deepest).clamp_max_(1 / near).reciprocal_()
     second, third = second.mul_(z), third.mul_(z)
     fragments.barycentric[part] = columns(1 - second - third, second, third)
     fragments.depth[part] = z
@@ -285,6 +285,9 @@ def _chunks(sizes: Tensor):
     """Slices over `sizes` whose sums stay below CHUNK, or hold one item."""
     ends = sizes.cumsum(0)
     start, done = 0, 0
+    if len(sizes) and int(ends[-1]) <= CHUNK:  # one question to the device, not two for each slice
+        yield slice(0, len(sizes))
+        return
     while start < len(sizes):
         stop = int(torch.searchsorted(ends, done + CHUNK, right=True))
         stop = max(stop, start + 1)
