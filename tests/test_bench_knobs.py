@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from patchproof.bench import evidence, train
+from patchproof.bench import effort, evidence, train
 from patchproof.bench.chart import Chart, Point, all_checks
 from patchproof.bench.paper import PIECE_MM, corners_mm, drawn_sheet
 from patchproof.bench.world import demo_problem, with_optimize
@@ -105,3 +105,15 @@ def test_exact_corners_of_bent_sheets_need_their_model(kind, beaten):
     corners = {i: sheet.px(mm) for i, mm in corners_mm().items()}
     right, wrong = (evidence.error_mm(evidence.MODELS[name](corners), sheet) for name in ("what pays", beaten))
     assert right < wrong / 3
+
+
+def test_efforts_are_timed_beside_the_default_and_judged_in_the_same_views():
+    efforts = {"draft": (1, 8), effort.DEFAULT: (3, 16)}
+    chart = effort.effort_chart(["carton"], efforts, 12, lambda stage, done, total: None)
+    draft, default = chart.series["carton"]
+    assert (draft.setting, default.setting, default.default) == ("draft", "default", True)
+    assert draft.cost < default.cost == 1.0
+    (table,) = chart.tables
+    assert [row[:2] for row in table.rows] == [("carton", "draft"), ("carton", "default")]
+    for point, row in zip((draft, default), table.rows, strict=True):
+        assert point.error.n == 12 and row[-1] == 1 - point.error.value

@@ -18,7 +18,7 @@ from patchproof.report.results import Results, write_results
 from patchproof.strict import Refused, nearest
 
 Bench = Callable[[bool, OnStage], Iterator[Chart]]
-BENCHES = ("render", "train", "printer", "detect", "evidence", "peers")  # modules with a `charts`
+BENCHES = ("render", "train", "effort", "printer", "detect", "evidence", "peers")  # modules with a `charts`
 _OWN = ("*.json", "*.html", "*_*.csv", "*_*.png")
 
 
