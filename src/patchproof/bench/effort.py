@@ -29,7 +29,7 @@ from patchproof.settings import OptimizeSettings, SceneSettings
 from patchproof.strict import validated
 from patchproof.workers import threads
 
-# By label, all from above: the primitive, its length, how far the piece is off the middle of its top, and its size (mm).
+# By label, all from above: the primitive, its length, how far the piece is off its middle, and its size, in mm.
 OBJECTS = {
     "box truck": ("box_truck", 400, 45, 147),
     "carton": ("carton", 300, 0, 140),
