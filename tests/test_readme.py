@@ -185,6 +185,21 @@ def rows_of(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def test_figures_of_views_are_the_stored_ones():
+    page, rows = words(NOTEBOOK), rows_of("views/views.csv")
+    assert len(rows) == 10
+    for design, bare in zip(rows[::2], rows[1::2], strict=True):
+        assert (design["scene"], design["shown"], bare["shown"]) == (bare["scene"], "design", "bare")
+        off = " | ".join(
+            f"{float(row['confidence_off']):+.3f} ± "
+            f"{(float(row['confidence_high']) - float(row['confidence_low'])) / 2:.3f}"
+            for row in (design, bare)
+        )
+        rates = f"{float(design['views_rate']):.1%} in views, {float(design['photographs_rate']):.1%} in photographs"
+        sizes = f"{design['view_px']}, {design['photo_px']}"
+        assert f"| {sizes} | {off} | {rates.replace('%', ' %')} |" in page
+
+
 def test_figures_of_verdicts_are_the_stored_ones():
     kept = {
         (float(row["correlation"]), int(row["sessions"]), round(float(row["true rate"]), 2)): row

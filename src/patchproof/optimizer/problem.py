@@ -33,9 +33,11 @@ from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
 # Sides at which views are rendered: for training of this many pixels at least, for figures so many times the largest
-# input. FIGURES
+# input, with so many taps of the object's own texture. At twice the size with two taps, mean confidences were within
+# 0.003 of 200 full photographs' in three scenes, 0.026 too low and 0.021 too high in two; at 1.5 times or with one tap
+# no scene was nearer than that throughout; at the network's own size they are 0.07 to 0.3 too high.
 TRAINING_PX, FIGURE_SCALE = 192, 2
-TRAINING_TAPS, FIGURE_TAPS = 1, 2  # of the object's own texture, `render.texture`
+TRAINING_TAPS, FIGURE_TAPS = 1, 2
 
 
 @dataclass(frozen=True, eq=False)
