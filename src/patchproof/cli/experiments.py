@@ -108,7 +108,7 @@ def keys(
 
 def bench(
     name: Annotated[
-        str, typer.Argument(help="A benchmark: render, train, printer, detect, evidence, peers, or all.")
+        str, typer.Argument(help="A benchmark: render, train, effort, printer, detect, evidence, peers, or all.")
     ] = "all",
     quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchproof-bench"),
