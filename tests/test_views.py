@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from torch.nn.functional import avg_pool2d
 
 from conftest import SCENE
 from patchproof import geometry
 from patchproof.channel.lens import distort_points
 from patchproof.color import srgb_from_linear
+from patchproof.optimizer.problem import set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
 from patchproof.render.photograph import expose, photograph, shade
@@ -405,3 +407,26 @@ def test_a_bent_piece_is_hidden_where_the_mug_is_in_front(tmp_path, side, family
     # each view but the one from behind shows it
     per_view = np.bincount(seen.piece.view.numpy(), share, minlength=5)
     assert per_view[0] > 100 and per_view[4] < 1
+
+
+def test_more_taps_of_an_object_s_texture_bring_views_nearer_to_reduced_photographs(tmp_path):
+    """A picture of 1024 texels round a cube. One tap, which spans up to two texels, is the bluntest."""
+    cube = trimesh.creation.box((300, 300, 300))
+    cube.unmerge_vertices()
+    across = cube.vertices[:, 0] + cube.vertices[:, 1]
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    picture = Image.fromarray(noise).resize((1024, 1024), Image.Resampling.BICUBIC)
+    uv = np.stack([across / 600 + 0.5, cube.vertices[:, 2] / 300 + 0.5], 1)
+    cube.visual = trimesh.visual.TextureVisuals(uv, image=picture)
+    cube.export(tmp_path / "cube.glb")
+    scene = scene_of(tmp_path, ("primitive:carton", "cube.glb"), ("[800, 600]", "[1600, 1200]"))
+    stage, conditions = set_stage(scene), posed(scene, 2, azimuth_deg=[20, -40], blur_px=0, noise=0)
+    reduced = avg_pool2d(photograph(stage, None, conditions, (768, 768), jpeg=False), 4)
+    off = {}
+    for taps in (1, 2, 4):
+        view = expose(see(stage, None, conditions, (192, 192), taps=taps), None, jpeg=False)
+        off[taps] = float(((view - reduced) ** 2).mean().sqrt())
+    assert off[4] < off[2] < 0.8 * off[1], off
+    problem = set_problem(scene)
+    small, figure = (problem.see(None, conditions, side).object.texels for side in (96, problem.figure_px))
+    assert len(small.groups) == 1 < len(figure.groups), "views smaller than figures are looked at once a pixel"
