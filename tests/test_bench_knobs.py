@@ -57,6 +57,7 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     score = loop.score
     monkeypatch.setattr(loop, "score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
     train.trained(with_optimize(problem, OptimizeSettings(views=3, steps=2)), [2])
     assert sum(seen) == loop.views_seen(OptimizeSettings(views=3, steps=2))
 
@@ -76,10 +77,12 @@ def test_training_charts_have_one_default_and_its_real_settings(monkeypatch):
     assert [p.error.value for p in last] == pytest.approx([*train.QUICK_ADAM, *train.QUICK_SIGN])
 
 
-def test_designs_are_judged_on_the_same_new_conditions(problem):
-    run, effort = OptimizeSettings(views=60), train.Effort(120, 2, 4)
+def test_designs_are_judged_on_the_same_new_conditions(problem, monkeypatch):
+    monkeypatch.setattr(loop, "SELECT_AFTER", 6)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
+    run, effort = OptimizeSettings(views=3), train.Effort(6, 2, 4)
     losses = train.trained_losses(problem, [run], effort, quiet)
-    assert list(losses) == [(run, 120)] and len(set(losses[run, 120])) == 2
+    assert list(losses) == [(run, 6)] and len(set(losses[run, 6])) == 2
     assert losses == train.trained_losses(problem, [run], effort, quiet)
 
 
