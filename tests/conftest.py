@@ -10,6 +10,15 @@ import torch
 
 torch.set_num_threads(1)  # the tests run side by side, a process per core
 
+LONG = ("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere")  # of the file's name
+
+
+def pytest_collection_modifyitems(items):
+    """The longest files first, so that no core waits for one of them at the end: xdist itself would begin with those
+    of the most tests, and end with a single test of half a minute.
+    """
+    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
+
 
 @pytest.fixture(scope="session")
 def data() -> Path:
