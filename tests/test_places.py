@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 
@@ -79,9 +80,21 @@ class Counted(Bright):
         self.passes += number
 
 
+@functools.cache
+def searched():
+    """The place that a whole search of a network chooses, and the passes of that network in it."""
+    network = Counted()
+    classifier = pp.classifier_of(network, 32, ["bright", "dark"], "python:bright")
+    network.passes = 0
+    load_classifier(classifier, Path())
+    doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
+    place = choose_place(open_scene(), models=[classifier])
+    return place, network.passes - doubting
+
+
 def test_the_place_is_where_the_network_looks():
     """It looks at the picture's upper left quarter alone; as one faces +z, left is -x."""
-    place = choose_place(open_scene())
+    place, _ = searched()
     x, y, z = place.at
     assert x < -30 and y > 30 and z == 10 and place.front == "+z"
     assert place.candidates[0].at == place.at and place.candidates[0].draft is not None
@@ -172,13 +185,8 @@ def test_with_front_left_out_views_face_the_patch_as_before():
 
 
 def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
-    network = Counted()
-    classifier = pp.classifier_of(network, 32, ["bright", "dark"], "python:bright")
-    network.passes = 0
-    load_classifier(classifier, Path())
-    doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
-    place = choose_place(open_scene(), models=[classifier])
-    assert place.passes == network.passes - doubting and place.run_share == place.passes / default_passes()
+    place, passes = searched()
+    assert place.passes == passes and place.run_share == place.passes / default_passes()
     screens = (places.PLACES + 3 * places.TURNED) * 2 * places.SCREEN_VIEWS + places.SCREEN_VIEWS
     drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
     assert screens + drafts <= default_passes() / 4 and default_passes() / 5 < place.passes <= default_passes() / 4
