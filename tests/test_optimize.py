@@ -14,7 +14,7 @@ import torch
 from patchproof.claims import wilson
 from patchproof.classifier.network import Classifier
 from patchproof.goal import Goal
-from patchproof.optimizer import loop, run
+from patchproof.optimizer import loop, places, run
 from patchproof.optimizer.goals import target_loss, total_variation
 from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -203,7 +203,7 @@ def test_the_design_kept_is_the_best_on_the_selection_set(tmp_path, monkeypatch)
     assert tried[-1].state.best_loss == min(step.select_loss for step in tried)
 
 
-def test_variation_and_gamut_terms_do_what_they_say(tmp_path):
+def test_variation_and_gamut_terms_do_what_they_say(tmp_path, few_views):
     """From noise in strong colors: the one smooths it, the other draws it towards what can be printed."""
 
     def after(**weights):
@@ -246,7 +246,7 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
 def few_views(monkeypatch):
     """Fewer views to select by and to promise from, where rates do not matter."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
-    monkeypatch.setattr(loop, "SELECT_VIEWS", 16)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_AFTER", 40)
 
 
@@ -324,10 +324,10 @@ class Killed(Exception):
 
 
 def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, few_views):
-    scene = toml(tmp_path / "scene.toml", optimize__steps=24)
+    scene = toml(tmp_path / "scene.toml", optimize__steps=14)
 
     def kill(step, total):
-        if step.state.number == 17:
+        if step.state.number == 12:  # tried on the selection set after 10
             raise Killed
 
     optimize_scene(scene, tmp_path / "whole")
@@ -337,13 +337,15 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
         load_run(tmp_path / "cut")
     resumed = optimize_scene(scene, tmp_path / "cut", resume=True)
     assert same_files(tmp_path / "whole", tmp_path / "cut")
-    assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 24
+    assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 14
     np.testing.assert_array_equal(load_run(tmp_path / "cut").design, resumed.design)
 
 
 @pytest.mark.skipif(not can_fork(), reason="this torch takes no gradients in forked processes")
-def test_the_number_of_processes_changes_no_byte(tmp_path, few_views):
-    """A step of 5 views, the selection, promise and controls, and the search for a place."""
+def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatch):
+    """A step of 5 views, the selection, promise and controls, and the search for a place among three."""
+    monkeypatch.setattr(places, "PLACES", 3)
+    monkeypatch.setattr(places, "SHARE", 0)
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
     with threads(1):
         for jobs in (1, 3):
