@@ -306,23 +306,26 @@ def _laid_on(light, page, px, depth) -> np.ndarray:
     """The page's samples thrown into the picture's light, each into the four pixels about it, hidden ones left out."""
     height, width = light.shape[:2]
     inside = ((px > 1) & (px < [width - 1, height - 1])).all(1)
-    px, depth, page = px[inside], depth[inside], page[inside]
-    cell = (px[:, 1] // 4).astype(int) * (width // 4 + 1) + (px[:, 0] // 4).astype(int)
+    if not inside.all():
+        px, depth, page = px[inside], depth[inside], page[inside]
+    cell = (px[:, 1] * 0.25).astype(int) * (width // 4 + 1) + (px[:, 0] * 0.25).astype(int)
     nearest = np.full((height // 4 + 1) * (width // 4 + 1), np.inf)
     np.minimum.at(nearest, cell, depth)
     shown = depth < nearest[cell] + 12.0  # mm: what a steep part gains over four pixels
-    px, page = px[shown] - 0.5, page[shown]
-    low = np.floor(px).astype(int)
-    share = px - low
-    total = np.zeros((height * width, 4))
+    if not shown.all():
+        px, page = px[shown], page[shown]
+    x, y = np.ascontiguousarray(px.T) - 0.5
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    right, below, colors = x - left, y - top, np.ascontiguousarray(page.T)
+    total = np.zeros((4, height * width))
     for dx in (0, 1):
         for dy in (0, 1):
-            weight = np.abs(1 - dx - share[:, 0]) * np.abs(1 - dy - share[:, 1])
-            index = (low[:, 1] + dy) * width + low[:, 0] + dx
-            total[:, 3] += np.bincount(index, weight, height * width)
+            weight = (right if dx else 1 - right) * (below if dy else 1 - below)
+            index = (top + dy) * width + left + dx
+            total[3] += np.bincount(index, weight, height * width)
             for c in range(3):
-                total[:, c] += np.bincount(index, weight * page[:, c], height * width)
-    total = total.reshape(height, width, 4).astype(np.float32)
+                total[c] += np.bincount(index, weight * colors[c], height * width)
+    total = np.ascontiguousarray(total.T.reshape(height, width, 4), np.float32)
     dense = np.maximum(cv2.dilate(total[..., 3], np.ones((5, 5))), 1e-3)
     cover = np.clip(total[..., 3:] / dense[..., None] / 0.7, 0, 1)
     color = total[..., :3] / np.maximum(total[..., 3:], 1e-6)
