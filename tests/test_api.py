@@ -42,6 +42,7 @@ def loss(logits: torch.Tensor, indices: tuple[int, ...]) -> torch.Tensor:
 def run(tmp_path_factory) -> pp.Run:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
         return pp.optimize(scene(), tmp_path_factory.mktemp("api") / "run", models=[network()], loss=loss)
 
 

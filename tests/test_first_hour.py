@@ -126,7 +126,8 @@ def typed_apart(line: str, folder: Path) -> tuple[int, str, float]:
     return done.returncode, done.stdout, resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
 
 
-def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path):
+def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)  # what they cost is time
     said = {line: text for line, (text, _) in spent(tmp_path, typed_here).items()}
     asked, new, preview, optimize, sheet, _, refused, verify = said.values()
     assert 'add --label with what it is to be recognized as: "lamp", "vase", "stone"' in asked

@@ -36,16 +36,20 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.fixture(autouse=True)
-def a_promise_of_few_views(monkeypatch):
+def few_views(monkeypatch):
+    """Of a promise and of the selection set: what they cost is time."""
     monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
 
 
 @pytest.fixture(scope="module")
 def here(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     toml = blocks("toml")[0]
-    # fewer steps than a user would take
-    (folder / "scene.toml").write_text(toml + "\n[optimize]\nsteps = 3\nviews = 4\n", encoding="utf-8")
+    # fewer steps and smaller photographs than a user would take
+    (folder / "scene.toml").write_text(
+        toml + "\n[optimize]\nsteps = 3\nviews = 4\n[camera]\nphoto_px = [1200, 900]\n", encoding="utf-8"
+    )
     return folder
 
 
