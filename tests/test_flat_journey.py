@@ -250,7 +250,7 @@ def test_reprints_are_judged_where_the_truth_says(request, kind, tmp_path):
     arguments = ("--run", folder / "run", "--n", REPRINTS, "--out", tmp_path / "reprints")
     assert command("reprint", folder / "SHEET.pdf", *arguments) == 0
     sheet = folder / "SHEET.json"
-    assert command("verify", tmp_path / "reprints", "--sheet", sheet, "--out", tmp_path / "report") == 0
+    assert command("verify", tmp_path / "reprints", "--sheet", sheet, "--ledger", 0, "--out", tmp_path / "report") == 0
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     truth = json.loads((tmp_path / "reprints" / "truth.json").read_text())
     corners = rect_corners(load_manifest(sheet).design.rect_mm)
