@@ -29,6 +29,11 @@ from patchproof.version import __version__
 from test_journey import command
 
 
+@pytest.fixture(autouse=True)
+def few_views_to_select_by(monkeypatch):
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+
+
 def patchproof(*arguments, **environment) -> subprocess.CompletedProcess:
     """The command in a process of its own."""
     program = [sys.executable, "-m", "patchproof", *map(str, arguments)]

@@ -221,7 +221,8 @@ def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(ship
     assert found.mean() > card["held_out_ap50"] - 0.15  # ten views of one shape are alike
 
 
-def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped):
+def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped, monkeypatch):
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
     scene = pp.make_scene(
         {
             "object": {"mesh": "primitive:box_truck", "length_mm": 400},

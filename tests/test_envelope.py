@@ -42,6 +42,7 @@ def world(tmp_path_factory):
     (folder / "scene.toml").write_text(scene)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         optimize_scene(folder / "scene.toml", folder / "run")
     return open_world(folder / "run", None)
 
@@ -199,6 +200,7 @@ def blue_run(tmp_path_factory):
     (folder / "scene.toml").write_text(scene.replace("steps = 3", "steps = 8").replace("[500, 900]", "[330, 340]"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         optimize_scene(folder / "scene.toml", folder / "run")
     return folder / "run"
 

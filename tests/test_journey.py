@@ -41,6 +41,7 @@ def journey(tmp_path_factory):
     (folder / "scene.toml").write_text(scene, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:  # a tenth of the promise's views: what they cost is time
         patch.setattr(run_module, "PROMISE_VIEWS", 40)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
         assert command("optimize", folder / "scene.toml", "--out", folder / "run") == 0
     assert command("sheet", folder / "run", "--out", folder / "sheet.pdf", "--check") == 0
     pdf, run, photos = folder / "sheet.pdf", folder / "run", folder / "photos"
