@@ -185,7 +185,7 @@ def _scaled(srgb: np.ndarray, scale: float) -> tuple[int, int]:
 
 def light_picture(srgb: np.ndarray) -> np.ndarray:
     """Linear light scaled so that all but the brightest thousandth (lamps, glare) fits."""
-    step = -(-max(srgb.shape) // 512)
+    step = max(1, max(srgb.shape) // 512)
     bright = max(float(np.percentile(luminance(np.ascontiguousarray(srgb[::step, ::step])), 99.9)), 1e-3)
     picture = np.empty(srgb.shape[:2], np.uint8)
     for rows in strips(srgb):
