@@ -61,7 +61,7 @@ def squares_in(gray: np.ndarray, perimeter_px: float = 36, most: int = 0) -> int
         return 0
     if most:  # noise: specks have outlines that are too short, and are most of them
         _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)
-        dark = (stats[:, cv2.CC_STAT_AREA] >= perimeter_px / 2).astype(np.uint8)[labels] & dark
+        dark = np.where(np.take(stats[:, cv2.CC_STAT_AREA] >= perimeter_px / 2, labels), dark, 0)
         if edges_in(dark) <= most * perimeter_px:
             return 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -72,7 +72,7 @@ def squares_in(gray: np.ndarray, perimeter_px: float = 36, most: int = 0) -> int
 def edges_in(mask: np.ndarray) -> int:
     """How many edges of pixels lie between 0 and anything else, with 0 all round: each point of an outline has one."""
     mask = cv2.copyMakeBorder((mask != 0).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    return cv2.countNonZero(mask[1:] ^ mask[:-1]) + cv2.countNonZero(mask[:, 1:] ^ mask[:, :-1])
+    return int(np.count_nonzero(mask[1:] != mask[:-1]) + np.count_nonzero(mask[:, 1:] != mask[:, :-1]))
 
 
 def finder_lines_in(gray: np.ndarray) -> int:
