@@ -61,7 +61,8 @@ def squares_in(gray: np.ndarray, perimeter_px: float = 36, most: int = 0) -> int
         return 0
     if most:  # noise: specks have outlines that are too short, and are most of them
         _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)
-        dark = np.where(np.take(stats[:, cv2.CC_STAT_AREA] >= perimeter_px / 2, labels), dark, 0)
+        areas = np.asarray(stats)[:, cv2.CC_STAT_AREA]
+        dark = np.where((areas >= perimeter_px / 2)[np.asarray(labels)], dark, 0)
         if edges_in(dark) <= most * perimeter_px:
             return 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
