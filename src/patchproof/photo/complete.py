@@ -2,9 +2,9 @@
 
 In: the photograph and where every marker lies on the page. Out: `MarkersInView`. After each level of the detector a
 homography from the markers found predicts the corners of the rest; where cells are about the printed ones, borders are
-fitted from there, and a marker counts when these fit near the prediction and its cells are the printed ones. That needs no contours, so it still works
-for small, blurred or partly covered markers, and it spares the finer levels, which cost most; they then look only
-where markers are still missing. Prediction never identifies a sheet by itself.
+fitted from there, and a marker counts when these fit near the prediction and its cells are the printed ones. That needs
+no contours, so it still works for small, blurred or partly covered markers, and it spares the finer levels, which cost
+most; they then look only where markers are still missing. Prediction never identifies a sheet by itself.
 """
 
 from __future__ import annotations

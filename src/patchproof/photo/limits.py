@@ -62,7 +62,7 @@ def squares_in(gray: np.ndarray, perimeter_px: float = 36, most: int = 0) -> int
     if most:  # noise: specks have outlines that are too short, and are most of them
         _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)
         areas = np.asarray(stats)[:, cv2.CC_STAT_AREA]
-        dark = np.where((areas >= perimeter_px / 2)[np.asarray(labels)], dark, 0)
+        dark = np.where((areas >= perimeter_px / 2)[labels.astype(np.int32, copy=False)], dark, 0)
         if edges_in(dark) <= most * perimeter_px:
             return 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
