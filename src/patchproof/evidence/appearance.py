@@ -23,12 +23,15 @@ from patchproof.geometry import rect_corners
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
 from patchproof.photo.detect import LIGHT
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import crop, rectify
+from patchproof.photo.rectify import crop, least_px_per_mm, rectify
 
 _CELLS = (6, 48)  # least and most along the design's shorter side
 MOST_CLIPPED = 0.5  # share of the design at full white, where color is unknown
 _MOST_CLIPPED_PAPER = 0.2
 _PICTURE_PX = 192
+_SAMPLES = 8  # along a cell that are looked at, each the mean of the photograph's pixels there
+_STRIP_PX = 100_000  # 1.6 MB as light: caches hold it
+_LIGHT = np.repeat(LIGHT[None, :, None], 3, 2)
 _ANCHORS = 8  # cells for each time that paper and ink count
 _GLOSS = 0.15  # linear light, paper = 1
 
@@ -40,15 +43,20 @@ def appearance(
     promised: Promised,
     light: FrameLight,
     geometry: Geometry,
+    with_pictures: bool = True,
 ) -> tuple[Color, dict[str, np.ndarray]]:
     """Color difference of the whole design, None where more than half of it is clipped, and pictures (uint8 sRGB;
-    `delta_e00` float cells).
+    `delta_e00` float cells) where they are wanted.
     """
-    part, px_from_mm = piece_only(srgb, px_from_mm, surface)
-    linear = LIGHT[part]
-    flat = partial(rectify, px_from_mm=px_from_mm, rect_mm=surface.rect_mm, px_per_mm=_cells_per_mm(surface, geometry))
-    lit = flat(linear).astype(float)
-    clipped = flat((part.max(-1, keepdims=True) >= CLIPPED_CODE).astype(np.float32)).reshape(lit.shape[:2]) > 0.05
+    cells_per_mm, picture_per_mm = _cells_per_mm(surface, geometry), _PICTURE_PX / max(surface.rect_mm[2:])
+    spare = least_px_per_mm(px_from_mm, surface.rect_mm) / max(_SAMPLES * cells_per_mm, picture_per_mm)
+    step = max(1, int(spare))
+    part, px_from_mm = crop(srgb, px_from_mm, rect_corners(surface.rect_mm), 4 * step)
+    linear = _reduced_light(part, step)
+    px_from_mm = np.diag([1 / step, 1 / step, 1.0]) @ px_from_mm
+    flat = partial(rectify, linear, px_from_mm, surface.rect_mm)
+    *lit, clipped = cv2.split(flat(cells_per_mm))
+    lit, clipped = np.dstack(lit).astype(float), clipped > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     expected = coarse(promised.design, lit.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
     usable = ~clipped
@@ -70,15 +78,34 @@ def appearance(
         delta_e00_mean=float(known.mean()) if known.size else None,
         delta_e00_p95=float(np.percentile(known, 95)) if known.size else None,
     )
-    flat = partial(flat, px_per_mm=_PICTURE_PX / max(surface.rect_mm[2:]))
-    fitted = fit.apply(flat(linear))
+    if not with_pictures:
+        return color, {}
+    seen = flat(picture_per_mm)[..., :3]
+    fitted = fit.apply(seen)
     pictures = {
-        "seen": flat(part),
+        "seen": photo_codes_of(srgb_from_linear(seen)),
         "fitted": photo_codes_of(srgb_from_linear(fitted)),
         "promised": photo_codes_of(srgb_from_linear(coarse(promised.design, fitted.shape[:2], 0.0))),
         "delta_e00": np.where(usable, delta, np.nan).astype(np.float32),
     }
     return color, pictures
+
+
+def _reduced_light(srgb: np.ndarray, step: int) -> np.ndarray:
+    """Linear light of uint8 pixels and the share of clipped ones, H×W×4 float32, each the mean of `step` times `step`:
+    of 12 megapixels each cell has hundreds, of which making them light and resampling them took most of the time.
+    """
+    height, width = (side // step for side in srgb.shape[:2])
+    srgb, means = srgb[: height * step, : width * step], np.zeros((height, width, 4), np.float32)
+    rows = max(1, _STRIP_PX // srgb.shape[1] // step)
+    for top in range(0, height, rows):
+        strip, into = srgb[top * step : (top + rows) * step], means[top : top + rows]
+        averaged = partial(cv2.resize, dsize=into.shape[1::-1], interpolation=cv2.INTER_AREA)
+        into[..., :3] = averaged(cv2.LUT(strip, _LIGHT))
+        unclipped = cv2.inRange(strip, (0, 0, 0), 3 * (CLIPPED_CODE - 1,))
+        if cv2.countNonZero(unclipped) < unclipped.size:
+            into[..., 3] = averaged((unclipped == 0).astype(np.float32))
+    return means
 
 
 def cells_fit(seen: np.ndarray, promised: np.ndarray, light: FrameLight, ink: np.ndarray) -> ColorFit:
@@ -129,8 +156,3 @@ def coarse(design: np.ndarray, shape: tuple[int, ...], blur_design_px: float) ->
         design = cv2.GaussianBlur(design, (0, 0), float(blur_design_px), borderType=cv2.BORDER_REPLICATE)
     way = cv2.INTER_AREA if shape[1] <= design.shape[1] else cv2.INTER_LINEAR
     return cv2.resize(design, (shape[1], shape[0]), interpolation=way).astype(float)
-
-
-def piece_only(srgb: np.ndarray, px_from_mm: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the photo that holds the design, and the homography to it."""
-    return crop(srgb, px_from_mm, rect_corners(surface.rect_mm), 4)

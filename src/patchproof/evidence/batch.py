@@ -164,7 +164,8 @@ def _measure(task: Task, item: Item) -> MeasuredPhoto:
             return _rejected(item, Remark(code="empty", advice=_EMPTY))
         return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
     view = view_of(photo, task.camera)
-    measured = measure(view, item.file, task.surface, task.promised, task.ranges, task.scan_dpi)
+    wanted = task.scan_dpi, item.with_pictures
+    measured = measure(view, item.file, task.surface, task.promised, task.ranges, *wanted)
     if measured.counted and measured.entry.code is None and _is_part(photo, task):
         measured = replace(measured, entry=measured.entry.changed(remark=Remark(code="cropped", advice=_PART)))
     if not item.with_pictures:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from patchproof.strict import Refused
 if TYPE_CHECKING:
     from patchproof.classifier import Classifier
 
-
+_STRIP_ROWS = 32  # of a photograph as float: of these few pixels of a square are made, and caches hold them
 Box = tuple[float, float, float, float]  # left, top, right, bottom as shares of the photograph's centered square
 
 
@@ -72,19 +73,33 @@ def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
 
 
 def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarray]:
-    """The centered square of an uint8 photograph at each size, float32 3×S×S in [0, 1]."""
-    import torch
-
-    from patchproof.classifier import center_square
-
+    """The centered square of an uint8 photograph at each size, float32 3×S×S in [0, 1]: `center_square`'s pixels, in an
+    eighth of its time, since a strip of rows counts in few rows of the result.
+    """
     square, _ = square_of(srgb)
-    planes = {size: [] for size in sizes_px}
-    with torch.inference_mode():
-        for channel in range(3):  # one by one, since as float each takes 4 times the memory
-            codes = torch.from_numpy(square[..., channel].astype(np.float32))[None, None]
-            for size, own in planes.items():
-                own.append(center_square(codes, size)[0, 0] / 255)
-        return {size: torch.stack(own).numpy() for size, own in planes.items()}
+    side = len(square)
+    weights = {size: _weights(side, size) for size in sizes_px}
+    rows = {size: np.zeros((size, 3 * side), np.float32) for size in sizes_px}
+    codes = np.empty((_STRIP_ROWS, side, 3), np.float32)
+    for top in range(0, side, _STRIP_ROWS):
+        strip = codes[: side - top]
+        np.copyto(strip, square[top : top + _STRIP_ROWS])
+        for size, own in rows.items():
+            part = weights[size][:, top : top + _STRIP_ROWS]
+            first, last = np.flatnonzero(part.any(1))[[0, -1]]
+            own[first : last + 1] += part[first : last + 1] @ strip.reshape(-1, 3 * side)
+    return {size: np.stack([own[:, c::3] @ weights[size].T for c in range(3)]) / 255 for size, own in rows.items()}
+
+
+@lru_cache(8)  # most photographs of a verification are of one size
+def _weights(side: int, size: int) -> np.ndarray:
+    """What each of `side` pixels in a row counts in each of `size`, float32 size×side: `center_square`'s resampling,
+    whose kernel is a triangle as wide as two of the new pixels, or two of the old ones where these are larger.
+    """
+    scale = side / size
+    off = np.abs((np.arange(size)[:, None] + 0.5) * scale - (np.arange(side) + 0.5))
+    weights = np.maximum(1 - off / max(scale, 1.0), 0)
+    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
 def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:

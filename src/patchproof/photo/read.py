@@ -38,7 +38,7 @@ _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda a: a[::-1, ::-1].transpose(1, 0, 2),
     8: lambda a: np.rot90(a),
 }
-_STRIP_PX = 4_000_000
+_STRIP_PX = 250_000  # a megabyte: larger ones leave the processor's cache, and take four times as long
 WHOLE_PX = 30_000_000  # few cameras but phones give more; markers are looked for in 25 million at once
 # What people copy along with photographs and nobody reads here.
 _OTHERS = (

@@ -126,6 +126,11 @@ def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: floa
     return warped if fine == 1 else cv2.resize(warped, size, interpolation=cv2.INTER_AREA)
 
 
+def least_px_per_mm(px_from_mm: np.ndarray, rect_mm) -> float:
+    """How many pixels a millimeter has at the rectangle's corner, and in the direction, where it has fewest."""
+    return float(1 / max(np.linalg.norm(j, 2) for j in _mm_from_px(px_from_mm, rect_corners(rect_mm))))
+
+
 def reduced(pixels: np.ndarray, longest_px: int) -> np.ndarray:
     """A picture averaged down until its longer side has no more pixels than that."""
     shrink = longest_px / max(pixels.shape[:2])
