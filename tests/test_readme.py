@@ -204,6 +204,19 @@ def test_figures_of_views_are_the_stored_ones():
         assert f"| {sizes} | {off} | {rates.replace('%', ' %')} |" in page
 
 
+def test_figures_of_effort_are_the_stored_ones():
+    page, rows = words(NOTEBOOK), rows_of("bench_effort.csv")
+    for runs in (rows[first : first + 3] for first in range(0, 15, 3)):
+        cells = [
+            f"{float(run['seconds']):.0f} s, {100 * float(run['rate of fresh views']):.1f} %, "
+            f"± {100 * float(run['half width']):.1f}"
+            for run in runs
+        ]
+        assert [run["effort"] for run in runs] == ["draft", "default", "thorough"]
+        best = f"{100 * float(runs[2]['best control']):.1f} %"
+        assert f"| {runs[0]['object']} | {best} | {' | '.join(cells)} |" in page
+
+
 def test_figures_of_verdicts_are_the_stored_ones():
     kept = {
         (float(row["correlation"]), int(row["sessions"]), round(float(row["true rate"]), 2)): row
