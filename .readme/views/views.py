@@ -1,7 +1,7 @@
 """Views that promises are made of beside full photographs under the same conditions: how far off both are.
 
-In: scene files. Out, per scene, two lines of `views.csv`: of the design, which is optimized first as its scene says, and
-of the bare object, means over the conditions with 95 % intervals (Student's). One design each.
+In: scene files. Out, per scene, two lines of `views.csv`: of the design, which is optimized first as its scene says,
+and of the bare object, means over the conditions with 95 % intervals (Student's). One design each.
 Run in this folder: python views.py suv postbox carton truck small
 """
 

@@ -239,6 +239,9 @@ def verify(
     ] = None,
     ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
     camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
+    boxes: Annotated[
+        Path | None, typer.Option(help="The object's boxes in photographs (COCO JSON), for detectors.")
+    ] = None,
     require: Annotated[
         Literal["kept", "helps"] | None,
         typer.Option(
@@ -272,6 +275,7 @@ def verify(
             ruler_mm=None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm"),
             ledger_photos=ledger,
             camera=camera,
+            boxes=boxes,
             run=run,
             jobs=jobs or 1,
             cluster=cluster,

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
+from patchproof.evidence.boxes import in_square
 from patchproof.evidence.camera import view_of
-from patchproof.evidence.classify import Judges, square_of, squares_of
+from patchproof.evidence.classify import Box, Judges, square_of, squares_of
 from patchproof.evidence.journal import Journal, file_sha256
 from patchproof.evidence.ledger import usable
 from patchproof.evidence.measure import MeasuredPhoto, measure
@@ -50,14 +51,15 @@ Light = Annotated[Finite, Field(ge=-4, le=4)]
 
 @dataclass(frozen=True)
 class Item:
-    """A photograph to look at, its name in the report, the control that it shows (None: the patch), and whether
-    pictures of it are wanted.
+    """A photograph to look at, its name in the report, the control that it shows (None: the patch), whether pictures of
+    it are wanted, and the box that somebody drew round the object.
     """
 
     path: Path
     file: str
     control: str | None = None
     with_pictures: bool = False
+    box_px: Box | None = None
 
     @property
     def name(self) -> str:
@@ -147,7 +149,7 @@ def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> Measu
 
 def _measured(task: Task, item: Item) -> MeasuredPhoto:
     try:
-        return limited(_measure, task, item)
+        return limited(_measured_in_box, task, item)
     except CannotJudge as cannot:
         return _rejected(item, Remark.of(cannot))
     except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
@@ -156,8 +158,15 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         return _rejected(item, Remark(code="unreadable", advice=advice))
 
 
-def _measure(task: Task, item: Item) -> MeasuredPhoto:
+def _measured_in_box(task: Task, item: Item) -> MeasuredPhoto:
     photo = read_photo(item.path)
+    measured = _measure(task, item, photo)
+    if item.box_px is None:
+        return measured
+    return replace(measured, box=in_square(item.box_px, photo.srgb.shape[1::-1]))
+
+
+def _measure(task: Task, item: Item, photo: Photo) -> MeasuredPhoto:
     squares = squares_of(photo.srgb, task.sizes_px)
     if item.control is not None:
         if shows_nothing(square_of(photo.srgb)[0]):

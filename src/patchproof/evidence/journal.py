@@ -75,6 +75,7 @@ def settings_key(manifest: Manifest, options: Options) -> str:
         "printer": _printer_sha256(options.printer),
         "scan_dpi": options.scan_dpi,
         "camera": options.camera and options.camera.model_dump(mode="json"),
+        "boxes": dict(options.boxes),
     }
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from patchproof.claims import wilson
 from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
+from patchproof.evidence.boxes import box_in
 from patchproof.evidence.classify import Judges, judges_of
 from patchproof.evidence.copies import COPY, without_copies
 from patchproof.evidence.estimated import estimate_effect
@@ -69,6 +70,10 @@ def gather_evidence(
     task = task_of(manifest, options, judges)
     items = [Item(path, grouping.file(i), with_pictures=i < WITH_PICTURES) for i, path in enumerate(paths)]
     items += [Item(path, printable(path.name), control) for control, files in control_paths.items() for path in files]
+    items = [replace(item, box_px=box_in(options.boxes, item.name)) for item in items]
+    if options.boxes and not any(item.box_px for item in items):
+        do = "name the images of the boxes' file as the photographs are called"
+        raise Refused("boxes of these photographs", f"some of {next(iter(options.boxes))} and others", do)
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
     with kept as open_journal, open_workers(jobs, cluster) as workers:
         results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)

@@ -5,12 +5,12 @@ In: a manifest and the `Options` of a verification. Out: a `Task`: all that one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from patchproof.evidence.classify import Judges
+from patchproof.evidence.classify import Box, Judges
 from patchproof.evidence.ranges import PromisedRanges, promised_ranges, promised_side_px
 from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
 from patchproof.sheets.manifest import Manifest
@@ -30,7 +30,8 @@ class Options:
     `printer` is the appearance model that the promise was made with.
     `camera` replaces the EXIF focal length and takes out the lens. `ruler_mm` are the printed rulers (x, y) as somebody
     measured them. `controls` is a folder of photographs of controls. `ledger_photos` of the photographs at most, spread
-    evenly, go into the gap ledger (0: no ledger).
+    evenly, go into the gap ledger (0: no ledger). `boxes` are those that somebody drew round the object, by photograph
+    (`boxes.given_boxes`).
     """
 
     models: Sequence[Classifier]
@@ -40,6 +41,7 @@ class Options:
     ruler_mm: tuple[float, float] | None = None
     controls: str | Path | None = None
     ledger_photos: int = LEDGER_PHOTOS
+    boxes: Mapping[str, Box] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

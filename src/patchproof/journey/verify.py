@@ -16,10 +16,12 @@ import numpy as np
 
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer
-from patchproof.classifier.detector import at_score
+from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
+from patchproof.evidence.boxes import given_boxes
+from patchproof.evidence.classify import Box
 from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
@@ -52,6 +54,7 @@ def verify_photos(
     ruler_mm: tuple[float, float] | None = None,
     ledger_photos: int = LEDGER_PHOTOS,
     camera: str | None = None,
+    boxes: str | Path | None = None,
     run: str | Path | Run | None = None,
     jobs: int = 1,
     cluster: str | None = None,
@@ -63,9 +66,10 @@ def verify_photos(
 
     `models` are names, or classifiers in memory; a network of the sheet that is code (`module:`) is run only where it
     is one of them. `camera` is a camera file's name or path. Model and printer names are looked up from the manifest's
-    folder, then as the scene's were. With the `run` that the sheet was made from, each photograph gets a forecast of
-    its own. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are new, or
-    differ, are measured.
+    folder, then as the scene's were. For detectors, `boxes` is COCO JSON with the object's box in photographs whose
+    sheet does not tell it, or tells it wrongly. With the `run` that the sheet was made from, each photograph gets a
+    forecast of its own. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are
+    new, or differ, are measured.
     """
     out, manifest = Path(out), load_manifest(sheet)
     _check_out(out, resume, overwrite)
@@ -76,6 +80,8 @@ def verify_photos(
         controls=controls,
         ledger_photos=ledger_photos,
     )
+    if boxes is not None:
+        options = replace(options, boxes=_drawn(boxes, manifest, options))
     forecast = None if run is None else retaker(run if isinstance(run, Run) else load_run(run), manifest)
     report = gather_evidence(
         photos,
@@ -93,6 +99,7 @@ def verify_photos(
         "scan_dpi": scan_dpi,
         "ruler_mm": ruler_mm,
         "camera": camera and Path(camera).name,
+        "boxes": boxes and Path(boxes).name,
         "ledger_photos": ledger_photos,
     }
     hashes = {"manifest": file_sha256(Path(sheet))} | {
@@ -104,6 +111,13 @@ def verify_photos(
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
     write_whole(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
+
+
+def _drawn(boxes: str | Path, manifest: Manifest, options: Options) -> dict[str, Box]:
+    """The boxes of a file, refused before networks that do not look at them."""
+    if manifest.promise is None or not any(isinstance(model, Detector) for model in options.models):
+        raise Refused("a detector, which alone looks at boxes", "none that judges these photographs", "leave boxes out")
+    return given_boxes(boxes, manifest.promise.target.label)
 
 
 def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
