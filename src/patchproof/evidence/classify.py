@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from patchproof.evidence.results import Prediction
 from patchproof.sheets.manifest import Manifest, Promise
@@ -74,32 +75,43 @@ def square_of(srgb: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
 
 def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarray]:
     """The centered square of an uint8 photograph at each size, float32 3×S×S in [0, 1]: `center_square`'s pixels, in an
-    eighth of its time, since a strip of rows counts in few rows of the result.
+    eighth of its time, since a strip of rows counts in few rows of the result. The same bits on any number of threads.
     """
     square, _ = square_of(srgb)
     side = len(square)
-    weights = {size: _weights(side, size) for size in sizes_px}
     rows = {size: np.zeros((size, 3 * side), np.float32) for size in sizes_px}
-    codes = np.empty((_STRIP_ROWS, side, 3), np.float32)
-    for top in range(0, side, _STRIP_ROWS):
-        strip = codes[: side - top]
-        np.copyto(strip, square[top : top + _STRIP_ROWS])
+    for number, top in enumerate(range(0, side, _STRIP_ROWS)):
+        strip = square[top : top + _STRIP_ROWS].astype(np.float32).reshape(-1, 3 * side)
         for size, own in rows.items():
-            part = weights[size][:, top : top + _STRIP_ROWS]
-            first, last = np.flatnonzero(part.any(1))[[0, -1]]
-            own[first : last + 1] += part[first : last + 1] @ strip.reshape(-1, 3 * side)
-    return {size: np.stack([own[:, c::3] @ weights[size].T for c in range(3)]) / 255 for size, own in rows.items()}
+            first, part = _strips(side, size)[number]
+            own[first : first + part.shape[0]] += part @ strip
+    whole = {size: _weights(side, size) for size in sizes_px}
+    return {
+        size: np.stack([(whole[size] @ np.ascontiguousarray(own[:, c::3].T)).T for c in range(3)]) / 255
+        for size, own in rows.items()
+    }
 
 
 @lru_cache(8)  # most photographs of a verification are of one size
-def _weights(side: int, size: int) -> np.ndarray:
+def _weights(side: int, size: int) -> csr_array:
     """What each of `side` pixels in a row counts in each of `size`, float32 size×side: `center_square`'s resampling,
     whose kernel is a triangle as wide as two of the new pixels, or two of the old ones where these are larger.
     """
     scale = side / size
     off = np.abs((np.arange(size)[:, None] + 0.5) * scale - (np.arange(side) + 0.5))
     weights = np.maximum(1 - off / max(scale, 1.0), 0)
-    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+    return csr_array((weights / weights.sum(1, keepdims=True)).astype(np.float32))
+
+
+@lru_cache(8)
+def _strips(side: int, size: int) -> list[tuple[int, csr_array]]:
+    """Of each strip of rows the first row of the result that it counts in, and its weights from there on."""
+    weights, strips = _weights(side, size).toarray(), []
+    for top in range(0, side, _STRIP_ROWS):
+        part = weights[:, top : top + _STRIP_ROWS]
+        first, last = np.flatnonzero(part.any(1))[[0, -1]]
+        strips.append((int(first), csr_array(part[first : last + 1])))
+    return strips
 
 
 def target_indices(model: Classifier, promise: Promise, settings: Mapping[str, Any]) -> tuple[int, ...]:
