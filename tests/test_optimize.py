@@ -6,6 +6,7 @@ import json
 import math
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -242,6 +243,15 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
     assert promise.rate > 0.9 and all(promise.controls[kind].rate < 0.5 for kind in ("bare", "gray"))
     views = problem.scene.settings.view
     assert all(views.azimuth_deg[0] - 12 < c.azimuth_deg < views.azimuth_deg[1] + 12 for c in promise.conditions)
+
+
+@pytest.mark.parametrize(
+    ("input_px", "training_px", "figure_px"),
+    [(8, 192, 192), (96, 192, 192), (128, 256, 256), (224, 224, 448), (800, 800, 1200), (1300, 1200, 1200)],
+)
+def test_views_are_multiples_of_the_network_s_size_up_to_the_photograph_s(tmp_path, input_px, training_px, figure_px):
+    problem = replace(set_problem(scene_with(tmp_path)), classifiers=(SimpleNamespace(input_px=input_px),))
+    assert (problem.training_px, problem.figure_px) == (training_px, figure_px)
 
 
 @pytest.fixture

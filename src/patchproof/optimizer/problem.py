@@ -32,11 +32,11 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
-# Sides at which views are rendered: for training of this many pixels at least, for figures so many times the largest
-# input, with so many taps of the object's own texture. At twice the size with two taps, mean confidences were within
-# 0.003 of 200 full photographs' in three scenes, 0.026 too low and 0.021 too high in two; at 1.5 times or with one tap
-# no scene was nearer than that throughout; at the network's own size they are 0.07 to 0.3 too high.
-TRAINING_PX, FIGURE_SCALE = 192, 2
+# Sides at which views are rendered: this many pixels at least, for figures at least so many times the largest input,
+# with so many taps of the object's own texture. At twice the size with two taps, mean confidences were within 0.003 of
+# 200 full photographs' in three scenes, 0.026 too low and 0.021 too high in two; at 1.5 times or with one tap no scene
+# was nearer than that throughout; at the network's own size they are 0.07 to 0.3 too high.
+LEAST_PX, FIGURE_SCALE = 192, 2
 TRAINING_TAPS, FIGURE_TAPS = 1, 2
 
 
@@ -56,14 +56,14 @@ class Problem:
     @property
     def training_px(self) -> int:
         """The side at which views are rendered for training and selection: the smallest whole multiple of the largest
-        input size that is large enough.
+        input size that is no less than `LEAST_PX`.
         """
-        return self._at_most_photo(self.network_px * math.ceil(TRAINING_PX / self.network_px))
+        return self._multiple(1)
 
     @property
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
-        return self._at_most_photo(FIGURE_SCALE * self.network_px)
+        return self._multiple(FIGURE_SCALE)
 
     def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N losses to descend on, of what a network answers."""
@@ -103,8 +103,9 @@ class Problem:
         """The largest input size."""
         return max(classifier.input_px for classifier in self.classifiers)
 
-    def _at_most_photo(self, side_px: int) -> int:
-        return min(side_px, min(self.scene.settings.camera.photo_px))
+    def _multiple(self, at_least: int) -> int:
+        times = max(at_least, math.ceil(LEAST_PX / self.network_px))
+        return min(times * self.network_px, min(self.scene.settings.camera.photo_px))
 
     @property
     def device(self) -> torch.device:
