@@ -83,8 +83,8 @@ def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarra
     for number, top in enumerate(range(0, side, _STRIP_ROWS)):
         strip = square[top : top + _STRIP_ROWS].astype(np.float32).reshape(-1, 3 * side)
         for size, own in rows.items():
-            first, part = _strips(side, size)[number]
-            own[first : first + part.shape[0]] += part @ strip
+            reached, part = _strips(side, size)[number]
+            own[reached] += part @ strip
     whole = {size: _weights(side, size) for size in sizes_px}
     return {
         size: np.stack([(whole[size] @ np.ascontiguousarray(own[:, c::3].T)).T for c in range(3)]) / 255
@@ -104,13 +104,14 @@ def _weights(side: int, size: int) -> csr_array:
 
 
 @lru_cache(8)
-def _strips(side: int, size: int) -> list[tuple[int, csr_array]]:
-    """Of each strip of rows the first row of the result that it counts in, and its weights from there on."""
+def _strips(side: int, size: int) -> list[tuple[slice, csr_array]]:
+    """Of each strip of rows the rows of the result that it counts in, and its weights there."""
     weights, strips = _weights(side, size).toarray(), []
     for top in range(0, side, _STRIP_ROWS):
         part = weights[:, top : top + _STRIP_ROWS]
         first, last = np.flatnonzero(part.any(1))[[0, -1]]
-        strips.append((int(first), csr_array(part[first : last + 1])))
+        reached = slice(int(first), int(last) + 1)
+        strips.append((reached, csr_array(part[reached])))
     return strips
 
 
