@@ -43,6 +43,7 @@ def test_squares_are_those_that_networks_were_trained_with(shape, sizes):
     srgb = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     slow = torch.from_numpy(srgb.astype(np.float32)).permute(2, 0, 1)[None] / 255
     for size, fast in squares_of(srgb, sizes).items():
+        assert fast.flags.c_contiguous, "what is summed in another order has other last bits"
         # 1e-5 is a four-hundredth of a code value; of 12 megapixels it is 8e-6, and no confidence moves by 2e-6
         torch.testing.assert_close(torch.from_numpy(fast), center_square(slow, size)[0], atol=1e-5, rtol=0)
 

@@ -85,11 +85,11 @@ def squares_of(srgb: np.ndarray, sizes_px: Sequence[int]) -> dict[int, np.ndarra
         for size, own in rows.items():
             reached, part = _strips(side, size)[number]
             own[reached] += part @ strip
-    whole = {size: _weights(side, size) for size in sizes_px}
-    return {
-        size: np.stack([(whole[size] @ np.ascontiguousarray(own[:, c::3].T)).T for c in range(3)]) / 255
-        for size, own in rows.items()
-    }
+    squares = {size: np.empty((3, size, size), np.float32) for size in sizes_px}  # other strides: other sums
+    for size, own in rows.items():
+        for channel, plane in enumerate(squares[size]):
+            plane[:] = (_weights(side, size) @ np.ascontiguousarray(own[:, channel::3].T)).T / 255
+    return squares
 
 
 @lru_cache(8)  # most photographs of a verification are of one size
