@@ -69,14 +69,16 @@ def box_in(boxes: Mapping[str, Box], name: str) -> Box | None:
     return boxes.get(name, boxes.get(PurePosixPath(name).name))
 
 
-def in_square(box_px: Box, size_px: tuple[int, int]) -> Box | None:
-    """The box as shares of the centered square of a photograph of `size_px`; None where nothing of it lies in there."""
+def in_square(box_px: Box, size_px: tuple[int, int]) -> Box:
+    """The box as shares of the centered square of a photograph of `size_px`; all zeros, which nothing overlaps, where
+    none of it lies in there.
+    """
     side = min(size_px)
     left, top = ((size - side) / 2 for size in size_px)
     x0, y0, x1, y1 = (
         min(max((value - start) / side, 0.0), 1.0) for value, start in zip(box_px, (left, top, left, top), strict=True)
     )
-    return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
+    return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else (0.0, 0.0, 0.0, 0.0)
 
 
 def _corners(bbox: tuple[float, float, float, float]) -> Box:
