@@ -1,7 +1,9 @@
 """Detectors: boxes of meshes, what counts as seen, the words they share with classifiers, and the one that ships."""
 
+import importlib
 import json
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -212,22 +214,56 @@ def shipped():
     return load_classifier("builtin-detector", HERE)
 
 
-def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(shipped):
+@pytest.fixture(scope="module")
+def fresh():
+    return pictures(10, 7_000_000, INPUT_PX)
+
+
+def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(shipped, fresh):
     card = json.loads((HERE / "builtin_detector.json").read_text())
     assert card["held_out_ap50"] >= 0.8 and (HERE / "builtin_detector.safetensors").stat().st_size < 5_000_000
-    fresh = pictures(10, 7_000_000, INPUT_PX)
     found = train_detector.precision(train_detector.found_by_class(shipped.network, fresh), fresh)
     assert shipped.least_score == card["least_score"]
     assert found.mean() > card["held_out_ap50"] - 0.15  # ten views of one shape are alike
 
 
-def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped, monkeypatch):
+@pytest.fixture
+def two_stage(monkeypatch):
+    """Proposals and names by two networks, as R-CNN: the user's own code."""
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / ".readme" / "detector")
+    return importlib.import_module("two_stage")
+
+
+def test_two_stages_find_fresh_objects_and_pass_gradients(two_stage, fresh):
+    made = two_stage.rcnn()
+    assert train_detector.scored(made.network, fresh).mean() >= 0.8
+    photo, box, index = fresh.images[:1].float() / 255, fresh.boxes[:1].numpy(), fresh.labels[:1].tolist()
+    before = made.logits(photo.requires_grad_(), box)[0, index]
+    (gradient,) = torch.autograd.grad(before.sum(), photo)
+    up, down = (made.logits(photo.detach() + step * gradient.sign(), box)[0, index] for step in (0.01, -0.01))
+    assert up > before > down  # not a difference to the last digit: where it is cut out has no gradient
+
+
+def test_crops_are_opencv_s(two_stage):
+    photo, box = torch.rand(1, 3, 128, 128), torch.tensor([[[30.0, 20.0, 90.0, 100.0]]])
+    side = two_stage.MARGIN * 80
+    scale = side / two_stage.CROP_PX
+    left, top = 60 - side / 2, 60 - side / 2
+    matrix = np.array([[scale, 0, left + scale / 2 - 0.5], [0, scale, top + scale / 2 - 0.5]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = two_stage.CROP_PX, two_stage.CROP_PX
+    theirs = cv2.warpAffine(photo[0].permute(1, 2, 0).numpy(), matrix, size, flags=flags, borderValue=(0.5,) * 3)
+    np.testing.assert_allclose(two_stage.crops(photo, box)[0].permute(1, 2, 0), theirs, atol=0.04)
+
+
+@pytest.mark.parametrize("name", ["builtin-detector", "module:two_stage.rcnn"])
+def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stage, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
     scene = pp.make_scene(
         {
             "object": {"mesh": "primitive:box_truck", "length_mm": 400},
             "patch": {"width_mm": 120, "height_mm": 120, "side": "+x"},
-            "target": {"label": "box truck", "models": ["builtin-detector"], "least_score": 0.4},
+            "target": {"label": "box truck", "models": [name], "least_score": 0.4},
             "camera": {"photo_px": [320, 240]},
             "optimize": {"steps": 2},
         }
@@ -237,15 +273,15 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(tmp_path, shipped, monke
     assert claim.least_score == 0.4 and 3 < len(run.promise.outermost_mm) <= MOST_POINTS
     pp.sheet(run, tmp_path / "sheet.pdf")
     pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
-    found = pp.evaluate(run.folder, n=4)["models"]["builtin-detector"]["ap50"]
+    found = pp.evaluate(run.folder, n=4)["models"][name]["ap50"]
     assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
-    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run)
+    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=[name])
     said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
     assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
     truth = scene.boxes(scene.draw("reprint", 3))
-    network = at_score(shipped, 0.4)
+    network = at_score(load_classifier(name, HERE), 0.4)
     for photo, box in zip(report.photos, truth, strict=True):
-        answer = photo.predictions["builtin-detector"]
+        answer = photo.predictions[name]
         pixels = torch.tensor(np.asarray(Image.open(tmp_path / "photos" / photo.file).convert("RGB")))
         logits = network.logits(pixels.permute(2, 0, 1)[None] / 255, box[None])
         assert answer.target_confidence == pytest.approx(network.confidence(logits, (4,)).item(), abs=0.02)
