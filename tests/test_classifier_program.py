@@ -368,3 +368,31 @@ def test_real_networks_recognize_a_photograph(data):
         truth = torch.export.load(str(data / "models" / f"{name}.pt2")).module()
         for ours, theirs in zip(answered(classifier.network, square), answered(truth, square), strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5 * float(theirs.abs().max()))
+
+
+class Rectified(torch.nn.Module):
+    """Three activations; only of the last nobody else has what it rectifies."""
+
+    def __init__(self):
+        super().__init__()
+        self.convs = torch.nn.ModuleList(torch.nn.Conv2d(3, 4, 3, padding=1) for _ in range(2))
+
+    def forward(self, x):
+        first, view = self.convs[0](x), self.convs[1](x).flatten(2)
+        again = torch.nn.functional.relu6(first) - first  # used twice
+        seen = torch.relu(view)  # through a view
+        return (again + torch.relu(first + 0.1)).flatten(2).mean(2) + seen.mean(2) + x.mean((1, 2, 3))[:, None]
+
+
+def test_activations_write_over_what_nobody_else_has(tmp_path, honest):
+    module, photos = seeded(Rectified()), torch.randn(2, 3, 16, 16).requires_grad_()
+    network = load_classifier(f"file:{save(tmp_path, exported(module))}", tmp_path).network
+    names = [str(step.compute) for step in network.network.steps]
+    assert {name: names.count(name) for name in names if "relu" in name} == {
+        "aten.relu6.default": 1, "aten.relu.default": 1, "aten.relu_.default": 1,
+    }  # fmt: skip
+    before = photos.detach().clone()
+    answers = network(photos), module(photos)
+    torch.testing.assert_close(*answers)
+    torch.testing.assert_close(*(torch.autograd.grad(answer[:, 1].sum(), photos)[0] for answer in answers))
+    assert torch.equal(photos, before)
