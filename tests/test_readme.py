@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from patchproof.bench.run import BENCHES
 from patchproof.claims import student_mean
 from patchproof.optimizer.run import load_run
 from patchproof.settings import SceneSettings
@@ -27,7 +28,6 @@ README, NOTEBOOK, CONTRIBUTING = (
     ROOT / ".github" / "CONTRIBUTING.md",
 )
 PACKAGE = ROOT / "src" / "patchproof"
-RASTERIZED = ("rasterizing alone", "rasterizing spot.glb")
 PRINTERS = ("coated", "uncoated")
 
 
@@ -168,6 +168,13 @@ def test_figures_of_the_detector_are_the_stored_ones():
     assert f"Photographed were {truck}, {carton}, {chair} and {mailbox} of 48." in words(NOTEBOOK)
     card = json.loads((ROOT / "src/patchproof/classifier/builtin_detector.json").read_text(encoding="utf-8"))
     assert f"AP50 {card['held_out_ap50']:.3f}" in words(NOTEBOOK)
+    tables = stored("detector/two_stage.json")["tables"]
+    sessions, held = tables["promises"]["rows"], tables["held"]["rows"][-1][1]
+    truck, carton = (100 * sessions[row][6] for row in (0, 4))
+    found = [sum(row[9] for row in sessions[first : first + 4]) for first in (0, 4)]
+    assert [held["value"], held["n"], round(100 * held["low"])] == [1, 8, 68]
+    assert f"Promised {truck:.1f} % (truck) and {carton:.1f} % (carton); 8 of 8 sessions of 12" in words(NOTEBOOK)
+    assert f"(100 % [68, 100]), {found[0]} and {found[1]} of 48 were recognized" in words(NOTEBOOK)
 
 
 def test_figures_of_families_are_the_stored_ones():
@@ -205,16 +212,24 @@ def test_figures_of_views_are_the_stored_ones():
 
 
 def test_figures_of_effort_are_the_stored_ones():
-    page, rows = words(NOTEBOOK), rows_of("bench_effort.csv")
+    page, rows = words(NOTEBOOK), stored("bench/effort.json")["tables"]["effort_runs"]["rows"]
     for runs in (rows[first : first + 3] for first in range(0, 15, 3)):
-        cells = [
-            f"{float(run['seconds']):.0f} s, {100 * float(run['rate of fresh views']):.1f} %, "
-            f"± {100 * float(run['half width']):.1f}"
-            for run in runs
-        ]
-        assert [run["effort"] for run in runs] == ["draft", "default", "thorough"]
-        best = f"{100 * float(runs[2]['best control']):.1f} %"
-        assert f"| {runs[0]['object']} | {best} | {' | '.join(cells)} |" in page
+        cells = [f"{run[2]:.0f} s, {100 * run[6]:.1f} %, ± {100 * run[4]:.1f}" for run in runs]
+        assert [run[1] for run in runs] == ["draft", "default", "thorough"]
+        assert f"| {runs[0][0]} | {100 * runs[2][5]:.1f} % | {' | '.join(cells)} |" in page
+
+
+def test_figures_of_all_benchmarks_are_the_stored_ones():
+    for name in BENCHES:
+        assert not stored(f"bench/{name}.json")["failed"] and not stored(f"bench/{name}.json")["settings"]["quick"]
+    behind = {row[0]: row[3] for row in stored("bench/peers.json")["tables"]["pooled"]["rows"][1:]}
+    sign, flat = (interval(*(behind[name][end] for end in ("value", "low", "high"))) for name in ("sign", "flat"))
+    told = f"minus signed steps {sign}, minus a design made without a scene {flat}".replace(" [", " points [", 1)
+    assert told.replace("+", "") in words(NOTEBOOK)
+    losses = {tuple(row[:2]): row[3] for row in stored("bench/train.json")["tables"]["optimizer"]["rows"]}
+    larger, default = (losses["trained on 960 views", f"adam {size}"] for size in ("0.06", "0.015"))
+    told = [f"{loss['value']:.2f} [{loss['low']:.2f}, {loss['high']:.2f}]" for loss in (larger, default)]
+    assert f"a smaller loss, {told[0]} beside {told[1]}" in words(NOTEBOOK)
 
 
 def test_figures_of_verdicts_are_the_stored_ones():
@@ -380,20 +395,15 @@ def test_figures_of_hardened_renders_are_the_stored_ones(name, network):
 
 
 def test_figures_of_benchmarks_and_cards_are_the_stored_ones():
-    (series,) = stored("bench_detect.json")["charts"]["levels_12mp"]["series"]
-    points = {point["setting"]: point for point in series["points"]}
-    fitted, theirs = points["1000 px, fitted"], points["1000 px, OpenCV's"]
-    assert f"searched in {fitted['cost'] / 1000:.2f} s" in words(NOTEBOOK)
-    assert f"{fitted['error']:.3f} px off" in words(NOTEBOOK) and f"{theirs['error']:.2f} px off" in words(NOTEBOOK)
-    charts = stored("bench_printer.json")["charts"]
-    best = [
-        next(point["error"] for point in charts[f"{count}_swatches"]["series"][0]["points"] if point["default"])
-        for count in (48, 96)
-    ]
-    assert f"has {best[0]:.2f} / {best[1]:.2f}" in words(NOTEBOOK)
-    step = stored("bench_render.json")["charts"]["step"]["series"][1]["points"]
-    suv, spot = (next(p["cost"] for p in step if p["setting"] == name) for name in RASTERIZED)
-    assert f"{suv:.0f} % (SUV, 1,514 faces), {spot:.0f} % (5,856 faces)" in words(NOTEBOOK)
+    points = {row[1]: row[2:4] for row in stored("bench/detect.json")["tables"]["levels_12mp"]["rows"]}
+    (cost, fitted), (_, theirs) = points["1000 px, fitted"], points["1000 px, OpenCV's"]
+    searched = f"searched in {cost['value'] / 1000:.2f} s of one core"
+    assert searched in words(NOTEBOOK) and f"{searched}, the design's corners {fitted['value']:.3f} px" in words(README)
+    assert f"{fitted['value']:.3f} px off" in words(NOTEBOOK) and f"{theirs['value']:.2f} px off" in words(NOTEBOOK)
+    tables = stored("bench/printer.json")["tables"]
+    means, worsts = zip(*(tables[f"{count}_swatches_chosen"]["rows"][-1][1:3] for count in (48, 96)), strict=True)
+    means, worsts = (f"{means[0]['value']:.2f} / {means[1]['value']:.2f}", f"{worsts[0]:.2f} / {worsts[1]:.2f}")
+    assert f"ΔE00 {means} in the mean, worst printer {worsts}" in words(NOTEBOOK)
     accuracy = json.loads((PACKAGE / "classifier" / "builtin.json").read_text())["held_out_accuracy"]
     assert f"| {100 * accuracy:.1f} % of 2,400 |" in words(NOTEBOOK)
     printers = [json.loads((ROOT / "calibration" / "printers" / f"{name}.json").read_text()) for name in PRINTERS]

@@ -51,7 +51,7 @@ def _draw(chart: Chart, machine: str, figure: Figure) -> None:
     axes.set_axisbelow(True)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(edgecolor="none", framealpha=0.8, fontsize=8)
+    axes.legend(edgecolor="none", fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside: it would hide points
     _write_settings(figure, axes, chart)
 
 
