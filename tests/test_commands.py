@@ -75,6 +75,16 @@ def test_a_study_prints_its_keys_and_asks_for_a_config(capsys):
     assert command("study", "stress") == 2 and "--example" in capsys.readouterr().err
 
 
+def test_efforts_are_steps_and_views(tmp_path, scene_file, capsys, monkeypatch):
+    monkeypatch.setattr(run_module, "THOROUGH", (3, 12))
+    run = tmp_path / "run"
+    assert command("optimize", scene_file, "--out", run, "--draft", "--thorough") == 2 and not run.exists()
+    assert "opposite of --draft" in capsys.readouterr().err
+    assert command("optimize", scene_file, "--out", run, "--thorough", "--seed", 5) == 0
+    made = load_run(run)
+    assert (made.scene.settings.optimize.steps, made.promise.n, made.scene.seed) == (3, 12, 5)
+
+
 def test_a_draft_says_that_it_is_one(tmp_path, scene_file, capsys):
     run = tmp_path / "run"
     assert command("optimize", scene_file, "--out", run, "--steps", 2, "--draft", "--promise", 8) == 0

@@ -22,7 +22,7 @@ from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.run import DRAFT_STEPS, DRAFT_VIEWS, Run, optimize_scene
+from patchproof.optimizer.run import DRAFT, THOROUGH, Run, optimize_scene
 from patchproof.report.tables import Table
 from patchproof.scene.scene import Scene, build_scene
 from patchproof.settings import OptimizeSettings, SceneSettings
@@ -37,14 +37,10 @@ OBJECTS = {
     "mailbox": ("mailbox", 400, 0, 90),
     "table lamp": ("table_lamp", 450, 0, 90),
 }
-STEPS, DEFAULT = OptimizeSettings().steps, "default"
+DEFAULT = "default"
 # By name the steps, and the views of the promise.
-EFFORTS = {
-    "draft": (DRAFT_STEPS, DRAFT_VIEWS),
-    DEFAULT: (STEPS, PROMISE_VIEWS),
-    "thorough": (3 * STEPS, 4 * PROMISE_VIEWS),
-}
-QUICK_EFFORTS = {"draft": EFFORTS["draft"], DEFAULT: (2 * DRAFT_STEPS, 2 * DRAFT_VIEWS)}
+EFFORTS = {"draft": DRAFT, DEFAULT: (OptimizeSettings().steps, PROMISE_VIEWS), "thorough": THOROUGH}
+QUICK_EFFORTS = {"draft": DRAFT, DEFAULT: (2 * DRAFT[0], 2 * DRAFT[1])}
 
 
 def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:

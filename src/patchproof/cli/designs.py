@@ -36,7 +36,7 @@ def import_picture(
 ) -> None:
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
     from patchproof.optimizer.given import import_folder, import_patch
-    from patchproof.optimizer.run import DRAFT_VIEWS
+    from patchproof.optimizer.run import DRAFT
     from patchproof.report.summary import imported_lines, promise_lines
     from patchproof.settings import behind
 
@@ -46,7 +46,7 @@ def import_picture(
             "device": device,
             "overwrite": overwrite,
             "jobs": jobs or 1,
-            "promise_views": promise or (DRAFT_VIEWS if draft else None),
+            "promise_views": promise or (DRAFT[1] if draft else None),
             "on_scene": lambda loaded: warn(loaded.warnings),
             "on_promise": lambda done, total: bar("promise", done, total),
         }

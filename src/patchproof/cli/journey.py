@@ -49,6 +49,7 @@ def optimize(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
     overwrite: Overwrite = False,
     draft: Annotated[bool, typer.Option("--draft", help="A first look: few steps, promised from few views.")] = False,
+    thorough: Annotated[bool, typer.Option("--thorough", help="Three times the steps, four times the views.")] = False,
     steps: Annotated[int | None, typer.Option(min=1, help="In place of the scene's own.")] = None,
     promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
     device: Device = "cpu",
@@ -62,13 +63,16 @@ def optimize(
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.optimizer.place_files import read_place
     from patchproof.optimizer.places import place_lines
-    from patchproof.optimizer.run import DRAFT_STEPS, DRAFT_VIEWS, optimize_scene
+    from patchproof.optimizer.run import DRAFT, THOROUGH, optimize_scene
     from patchproof.report.summary import promise_lines
     from patchproof.scene.scene import load_scene
     from patchproof.settings import behind
 
-    if draft:
-        steps, promise = steps or DRAFT_STEPS, promise or DRAFT_VIEWS
+    if draft and thorough:
+        raise typer.BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
+    if draft or thorough:
+        effort = DRAFT if draft else THOROUGH
+        steps, promise = steps or effort[0], promise or effort[1]
     with progress() as bar:
         run = optimize_scene(
             scene if steps is None else load_scene(scene, seed, steps),

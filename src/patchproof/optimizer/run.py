@@ -50,7 +50,9 @@ _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 OWN = (CHECKPOINT, _LOG, RUN_FILE, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
 
 NotNegativeInt = Annotated[int, Field(ge=0)]
-DRAFT_STEPS, DRAFT_VIEWS = 40, 40  # a first look: ten sessions, and an interval about three times as wide
+# Steps and promised views of a first look, whose interval is some four times as wide, and of a print that counts: three
+# times the default's steps, in half as wide an interval (`bench effort`).
+DRAFT, THOROUGH = (40, 40), (720, 1600)
 LEAST_MOVE = 1.5 / 255  # a design that moved by less is printed as it began
 
 
