@@ -7,9 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import patchproof as pp
+from patchproof.classifier.detector import iou
 from patchproof.evidence.boxes import box_in, given_boxes, in_square
 from patchproof.strict import Refused
 
@@ -92,6 +94,19 @@ def test_drawn_boxes_judge_as_the_sheet_s_own_do(journey):
     alone = verified(journey, "alone")
     drawn = verified(journey, "drawn", boxes=journey.photos / "coco.json")  # the truth, as `reprint` wrote it
     assert answers(drawn) == pytest.approx(answers(alone), abs=0.02) and drawn.origin.options["boxes"] == "coco.json"
+
+
+def test_a_report_s_boxes_are_where_the_object_is(journey):
+    verified(journey, "told")
+    told, true = (given_boxes(f / "coco.json", "box truck") for f in (journey.folder / "told", journey.photos))
+    sizes = {image["file_name"]: image for image in json.loads((journey.photos / "coco.json").read_text())["images"]}
+    assert len(told) == len(true) == 3
+    for name, box in true.items():
+        width, height = sizes[name]["width"], sizes[name]["height"]
+        margin = (max(width, height) - min(width, height)) / 2
+        x, y = (margin, 0) if width > height else (0, margin)  # a report knows what lies in the middle square
+        inside = np.clip(box, (x, y, x, y), (width - x, height - y, width - x, height - y))
+        assert iou(torch.tensor(told[name])[None, None], torch.tensor(inside)[None]) > 0.85, name
 
 
 def test_boxes_elsewhere_take_the_object_away_from_design_and_bare_photographs_even_when_a_run_goes_on(journey):

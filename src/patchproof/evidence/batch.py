@@ -91,11 +91,9 @@ def measure_all(
             measured = result_of(future)
         except WorkerDied:
             measured = _rejected(item, Remark(code="unreadable", advice=_DIED))
-        predictions = (
-            judges.predictions(measured.squares, measured.box) if judges and measured.squares is not None else {}
-        )
-        sha256 = file_sha256(item.path)
-        entry = measured.entry.changed(sha256=sha256, predictions=predictions)
+        entry, squares, sha256 = measured.entry, measured.squares, file_sha256(item.path)
+        predictions = judges.predictions(squares, entry.box) if judges and squares is not None else {}
+        entry = entry.changed(sha256=sha256, predictions=predictions)
         if item.control is None:
             on_pictures(item.file, measured.pictures)
         kept = _serialized(replace(measured, entry=entry), item.with_pictures)
@@ -120,20 +118,19 @@ class _Kept(Strict):
     counted: bool
     light: _Light | None
     pictures: bool
-    box: tuple[Finite, Finite, Finite, Finite] | None = None
 
     @property
     def photo(self) -> MeasuredPhoto:
         light = self.light
         if light is not None:
             light = FrameLight(np.array(light.paper), np.array(light.ink), light.contrast, light.clipped)
-        return MeasuredPhoto(self.entry, self.counted, light=light, box=self.box)
+        return MeasuredPhoto(self.entry, self.counted, light=light)
 
 
 def _serialized(measured: MeasuredPhoto, pictures: bool) -> dict[str, Any]:
     light = measured.light and {key: np.asarray(value).tolist() for key, value in vars(measured.light).items()}
     entry = measured.entry.model_dump(mode="json")
-    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures, "box": measured.box}
+    return {"entry": entry, "counted": measured.counted, "light": light, "pictures": pictures}
 
 
 def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> MeasuredPhoto | None:
@@ -163,7 +160,7 @@ def _measured_in_box(task: Task, item: Item) -> MeasuredPhoto:
     measured = _measure(task, item, photo)
     if item.box_px is None:
         return measured
-    return replace(measured, box=in_square(item.box_px, photo.srgb.shape[1::-1]))
+    return replace(measured, entry=measured.entry.changed(box=in_square(item.box_px, photo.srgb.shape[1::-1])))
 
 
 def _measure(task: Task, item: Item, photo: Photo) -> MeasuredPhoto:
@@ -226,7 +223,7 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
     def shot() -> Shot | None:
         view = view_of(read_photo(path), task.camera)
         shot = shot_of(entry.file, view.srgb, px_from_mm, blur_px, light, task.surface, size_px, view.matrix_px)
-        return shot and replace(shot, box=measured.box)
+        return shot and replace(shot, box=measured.entry.box)
 
     try:
         return limited(shot)

@@ -11,9 +11,11 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 from pydantic import BaseModel
 
 from patchproof.evidence.classify import Box
+from patchproof.geometry import rect_corners
 from patchproof.input import read_json
 from patchproof.strict import Finite, Positive, Refused, nearest, validated
 
@@ -79,6 +81,13 @@ def in_square(box_px: Box, size_px: tuple[int, int]) -> Box:
         min(max((value - start) / side, 0.0), 1.0) for value, start in zip(box_px, (left, top, left, top), strict=True)
     )
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else (0.0, 0.0, 0.0, 0.0)
+
+
+def from_square(box: Box, size_px: tuple[int, int]) -> np.ndarray:
+    """The corners 4×2 in pixels of a box that `in_square` gave."""
+    (width, height), side = size_px, min(size_px)
+    x0, y0, x1, y1 = box
+    return side * rect_corners((x0, y0, x1 - x0, y1 - y0)) + ((width - side) / 2, (height - side) / 2)
 
 
 def _corners(bbox: tuple[float, float, float, float]) -> Box:

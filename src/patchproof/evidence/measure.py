@@ -16,7 +16,6 @@ import numpy as np
 
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import View
-from patchproof.evidence.classify import Box
 from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, object_box, place, pose_of
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
@@ -62,8 +61,7 @@ _HIDDEN = "a corner of the design is covered, folded away or out of the picture:
 @dataclass(frozen=True)
 class MeasuredPhoto:
     """An entry without predictions, whether it is counted, pictures by kind, the light on the markers where it was
-    read, what the networks will see of it by side, where it was asked for, and the object's box in that, where it is
-    known.
+    read, and what the networks will see of it by side, where it was asked for.
     """
 
     entry: PhotoEntry
@@ -71,7 +69,6 @@ class MeasuredPhoto:
     pictures: dict[str, np.ndarray] = field(default_factory=dict)
     light: FrameLight | None = None
     squares: dict[int, np.ndarray] | None = None
-    box: Box | None = None
 
 
 def measure(
@@ -96,11 +93,11 @@ def measure(
         few = CannotJudge("too_few_markers", len(detected.markers), 1, advice)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True)
     light = frame_light(view.srgb, detected.markers.values())
-    fit, box = placed.fit, object_box(view, placed, surface)
+    fit = placed.fit
     geometry, corners = geometry_of(placed, detected, light, surface, promised)
     pose, focal = pose_of(view, placed, surface)
     geometry = geometry.changed(focal=focal)
-    entry = partial(entry, geometry=geometry, pose=pose)
+    entry = partial(entry, geometry=geometry, pose=pose, box=object_box(view, placed, surface))
     page_check = _is_uncut(placed, detected, surface)
     scale = None if scan_dpi is None else _scan_scale(fit.px_from_mm, surface, scan_dpi)
     counted = not page_check and scale is None
@@ -123,7 +120,7 @@ def measure(
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
         entry = partial(entry, status="measured", scale=scale, remark=_print_check(page_check, scale))
-    return MeasuredPhoto(entry(color=color), counted, pictures, light, box=box)
+    return MeasuredPhoto(entry(color=color), counted, pictures, light)
 
 
 def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:

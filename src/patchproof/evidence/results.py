@@ -99,7 +99,7 @@ KEYS = """
     file status sha256 photo_px code figure threshold advice markers_found residual_mm px_per_mm scale_x scale_y
     scale_x_over_y tilt_deg tilt_uncertainty_deg azimuth_deg azimuth_uncertainty_deg distance_mm
     distance_uncertainty_mm focal contrast blur_px corner_uncertainty_mm bend_mm design_shift_mm
-    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm forecast
+    curl_radius_mm delta_e00_mean delta_e00_p95 color_fit clipped_share glossy_share homography_px_from_mm box forecast
     predictions""".split()
 
 
@@ -119,6 +119,8 @@ class PhotoEntry(Strict):
     scale: Scale | None = None
     color: Color | None = None
     remark: Remark | None = None
+    # the object's, where a detector is asked and it is known: left, top, right, bottom as shares of the middle square
+    box: tuple[Finite, Finite, Finite, Finite] | None = None
     forecast: Finite | None = None  # the chance of being recognized, by rendering the run's scene at its measured view
     predictions: dict[str, Prediction] = Field(default_factory=dict)
 

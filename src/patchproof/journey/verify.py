@@ -1,7 +1,7 @@
 """Verify: photographs and a manifest in, a report out.
 
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
-report.html, pictures, coco.json with the piece's place in photographs, and photos.jsonl, one line per finished
+report.html, pictures, coco.json with the piece's and a detected object's place, and photos.jsonl, one line per finished
 photograph, from which `resume` goes on. This joins what must not know each other: the judge, its networks and the page.
 The promise's primary network always judges, whatever others are named.
 """
@@ -20,7 +20,7 @@ from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
-from patchproof.evidence.boxes import given_boxes
+from patchproof.evidence.boxes import from_square, given_boxes
 from patchproof.evidence.classify import Box
 from patchproof.evidence.journal import file_sha256
 from patchproof.evidence.results import Origin, Report
@@ -121,19 +121,21 @@ def _drawn(boxes: str | Path, manifest: Manifest, options: Options) -> dict[str,
 
 
 def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
-    """The photographs, and where the piece lies in those that show it flat and straight, as COCO JSON; where the object
-    ends in them nobody knows.
+    """The photographs, and where the piece lies in those that show it flat and straight, as COCO JSON; where detectors
+    were asked and it is known, the object's box, too: what of it lies in the middle square.
     """
     corners, photos = rect_corners(manifest.cut_mm), []
     bends = camera is not None and camera.bends  # then places are those in the picture made straight
+    label = "object" if manifest.promise is None else manifest.promise.target.label
     for entry in report.photos:
         if entry.photo_px is None:
             continue
         px_from_mm = None if entry.geometry is None else entry.geometry.homography_px_from_mm
         known = px_from_mm is not None and not bends and entry.status != "rejected"
         outlines = {PATCH: apply_homography(np.array(px_from_mm), corners)} if known else {}
+        if entry.box is not None and not bends:
+            outlines[label] = from_square(entry.box, entry.photo_px)
         photos.append(Labeled(entry.file, entry.photo_px, outlines))
-    label = "object" if manifest.promise is None else manifest.promise.target.label
     return coco_json(photos, label, f"photographs of sheet {manifest.sheet_id}")
 
 
