@@ -177,6 +177,21 @@ def test_figures_of_the_detector_are_the_stored_ones():
     assert f"(100 % [68, 100]), {found[0]} and {found[1]} of 48 were recognized" in words(NOTEBOOK)
 
 
+def test_figures_of_imported_designs_are_the_stored_ones():
+    tables = stored("promises/imported.json")["tables"]
+    (held, rendered), rows = (tables[name]["rows"][-1][1] for name in ("held", "rendered")), tables["elsewhere"]["rows"]
+    row = next(line for line in words(NOTEBOOK).split("| ") if line.startswith("promised 76 and 60 %"))
+    for share in (held, rendered):
+        count = f"{round(share['value'] * share['n'])} of {share['n']}"
+        interval = f"({share['value']:.0%} [{100 * share['low']:.0f}, {100 * share['high']:.0f}])".replace("%", " %")
+        assert count in row and interval in row
+    promised = [f"{100 * row[3]:.0f}" for row in rows]
+    assert row.startswith("promised {} and {} %, {} and {} %, {} and {} %;".format(*promised))
+    assert f"in {sum(row[-1] for row in rows)} of {len(rows)}" in row
+    verdicts = [row[-1] for row in tables["promises"]["rows"]]
+    assert f"{verdicts.count('kept')} `kept`, {verdicts.count('cannot_tell')} `cannot_tell`" in row
+
+
 def test_figures_of_families_are_the_stored_ones():
     tables, page = stored("families/transfer.json")["tables"], NOTEBOOK.read_text(encoding="utf-8").splitlines()
     gains: dict[str, list[str]] = {}
