@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+import patchproof as pp
 from archives import LABELS, ConvNeXt, ResNet, ViT, exported, seeded
 from archives import save as save_archive
 from patchproof.classifier import load_classifier
+from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.onnx_file import read_onnx
 from patchproof.classifier.onnx_operators import OPERATORS
 from patchproof.classifier.program import load_program
 from patchproof.strict import Refused
+from test_zoo import judged
 
 pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')
 
@@ -101,6 +104,22 @@ def test_onnx_module_and_archive_of_the_same_weights_agree(tmp_path):
     for other_logits, other_gradient in others:
         torch.testing.assert_close(logits, other_logits, rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(gradient, other_gradient, rtol=1e-4, atol=1e-4)
+
+
+def test_a_file_goes_from_a_scene_to_a_verdict(tmp_path):
+    builtin = load_builtin()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        axes = {"input_names": ["x"], "dynamic_axes": {"x": {0: "n"}}}
+        torch.onnx.export(builtin.network, (torch.rand(2, 3, 96, 96),), str(tmp_path / "b.onnx"), dynamo=False, **axes)
+    (tmp_path / "b.json").write_text(json.dumps({"input_px": 96, "labels": list(builtin.labels)}))
+    run, report = judged(tmp_path, "file:b.onnx", "carton")
+    assert run.promise.models[0].name == "file:b.onnx"
+    again = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "again", models=["builtin"])
+    pairs = [(a.predictions, b.predictions) for a, b in zip(report.photos, again.photos, strict=True) if a.predictions]
+    assert pairs
+    for ours, theirs in pairs:
+        assert ours["file:b.onnx"].target_confidence == pytest.approx(theirs["builtin"].target_confidence, abs=1e-4)
 
 
 def test_a_name_a_card_and_a_hash_are_as_for_archives(tmp_path):

@@ -17,7 +17,6 @@ from archives import seeded
 from conftest import SCENE
 from patchproof.begin.new import _model
 from patchproof.classifier import load_classifier, zoo
-from patchproof.optimizer import run as run_module
 from patchproof.reprints.hung_sheet import Hanging
 from patchproof.strict import Refused
 
@@ -50,6 +49,21 @@ def saved(path, network, labels=LABELS, input_px=None) -> None:
 
 def normalized(photos, mean, std):
     return (photos - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
+
+
+def judged(folder, model, label) -> tuple[pp.Run, pp.Report]:
+    """The run and report of a small journey from a scene before a network to the verdict on three photographs."""
+    text = SCENE.replace('"builtin"', f'"{model}"').replace('label = "carton"', f'label = "{label}"')
+    (folder / "scene.toml").write_text(text.replace("steps = 3\nviews = 4", "steps = 2\nviews = 2"), encoding="utf-8")
+    run = pp.optimize(pp.load_scene(folder / "scene.toml"), folder / "run", promise_views=8)
+    assert np.ptp(run.design) > 0  # gradients came through all of it
+    pp.sheet(run, folder / "sheet.pdf")
+    how = Hanging(path_traced=find_spec("mitsuba") is not None)  # by a renderer that is not ours where it is installed
+    pp.reprint(folder / "sheet.pdf", run, 3, folder / "photos", how)
+    report = pp.verify(folder / "photos", folder / "sheet.json", folder / "report")
+    assert report.summary.photos == 3 and report.summary.verdict in ("kept", "broken", "cannot_tell")
+    print(f"{model}: {report.summary.measured} of 3 measured, {report.summary.verdict}")
+    return run, report
 
 
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -106,8 +120,7 @@ def test_timms_families_from_a_file(name, tmp_path):
         ("timm:vit_tiny_patch16_224", 224),
     ],
 )
-def test_each_family_goes_from_a_scene_to_a_verdict(name, px, torchvision, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_module, "PROMISE_VIEWS", 8)
+def test_each_family_goes_from_a_scene_to_a_verdict(name, px, torchvision, tmp_path):
     library, _, model = name.partition(":")
     if library == "torchvision":
         options = {"init_weights": False} if model == "googlenet" else {}  # else seconds, and a warning
@@ -117,16 +130,7 @@ def test_each_family_goes_from_a_scene_to_a_verdict(name, px, torchvision, tmp_p
             model, num_classes=12
         )
     saved(tmp_path / "w.safetensors", network, input_px=px)
-    text = SCENE.replace('"builtin"', f'"{name}@w.safetensors"').replace('label = "carton"', 'label = "label 3"')
-    (tmp_path / "scene.toml").write_text(text.replace("steps = 3\nviews = 4", "steps = 2\nviews = 2"), encoding="utf-8")
-    run = pp.optimize(pp.load_scene(tmp_path / "scene.toml"), tmp_path / "run")
-    assert np.ptp(run.design) > 0  # gradients came through all of it
-    pp.sheet(run, tmp_path / "sheet.pdf")
-    how = Hanging(path_traced=find_spec("mitsuba") is not None)  # by a renderer that is not ours where it is installed
-    pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos", how)
-    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report")
-    assert report.summary.photos == 3 and report.summary.verdict in ("kept", "broken", "cannot_tell")
-    print(f"{name}: {report.summary.measured} of 3 measured, {report.summary.verdict}")
+    run, _ = judged(tmp_path, f"{name}@w.safetensors", "label 3")
     assert run.promise.models[0].sha256 == hashlib.sha256((tmp_path / "w.safetensors").read_bytes()).hexdigest()
 
 
