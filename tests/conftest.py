@@ -29,6 +29,21 @@ def data() -> Path:
     return Path(folder)
 
 
+@pytest.fixture(scope="session")
+def torchvision():
+    """torchvision; one that was built for CUDA lacks, beside a CPU torch, operators that no classifier needs."""
+    library = torch.library.Library("torchvision", "FRAGMENT")
+    try:
+        import torchvision
+    except ImportError:
+        pytest.skip('needs torchvision, of the extra "models"')
+    except RuntimeError:
+        for name in ("nms", "qnms"):
+            library.define(f"{name}(Tensor boxes, Tensor scores, float least) -> Tensor")
+        import torchvision
+    yield torchvision
+
+
 SCENE = """
 [object]
 mesh = "primitive:carton"

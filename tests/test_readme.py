@@ -177,6 +177,16 @@ def test_figures_of_the_detector_are_the_stored_ones():
     assert f"(100 % [68, 100]), {found[0]} and {found[1]} of 48 were recognized" in words(NOTEBOOK)
 
 
+def test_gains_of_the_detector_s_other_seeds_are_the_stored_ones():
+    gains: dict[str, list[str]] = {}
+    for row in csv.DictReader((ROOT / ".readme/detector/seeds.csv").read_text("utf-8").splitlines()):
+        gains.setdefault(row["object"], []).append(f"{100 * float(row['gain']):+.0f}")
+        assert (float(row["gain"]) >= 0.15) == (row["object"] != "mailbox")
+        assert (float(row["low"]) > 0) == (row["object"] != "mailbox")
+    for name, (first, second, third) in gains.items():
+        assert f"{name} {first}, {second} and {third}" in words(NOTEBOOK)
+
+
 def test_figures_of_imported_designs_are_the_stored_ones():
     tables = stored("promises/imported.json")["tables"]
     (held, rendered), rows = (tables[name]["rows"][-1][1] for name in ("held", "rendered")), tables["elsewhere"]["rows"]

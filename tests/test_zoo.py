@@ -25,21 +25,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights
 LABELS = [f"label {number}" for number in range(12)]
 
 
-@pytest.fixture(scope="module")
-def torchvision():
-    """torchvision; one that was built for CUDA lacks, beside a CPU torch, operators that no classifier needs."""
-    library = torch.library.Library("torchvision", "FRAGMENT")
-    try:
-        import torchvision
-    except ImportError:
-        pytest.skip('needs torchvision, of the extra "models"')
-    except RuntimeError:
-        for name in ("nms", "qnms"):
-            library.define(f"{name}(Tensor boxes, Tensor scores, float least) -> Tensor")
-        import torchvision
-    yield torchvision
-
-
 def saved(path, network, labels=LABELS, input_px=None) -> None:
     """Weights, and a card where the labels are not the published ones."""
     save_file(seeded(network).state_dict(), path)

@@ -156,7 +156,7 @@ def _shapes(rate: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _chances(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int]) -> np.ndarray:
     """P×(n + 1): the chance of every count at P points. Sessions multiply as Fourier transforms."""
-    from scipy.fft import irfft, next_fast_len, rfft
+    from scipy.fft import next_fast_len
     from scipy.stats import betabinom
 
     alpha, beta = _shapes(rates, correlations)
@@ -164,8 +164,8 @@ def _chances(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int])
     length = next_fast_len(counts, real=True)  # of 151, a prime, a transform takes five times as long as of 160
     for n, often in Counter(photos).items():
         one = betabinom.pmf(np.arange(n + 1), n, alpha[:, None], beta[:, None])
-        transform = transform * rfft(one, length) ** often
-    return np.clip(irfft(transform, length)[:, :counts], 0, 1)
+        transform = transform * np.fft.rfft(one, length) ** often
+    return np.clip(np.fft.irfft(transform, length)[:, :counts], 0, 1)
 
 
 @lru_cache(maxsize=64)

@@ -118,7 +118,7 @@ def validated(model: type[Model], data: Any, where: str) -> Model:
 
 
 # a network's name up to the file in it, and that file
-NETWORK_FILE = re.compile(r"(file:|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
+NETWORK_FILE = re.compile(r"(file:|clip:[^@:]+@|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
 
 
 def expand(text: str, base: Path) -> str:
@@ -133,7 +133,7 @@ def expand(text: str, base: Path) -> str:
     if match := NETWORK_FILE.fullmatch(text):
         return f"{match[1]}{base / match[2]}"  # an absolute path stays as it is
     prefix, colon, _ = text.partition(":")
-    if (colon and (prefix in {"primitive", "torchvision", "timm", "module", "python"})) or text in (
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "clip", "module", "python"})) or text in (
         "builtin",
         "builtin-detector",
     ):

@@ -6,6 +6,7 @@
     file:NAME.onnx         an ONNX file with NAME.json beside it
     torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py),
     timm:NAME              or with @FILE.safetensors behind the name read from that file
+    clip:NAME@FILE         a network of pictures and text, whose labels are the prompts of a file (clip.py)
     module:package.factory the user's own code, which is imported and called (custom.py)
     python:...             a Classifier given in Python beside the scene (custom.classifier_of)
 
@@ -49,6 +50,10 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
         from patchproof.classifier.zoo import load_timm, load_torchvision
 
         classifier = load_torchvision(rest) if kind == "torchvision" else load_timm(rest)
+    elif kind == "clip":
+        from patchproof.classifier.clip import load_clip
+
+        classifier = load_clip(rest)
     elif kind == "module":
         from patchproof.classifier.custom import load_custom
 
@@ -56,7 +61,7 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
-        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, file:NAME.pt2, file:NAME.onnx"
+        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.pt2, file:NAME.onnx"
         do = f'write "file:{name}"' if name.endswith((".pt2", ".onnx")) else "write one of these"
         raise Refused(f"a model named {known} or module:package.factory", f'"{name}"', do)
     return _trusted(replace(classifier, name=name), device)

@@ -52,7 +52,7 @@ class Normalized(nn.Module):
 
 def load_torchvision(name: str) -> Classifier:
     """A torchvision classification or detection model with its default weights; a classifier's may be a file's."""
-    models = _library("torchvision").models
+    models = library("torchvision", "torchvision").models
     if name in models.list_models(module=models.detection):
         return _detector(models, name)
     name, own = _own_weights(name)
@@ -64,7 +64,7 @@ def load_torchvision(name: str) -> Classifier:
     view = weights.transforms()
     side_px, labels = (own and own.card and own.card[:2]) or (int(view.crop_size[0]), weights.meta["categories"])
     if own is None:
-        network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
+        network = downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights))
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of how it begins, before the file's weights are in it
@@ -82,7 +82,7 @@ def _detector(models: Any, name: str) -> Detector:
     """A torchvision detector with its default weights, before suppression."""
     weights = models.get_model_weights(name).DEFAULT
     raw = {f"box_{key}": value for key, value in _RAW.items()} if "rcnn" in name else _RAW
-    network = _downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights, **raw))
+    network = downloaded(f"torchvision:{name}", lambda: models.get_model(name, weights=weights, **raw))
     view = network.transform
     input_px = view.fixed_size[0] if getattr(view, "fixed_size", None) else view.min_size[0]
     return detector_of(network, int(input_px), weights.meta["categories"], f"torchvision:{name}")
@@ -90,14 +90,14 @@ def _detector(models: Any, name: str) -> Detector:
 
 def load_timm(name: str) -> Classifier:
     """A timm model with its pretrained weights or a file's, where its labels are known."""
-    timm = _library("timm")
+    timm = library("timm", "timm")
     name, own = _own_weights(name)
     if not (timm.is_model(name) or (name.startswith("hf-hub:") and own is None)):
         do = nearest_names(name, timm.list_models(), "choose one of timm.list_models()")
         raise Refused("a timm model", f'"{name}"', do)
     if own is None:
         with _offline_at_once():
-            network = _downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
+            network = downloaded(f"timm:{name}", lambda: timm.create_model(name, pretrained=True))
     else:
         network = timm.create_model(name, **({"num_classes": len(own.card[1])} if own.card else {}))
     view = timm.data.resolve_model_data_config(network)
@@ -123,7 +123,7 @@ def _timm_labels(timm: Any, network: Any, name: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Own:
+class Own:
     """Weights of a local file."""
 
     path: Path
@@ -132,15 +132,17 @@ class _Own:
     card: Card | None  # input size and labels, where they are not the published ones
 
 
-def _own_weights(name: str) -> tuple[str, _Own | None]:
+def _own_weights(name: str) -> tuple[str, Own | None]:
     """The model's name, and the weights of the file that is named with it."""
     name, at, file = name.partition("@") if not name.startswith("hf-hub:") else (name, "", "")  # there @ is a revision
-    if not at:
-        return name, None
+    return name, own_weights(Path(file)) if at else None
+
+
+def own_weights(path: Path) -> Own:
+    """Those of a file NAME.safetensors, with the card beside it where there is one."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    path = Path(file)
     if path.suffix != ".safetensors":
         do = 'save them with safetensors.torch.save_file(network.state_dict(), "NAME.safetensors")'
         raise Refused("weights in a file NAME.safetensors", f"{path}", do)
@@ -152,7 +154,7 @@ def _own_weights(name: str) -> tuple[str, _Own | None]:
             "weights in safetensors", f"{path} that cannot be read ({first_line(error)})", "save it again"
         ) from error
     card = path.with_suffix(".json")
-    return name, _Own(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
+    return Own(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
 
 
 # heads that only training uses, and a counter of its steps
@@ -160,20 +162,24 @@ _UNUSED = re.compile(r"(aux\d?|AuxLogits)\..*|.*\.num_batches_tracked")
 
 
 def _with(
-    own: _Own | None, network: Any, mean: Sequence[float], std: Sequence[float], side_px: int, labels: Any, name: str
+    own: Own | None, network: Any, mean: Sequence[float], std: Sequence[float], side_px: int, labels: Any, name: str
 ) -> Classifier:
     """The network as a Classifier, the file's weights in it where there is one."""
     classifier = classifier_of(Normalized(network, mean, std), side_px, labels, name)
     if own is None:
         return classifier
+    do = "check the name, and write the labels of a network with others into NAME.json beside it"
+    put_into(network, own, f"{name} for {len(labels)} labels", do)
+    return replace(classifier, sha256=own.sha256)
+
+
+def put_into(network: Any, own: Own, name: str, do: str) -> None:
+    """The file's weights into a network of that name; refused, with what to `do`, where they are another's."""
     wanted = {key: tensor.shape for key, tensor in network.state_dict().items() if not _UNUSED.fullmatch(key)}
     given = {key: tensor.shape for key, tensor in own.tensors.items() if not _UNUSED.fullmatch(key)}
     if wrong := sorted(wanted.items() ^ given.items()):
-        got = f"{own.path} with another {wrong[0][0]}"
-        do = "check the name, and write the labels of a network with others into NAME.json beside it"
-        raise Refused(f"weights of {name} for {len(labels)} labels", got, do)
+        raise Refused(f"weights of {name}", f"{own.path} with another {wrong[0][0]}", do)
     network.load_state_dict({key: own.tensors[key] for key in wanted}, strict=False)
-    return replace(classifier, sha256=own.sha256)
 
 
 @contextmanager
@@ -192,7 +198,8 @@ def _offline_at_once() -> Iterator[None]:
         constants.HF_HUB_OFFLINE = before
 
 
-def _downloaded(name: str, load: Callable[[], Any]) -> Any:
+def downloaded(name: str, load: Callable[[], Any]) -> Any:
+    """What `load` gives; refused in a sentence where it fails."""
     try:
         return load()
     except Exception as error:  # each library raises its own for no network, no weights and no space
@@ -200,7 +207,8 @@ def _downloaded(name: str, load: Callable[[], Any]) -> Any:
         raise Refused(f"the published weights of {name}", got, "check the name and the way to the internet") from error
 
 
-def _library(name: str):
+def library(name: str, kind: str, extra: str = "models") -> Any:
+    """The library that models named `kind`:NAME need, of that extra."""
     try:
         return importlib.import_module(name)
     except Exception as error:  # a build for another torch raises RuntimeError, not ImportError
@@ -209,5 +217,7 @@ def _library(name: str):
         # a CPU torch with the registry's torchvision, built for CUDA: "torchvision::nms does not exist"
         do = "remove torchvision and install it from where torch is from: PyTorch's CPU index has CPU builds of both"
         if missing:
-            do = 'run pip install "patchproof[models]", beside a CPU torch after torchvision from PyTorch\'s CPU index'
-        raise Refused(f"the library {name} for {name}:NAME", got, do) from error
+            do = (
+                f'run pip install "patchproof[{extra}]", beside a CPU torch after torchvision from PyTorch\'s CPU index'
+            )
+        raise Refused(f"the library {name} for {kind}:NAME", got, do) from error
