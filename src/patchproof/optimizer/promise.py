@@ -33,7 +33,7 @@ from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim,
 
 # Many short sessions: how much they differ is known from their number, not from their length.
 PROMISE_VIEWS, PER_SESSION = 400, 4
-CONTROL_VIEWS = 2  # of each session: differences are paired, and need fewer
+CONTROL_VIEWS = 2  # of each session: of one, differences would be known to ± 6 to 10 points in place of 5 to 8
 CONTROLS = ("bare", "mean", "gray", "noise")
 
 

@@ -55,21 +55,20 @@ def responses(
 
     @torch.no_grad()
     def answers(rows: np.ndarray) -> dict[Thing, Answers]:
-        own: dict[Thing, list[Answers]] = {name: [] for name in shown}
-        both, alone = rows[compared[rows]], rows[~compared[rows]]
-        for part, names in ((both, list(shown)), (alone, [first])):
-            if len(part):
-                drawn = conditions[part]
-                views, boxes = problem.see(laid_out, drawn, side_px or problem.figure_px), problem.boxes(drawn)
-                for name in names:
-                    own[name].append(ask(problem, expose(views, shown[name]), boxes))
-        whole = {name: in_a_row(parts) for name, parts in own.items() if parts}
-        whole[first] = whole[first].at(np.argsort(np.concatenate([both, alone])))
-        return whole
+        drawn, names = conditions[rows], list(shown) if compared[rows[0]] else [first]
+        views, boxes = problem.see(laid_out, drawn, side_px or problem.figure_px), problem.boxes(drawn)
+        return {name: ask(problem, expose(views, shown[name]), boxes) for name in names}
 
-    parts = [np.arange(at, min(at + AT_A_TIME, n)) for at in range(0, n, AT_A_TIME)]
+    order, both = np.argsort(~compared, kind="stable"), int(compared.sum())
+    parts = [
+        order[at : min(at + AT_A_TIME, end)]
+        for begin, end in ((0, both), (both, n))
+        for at in range(begin, end, AT_A_TIME)
+    ]
     with sharing(answers, min(problem.jobs, len(parts))) as (workers, share):
-        return joined(workers.map(share, parts, lambda done, _: on_views(min(done * AT_A_TIME, n), n)))
+        whole = joined(workers.map(share, parts, lambda done, _: on_views(min(done * AT_A_TIME, n), n)))
+    whole[first] = whole[first].at(np.argsort(order))
+    return whole
 
 
 def in_parts(conditions: Conditions) -> Iterator[Conditions]:
