@@ -1,9 +1,11 @@
-"""Types are checked as they are written: no error in the package, and every mistake of a user is seen."""
+"""What a user's editor knows of the package: no error in a script that is right, and every mistake in a wrong one.
+
+That the package has no type error itself is checked by `basedpyright`, as CONTRIBUTING and CI have it.
+"""
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from pathlib import Path
 
@@ -32,32 +34,21 @@ rate: str = pp.optimize(scene, "run").promise.rate
 
 
 @pytest.fixture(scope="module")
-def errors(tmp_path_factory) -> dict[str, list[str]]:
-    """The checker's errors by file, of the package and of two users' scripts, in one run."""
+def errors(tmp_path_factory) -> dict[str, list[int]]:
+    """The lines that the checker calls wrong in two users' scripts, in one run."""
     folder = tmp_path_factory.mktemp("types")
     for name, text in (("right.py", RIGHT), ("wrong.py", WRONG)):
         (folder / name).write_text(text)
-    settings = {
-        "include": [str(ROOT / "src"), str(folder)],
-        "extraPaths": [str(ROOT / "src")],
-        "typeCheckingMode": "standard",
-    }
+    settings = {"include": [str(folder)], "extraPaths": [str(ROOT / "src")], "typeCheckingMode": "standard"}
     (folder / "pyrightconfig.json").write_text(json.dumps(settings))
     command = ["basedpyright", "--outputjson", "-p", str(folder)]
-    young = os.environ | {"NODE_OPTIONS": "--max-semi-space-size=64"}  # MB: a tenth less time in its garbage collector
-    checked = json.loads(subprocess.run(command, capture_output=True, text=True, check=False, env=young).stdout)
-    assert checked["summary"]["filesAnalyzed"] > 100
-    found: dict[str, list[str]] = {"right.py": [], "wrong.py": [], "package": []}
+    checked = json.loads(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
+    assert checked["summary"]["filesAnalyzed"] == 2
+    found: dict[str, list[int]] = {"right.py": [], "wrong.py": []}
     for error in checked["generalDiagnostics"]:
         if error["severity"] == "error":
-            path = Path(error["file"])
-            where = path.name if path.parent == folder else "package"
-            found[where].append(f"{path.name}:{error['range']['start']['line'] + 1}: {error['message']}")
+            found[Path(error["file"]).name].append(error["range"]["start"]["line"] + 1)
     return found
-
-
-def test_the_package_has_no_type_error(errors):
-    assert errors["package"] == []
 
 
 def test_a_users_script_is_understood(errors):
@@ -65,4 +56,4 @@ def test_a_users_script_is_understood(errors):
 
 
 def test_three_mistakes_are_three_errors(errors):
-    assert [error.split(":")[1] for error in errors["wrong.py"]] == ["4", "5", "6"]
+    assert errors["wrong.py"] == [4, 5, 6]

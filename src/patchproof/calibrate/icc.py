@@ -86,7 +86,8 @@ def _chain(data: bytes, file_name: str, perceptual: bool) -> tuple[Callable[[np.
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
         tags: Any = profile.profile
         kind, colors = tags.device_class.strip(), tags.xcolor_space.strip()
-        _description(tags), _paper_white(tags)  # damage shows where a tag is read
+        _description(tags)  # damage shows where a tag is read
+        _paper_white(tags)
     except (OSError, ImageCms.PyCMSError, ValueError, TypeError, AttributeError) as error:
         got = f"{file_name} ({' '.join(str(error).split())[:100]})"
         raise Refused("an ICC profile that can be read", got, "use another one") from error
