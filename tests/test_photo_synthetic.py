@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.color import LIGHT_OF_CODE, srgb_from_linear
 from patchproof.geometry import apply_homography, intrinsics, look_at, plane_homography
 from patchproof.sheets.content import png_base64
 from patchproof.sheets.manifest import Manifest, design_sha256
@@ -90,8 +90,8 @@ def page_raster(manifest: Manifest, only_piece: bool) -> np.ndarray:
     """The page as float32 linear light at 10 px/mm; `only_piece` leaves the rest of the page white paper out (gray)."""
     page = np.ones((round(PAGE_MM[1] * PX_PER_MM), round(PAGE_MM[0] * PX_PER_MM), 3), np.float32)
     printed = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
-    design = cv2.resize(manifest.design.pixels(), (1400, 1400), interpolation=cv2.INTER_NEAREST)
-    _paste(page, linear_from_srgb(design / 255.0), *DESIGN_MM[:2])
+    design = LIGHT_OF_CODE.astype(np.float32)[manifest.design.pixels()]
+    _paste(page, cv2.resize(design, (1400, 1400), interpolation=cv2.INTER_NEAREST), *DESIGN_MM[:2])
     for marker in manifest.markers:
         (x, y), side = marker.corners_mm[0], round(MARKER_MM * PX_PER_MM)
         quiet = round((MARKER_MM + 2 * MODULE_MM) * PX_PER_MM)
@@ -135,7 +135,8 @@ def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, li
     linear = cv2.resize(fine_linear, size_px, interpolation=cv2.INTER_AREA) * light
     if blur_px > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), blur_px)
-    linear = linear + np.random.default_rng(seed).normal(0, 1, linear.shape) * noise
+    if noise:
+        linear = linear + np.random.default_rng(seed).normal(0, 1, linear.shape) * noise
     srgb = np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
     if jpeg is None:
         return srgb

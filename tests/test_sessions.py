@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import betabinom
 
 from patchproof.claims import wilson
-from patchproof.sessions import TAIL, difference_in_sessions, evenly, in_sessions, spread_of
+from patchproof.sessions import TAIL, Spread, difference_in_sessions, evenly, in_sessions, spread_of
 
 
 def alone(recognized: int, n: int):
@@ -29,6 +29,15 @@ def test_photographs_on_their_own_are_the_beta_binomial_of_jeffreys_prior(recogn
     assert spread.counts([20]) == tuple(expected.ppf([TAIL, 1 - TAIL]))
     assert spread.correlation[0] < 1e-6 and spread.rate[0] <= recognized / 400 <= spread.rate[1]
     np.testing.assert_allclose(spread.rate, wilson(recognized, 400), atol=0.01)
+
+
+@pytest.mark.parametrize("photos", [1, 4, 100, 1000])
+@pytest.mark.parametrize(("rate", "correlation"), [(0.8, 0.1), (0.5, 0.95), (1e-5, 0.9), (1 - 1e-5, 1e-3), (0.3, 1e-7)])
+def test_chances_of_a_session_are_the_librarys(rate, correlation, photos):
+    strength = 1 / correlation - 1
+    expected = betabinom.pmf(np.arange(photos + 1), photos, rate * strength, (1 - rate) * strength)
+    spread = Spread(np.array([rate]), np.array([correlation]), np.ones(1))
+    np.testing.assert_allclose(spread.chances([photos]), expected, atol=1e-8)
 
 
 def test_one_session_allows_for_more_than_the_same_photographs_in_many():

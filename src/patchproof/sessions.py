@@ -157,15 +157,24 @@ def _shapes(rate: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.n
 def _chances(rates: np.ndarray, correlations: np.ndarray, photos: Sequence[int]) -> np.ndarray:
     """P×(n + 1): the chance of every count at P points. Sessions multiply as Fourier transforms."""
     from scipy.fft import next_fast_len
-    from scipy.stats import betabinom
 
     alpha, beta = _shapes(rates, correlations)
     counts, transform = sum(photos) + 1, np.ones(1)
     length = next_fast_len(counts, real=True)  # of 151, a prime, a transform takes five times as long as of 160
     for n, often in Counter(photos).items():
-        one = betabinom.pmf(np.arange(n + 1), n, alpha[:, None], beta[:, None])
-        transform = transform * np.fft.rfft(one, length) ** often
+        transform = transform * np.fft.rfft(_beta_binomial(n, alpha, beta), length) ** often
     return np.clip(np.fft.irfft(transform, length)[:, :counts], 0, 1)
+
+
+def _beta_binomial(n: int, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """P×(n + 1): the chances of 0 to n, from the ratio of each to the one before; SciPy's take 17 times as long at
+    n = 100.
+    """
+    k, log = np.arange(n), np.zeros((len(alpha), n + 1))
+    ratios = (n - k) / (k + 1) * (alpha[:, None] + k) / (beta[:, None] + n - 1 - k)
+    np.cumsum(np.log(ratios), axis=1, out=log[:, 1:])
+    chances = np.exp(log - log.max(1, keepdims=True))
+    return chances / chances.sum(1, keepdims=True)
 
 
 @lru_cache(maxsize=64)
