@@ -106,14 +106,15 @@ def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tens
 
 def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:
     """Gaussian blur with one sigma per picture; nothing where all are too small to be seen."""
-    from kornia.filters import gaussian_blur2d
+    from kornia.filters import get_gaussian_kernel1d
 
     largest = float(sigma_px.max())
     if largest < SMALLEST_BLUR_PX:
         return linear
     taps = 2 * int(3 * largest + 0.5) + 1
-    sigma = sigma_px.clamp_min(0.05)[:, None].expand(-1, 2)  # 0.05 px leaves a picture as it was
-    return gaussian_blur2d(linear, (taps, taps), sigma, border_type="replicate")
+    kernels = get_gaussian_kernel1d(taps, sigma_px.clamp_min(0.05)[:, None])  # 0.05 px leaves a picture as it was
+    kernels = torch.where(kernels > 1e-30, kernels, 0.0)  # numbers near the smallest took seven times as long
+    return _filtered(linear, kernels[:, None], kernels[:, :, None])
 
 
 def moved(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
@@ -121,11 +122,24 @@ def moved(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
 
     Nothing where all are too short to be seen; length 0 leaves a picture as it was.
     """
-    from kornia.filters import filter2d
-
     if float(length_px.max()) < SMALLEST_MOTION_PX:
         return linear
-    return filter2d(linear, _streaks(length_px, torch.as_tensor(angle_deg).to(linear)), border_type="replicate")
+    return _filtered(linear, _streaks(length_px, torch.as_tensor(angle_deg).to(linear)))
+
+
+def _filtered(pictures: Tensor, *kernels: Tensor) -> Tensor:
+    """Pictures N×C×H×W correlated with kernels N×h×w of odd sides, one after the other, edges repeated; as kornia's
+    `filter2d` has it to the bit. In this order of memory a photograph of 1600 × 1200 px takes a seventh of its time,
+    gradients a fifth.
+    """
+    count, channels, *_ = pictures.shape
+    below, right = (sum(kernel.shape[axis] // 2 for kernel in kernels) for axis in (1, 2))
+    padded = torch.nn.functional.pad(pictures.contiguous(), (right, right, below, below), mode="replicate")
+    filtered = padded.flatten(0, 1)[None].contiguous(memory_format=torch.channels_last)
+    for kernel in kernels:
+        weights = kernel.repeat_interleave(channels, 0)[:, None]
+        filtered = torch.nn.functional.conv2d(filtered, weights, groups=count * channels)
+    return filtered.reshape(pictures.shape)
 
 
 def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:

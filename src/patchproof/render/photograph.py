@@ -28,7 +28,7 @@ from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
-from patchproof.render.texture import Footprint, look_up, on_copies, texel_table
+from patchproof.render.texture import Footprint, look_up, on_copies
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
 
@@ -109,11 +109,10 @@ def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: 
 def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     """The light P×3 that the piece's pixels send to the camera."""
     drawn, piece = views.conditions.print, views.on_piece
-    footprints, srgb = piece.texels, [picture.srgb]
+    footprints, prints = piece.texels, [picture]
     if drawn.misregistration_mm.any():
-        footprints, srgb = _misregistered(views, picture)
-    table = torch.cat([texel_table([s if views.reduced else linear_from_srgb(s)], wrap=False) for s in srgb])
-    reflectance = look_up(footprints, table)
+        footprints, prints = _misregistered(views, picture)
+    reflectance = look_up(footprints, torch.cat([p.codes if views.reduced else p.light for p in prints]))
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)
     change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
@@ -126,12 +125,12 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     return light * (1 - mirrored.index_select(0, piece.view))[:, None] + views.piece_gloss
 
 
-def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[Tensor]]:
+def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[PiecePicture]]:
     """Each view's own print of the picture, and footprints on all of them."""
     (height, width, _), (width_mm, height_mm) = picture.srgb.shape, views.stage.piece_surface.size_mm
     shifts = torch.as_tensor(views.conditions.print.misregistration_mm).to(picture.srgb)
     shifts = shifts * shifts.new_tensor([width / width_mm, height / height_mm])
-    prints = [misregistered(picture.srgb, shift) for shift in shifts]
+    prints = [PiecePicture(misregistered(picture.srgb, shift)) for shift in shifts]
     texels = sum((max(width >> k, 1) + 1) * (max(height >> k, 1) + 1) for k in range(max(width, height).bit_length()))
     return on_copies(views.on_piece.texels, views.on_piece.view * texels), prints
 

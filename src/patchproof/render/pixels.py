@@ -8,13 +8,15 @@ extent, along each of the piece's sides, that lies within the cut line.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from patchproof.color import linear_from_srgb
 from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface
-from patchproof.render.texture import Footprint, footprint, layout
+from patchproof.render.texture import Footprint, footprint, layout, texel_table
 
 # Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
 # optimized designs 20 to 200 px wide, four 30. Four leave an object's own texture within 0.003 of the confidence that a
@@ -28,6 +30,16 @@ class PiecePicture:
     """The whole piece as it looks on paper, H×W×3 sRGB up to the cut line."""
 
     srgb: Tensor
+
+    @cached_property
+    def codes(self) -> Tensor:
+        """Its texels T×3 of all levels, averaged as code values: what a reduced photograph shows."""
+        return texel_table([self.srgb], wrap=False)
+
+    @cached_property
+    def light(self) -> Tensor:
+        """The same averaged as light, linear: a fifth of a photograph's time, so once for all that show it."""
+        return texel_table([linear_from_srgb(self.srgb)], wrap=False)
 
 
 @dataclass(frozen=True)
