@@ -187,6 +187,20 @@ def test_gains_of_the_detector_s_other_seeds_are_the_stored_ones():
         assert f"{name} {first}, {second} and {third}" in words(NOTEBOOK)
 
 
+def test_figures_of_promises_made_again_are_the_stored_ones():
+    tables = stored("promises/again.json")["tables"]
+    _, held, width, _, formerly, _, bias = tables["held"]["rows"][-1]
+    low, high = (f"{100 * held[end]:.0f}" for end in ("low", "high"))
+    sessions = f"{round(held['value'] * held['n'])} of {held['n']} sessions lay in their intervals"
+    said = f"{sessions} ({held['value']:.0%} [{low}, {high}]; {round(formerly['value'] * formerly['n'])} of 30 by the"
+    text = words(NOTEBOOK)
+    assert said.replace("%", " %") in text and f"are {width:.0%}".replace("%", " %") in text
+    value, low, high = (100 * bias[end] for end in ("value", "low", "high"))
+    assert f"sessions showed {-value:.1f} points less than was promised [{low:.1f}, {high:.1f}]" in text
+    within = [row[-1] for row in tables["elsewhere"]["rows"]]
+    assert f"lay within the promise's in {sum(within)} of {len(within)}" in text
+
+
 def test_figures_of_imported_designs_are_the_stored_ones():
     tables = stored("promises/imported.json")["tables"]
     (held, rendered), rows = (tables[name]["rows"][-1][1] for name in ("held", "rendered")), tables["elsewhere"]["rows"]
