@@ -159,12 +159,12 @@ def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tu
 
 
 # One coordinate at a time: NumPy's own take four times as long for N vectors of three.
-Three = Sequence[np.ndarray] | np.ndarray
+_Three = Sequence[np.ndarray] | np.ndarray
 
 
-def _cross(a: Three, b: Three) -> Three:
+def _cross(a: _Three, b: _Three) -> _Three:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _dot(a: Three, b: Three) -> np.ndarray:
+def _dot(a: _Three, b: _Three) -> np.ndarray:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
