@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from kornia.filters import filter2d, gaussian_blur2d
 
 from patchproof.channel.camera import (
+    _streaks,
     blurred,
     compressed,
     develop,
@@ -196,3 +198,18 @@ def test_develop_matches_finite_differences():
     drawn = sensor(1, exposure_ev=[-0.3, -0.3], white_balance=0.05, blur_px=[2, 2], **terms)
     linear = (torch.rand(1, 3, 6, 6, dtype=torch.float64) * 0.8 + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: develop(x, drawn, 0.4), linear, atol=1e-6)
+
+
+@pytest.mark.parametrize("colors_side_by_side", [False, True])
+@pytest.mark.parametrize("shape", [(1, 3, 60, 81), (4, 3, 40, 40), (3, 1, 33, 20)])
+def test_blur_and_motion_are_kornias_to_the_bit(shape, colors_side_by_side):
+    photos = torch.rand(shape)
+    if colors_side_by_side:
+        photos = photos.contiguous(memory_format=torch.channels_last)
+    sigmas, lengths, angles = (torch.linspace(*ends, len(photos)) for ends in ((0.02, 2), (1.5, 6), (0, 70)))
+    size, sigmas_yx = 2 * int(3 * float(sigmas.max()) + 0.5) + 1, sigmas.clamp_min(0.05)[:, None].expand(-1, 2)
+    theirs = gaussian_blur2d(photos, (size, size), sigmas_yx, border_type="replicate")
+    assert torch.equal(blurred(photos, sigmas), theirs)
+    assert torch.equal(
+        moved(photos, lengths, angles), filter2d(photos, _streaks(lengths, angles), border_type="replicate")
+    )

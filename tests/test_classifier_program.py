@@ -396,3 +396,36 @@ def test_activations_write_over_what_nobody_else_has(tmp_path, honest):
     torch.testing.assert_close(*answers)
     torch.testing.assert_close(*(torch.autograd.grad(answer[:, 1].sum(), photos)[0] for answer in answers))
     assert torch.equal(photos, before)
+
+
+class Padded(torch.nn.Module):
+    """Zeros around, in every way that a convolution's own padding can or cannot say."""
+
+    def __init__(self):
+        super().__init__()
+        self.convs = torch.nn.ModuleList(torch.nn.Conv2d(3, 3, 3, padding=p) for p in (0, 0, (1, 0), 0, 0, 0, 0))
+
+    def forward(self, x):
+        pad, (even, uneven, own, ones, mirrored, shared, cut) = torch.nn.functional.pad, self.convs
+        both = pad(x, (1, 1, 1, 1))
+        found = (
+            even(pad(x, (1, 1, 2, 2))), own(pad(x, (3, 3, 1, 1), value=0.0)),  # become their own
+            uneven(pad(x, (0, 1, 0, 1))), ones(pad(x, (1, 1, 1, 1), value=1.0)), cut(pad(x, (-1, -1, 1, 1))),
+            mirrored(pad(x, (1, 1, 1, 1), mode="reflect")), shared(both), both,
+        )  # fmt: skip
+        return torch.stack([values.square().mean((2, 3)) for values in found]).sum(0)
+
+
+@pytest.mark.parametrize("decomposed", [False, True])
+def test_zeros_around_a_picture_are_a_convolutions_own_where_it_can_say_so(decomposed, tmp_path, honest):
+    module, photos = seeded(Padded()), torch.randn(2, 3, 16, 16)
+    form = exported(module)
+    if decomposed:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch warns of itself
+            form = form.run_decompositions()
+    network = load_program(save(tmp_path, form)).network.network
+    kept = [str(step.compute) for step in network.steps if "pad" in str(step.compute)]
+    assert len([name for name in kept if "reflection" not in name]) == 5 - decomposed, kept
+    for ours, theirs in zip(answered(network, photos), answered(module, photos), strict=True):
+        torch.testing.assert_close(ours, theirs)

@@ -11,12 +11,30 @@ and 8.1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 UP = (0.0, 1.0, 0.0)
 
 MM_PER_INCH = 25.4
+
+Numbers = TypeVar("Numbers", "np.ndarray", "Tensor")
+
+
+def cross(a: Sequence[Numbers], b: Sequence[Numbers]) -> list[Numbers]:
+    """Cross products of N vectors each, one coordinate at a time: NumPy's own takes four times as long."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def dot(a: Sequence[Numbers], b: Sequence[Numbers]) -> Numbers:
+    """Inner products, likewise."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def orbit(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, forward: ArrayLike, up: ArrayLike = UP) -> np.ndarray:

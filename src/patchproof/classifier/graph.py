@@ -71,6 +71,38 @@ def written_over(steps: list[Step]) -> list[Step]:
     ]
 
 
+def padded_within(steps: list[Step]) -> list[Step]:
+    """The same steps, where zeros on all sides that only a convolution reads are its own padding: with 13 copies less
+    MobileNetV2's answers take 0.92 and its gradients 0.93 of the time, to the bit (as above).
+    """
+    kept: list[Step] = []
+    for step in steps:
+        if kept and (padded := _with_padding(step, kept[-1])):
+            kept[-1] = padded
+        else:
+            kept.append(step)
+    return kept
+
+
+def _with_padding(step: Step, pad: Step) -> Step | None:
+    """`step` in place of itself and of the step before it; None where they are no convolution of what a pad made."""
+    if pad.compute not in _PADS or step.compute not in _CONVOLUTIONS or pad.keywords or step.keywords:
+        return None
+    (made,), (photos, sides, *filled) = pad.results, pad.arguments
+    arguments = [*step.arguments, *_CONVOLUTION_DEFAULTS[len(step.arguments) - 2 :]]
+    here, weight, bias, stride, own, *others = arguments
+    zeros = all(item in ("constant", None, 0) for item in filled)
+    even = all(type(side) is int and side >= 0 for side in [*sides, *own]) and sides[::2] == sides[1::2]
+    alone = here == Value(made) and made in step.spent and [*_numbers(arguments)].count(made) == 1
+    if not (zeros and even and alone and (len(sides), len(own)) == (4, 2)) or (
+        step.compute is _ATEN.convolution.default and others[1]
+    ):
+        return None
+    own = [own[0] + sides[2], own[1] + sides[0]]
+    spent = [*pad.spent, *(number for number in step.spent if number != made)]
+    return replace(step, arguments=[photos, weight, bias, stride, own, *others], spent=spent)
+
+
 def _numbers(arguments: Iterable[Any]) -> Iterator[int]:
     for argument in arguments:
         if type(argument) is Value:
@@ -86,7 +118,7 @@ class Program(torch.nn.Module):
         super().__init__()
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
-        self.steps, self.output, self.sizes = written_over(steps), output, sizes
+        self.steps, self.output, self.sizes = written_over(padded_within(steps)), output, sizes
         self.weighed: set[torch.Size] = set()
 
     def forward(self, photos: Tensor) -> Tensor:
@@ -157,6 +189,9 @@ _ATEN = torch.ops.aten
 # their gradients need what they made, not what they got; and those who make it do not need it
 _IN_PLACE = {getattr(_ATEN, name).default: getattr(_ATEN, f"{name}_").default for name in ("relu", "relu6", "hardtanh")}
 _MADE_ANEW = {_ATEN.conv2d.default, _ATEN.conv2d.padding, _ATEN.batch_norm.default, _ATEN.add.Tensor}
+_PADS = (_ATEN.pad.default, _ATEN.constant_pad_nd.default)
+_CONVOLUTIONS = (_ATEN.conv2d.default, _ATEN.convolution.default)
+_CONVOLUTION_DEFAULTS = [None, [1, 1], [0, 0]]  # bias, stride, padding
 _PLAIN = (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div), (_ATEN.relu, _ATEN.hardtanh, _ATEN.hardswish)
 _WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
     **{operator.Tensor: _like_first(operator.Tensor) for operator in _PLAIN[0]},

@@ -8,11 +8,11 @@ curved: each triangle visits the net points of its box on the chart, and each vi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from patchproof.geometry import cross, dot
 from patchproof.strict import Refused
 
 _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
@@ -146,25 +146,13 @@ def _cast(points: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tu
     """How far along its direction each line meets its triangle, and whether it does; edges belong to both sides,
     with 1e-6 of a triangle to spare, which closes the cracks of float32 files.
     """
-    a, edge_b, edge_c = corners[:, 0].T, (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-    along, away = directions.T, points.T - a
-    p = _cross(along, edge_c)
-    det = _dot(edge_b, p)
+    a, edges = corners[:, 0], corners[:, 1:] - corners[:, :1]
+    along, away, edge_b, edge_c = ([*vectors.T] for vectors in (directions, points - a, edges[:, 0], edges[:, 1]))
+    p = cross(along, edge_c)
+    det = dot(edge_b, p)
     # a triangle seen edge-on covers nothing; its neighbors have its edges
-    flat = np.abs(det) <= 1e-12 * np.sqrt(_dot(edge_b, edge_b) * _dot(edge_c, edge_c))
+    flat = np.abs(det) <= 1e-12 * np.sqrt(dot(edge_b, edge_b) * dot(edge_c, edge_c))
     det = np.where(flat, 1.0, det)
-    q = _cross(away, edge_b)
-    b, c = _dot(away, p) / det, _dot(along, q) / det
-    return _dot(edge_c, q) / det, ~flat & (b >= -1e-6) & (c >= -1e-6) & (b + c <= 1 + 1e-6)
-
-
-# One coordinate at a time: NumPy's own take four times as long for N vectors of three.
-_Three = Sequence[np.ndarray] | np.ndarray
-
-
-def _cross(a: _Three, b: _Three) -> _Three:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _dot(a: _Three, b: _Three) -> np.ndarray:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    q = cross(away, edge_b)
+    b, c = dot(away, p) / det, dot(along, q) / det
+    return dot(edge_c, q) / det, ~flat & (b >= -1e-6) & (c >= -1e-6) & (b + c <= 1 + 1e-6)

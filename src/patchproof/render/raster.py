@@ -22,6 +22,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from patchproof.geometry import cross, dot
 from patchproof.render.clip import GUARD_PX, clipped
 from patchproof.render.fragments import Cameras, Fragments, columns
 from patchproof.strict import Refused
@@ -158,9 +159,9 @@ def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]
     say nothing. It is drawn flat at its mean 1/z.
     """
     a, b, c = corners
-    total = _cross([q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)])
-    volume = a[0] * total[0] + a[1] * total[1] + a[2] * total[2]
-    planes = [[e / volume for e in plane] for plane in (_cross(c, a), _cross(a, b), total)]
+    total = cross([q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)])
+    volume = dot(a, total)
+    planes = [[e / volume for e in plane] for plane in (cross(c, a), cross(a, b), total)]
     inverse = [1 / corner[2].clamp_min(near) for corner in corners]
     steepness = planes[2][0].abs() + planes[2][1].abs()
     edge_on = ~(steepness < 25 * _extent(*inverse)[1])  # true also where the volume is 0
@@ -171,10 +172,6 @@ def _planes(corners: list[list[Tensor]], near: float) -> tuple[list[list[Tensor]
             [torch.where(edge_on, f, e) for f, e in zip(*pair, strict=True)] for pair in zip(flat, planes, strict=True)
         ]
     return planes, volume
-
-
-def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def _trapezoids(corners: list[Tensor], height: int) -> list[Tensor]:
