@@ -202,6 +202,21 @@ def test_figures_of_promises_made_again_are_the_stored_ones():
     assert f"lay within the promise's in {sum(within)} of {len(within)}" in text
 
 
+def test_our_photographs_differ_from_the_path_tracers_as_it_is_said():
+    said = []
+    rows = list(csv.DictReader((ROOT / ".readme/promises/traced.csv").read_text("utf-8").splitlines()))
+    for shown, form in (("design", "rate {:.1f} points [{:.1f}, {:.1f}]"), ("bare", "{:.1f} [{:.1f}, {:.1f}]")):
+        ours = [row for row in rows if row["shown"] == shown]
+        rate, sure = (
+            student_mean(np.array([float(row[f"{kind}_off"]) for row in ours])) for kind in ("rate", "confidence")
+        )
+        said.append(form.format(*(100 * end for end in (rate.value, rate.low, rate.high))))
+        said.append(f"{sure.value:.3f} [{sure.low:.3f}, {sure.high:.3f}]")
+        for row in ours:
+            assert abs(float(row["confidence_off"])) < 0.03
+    assert "the design's {} and confidence {}, the bare object's {} and {}".format(*said) in words(NOTEBOOK)
+
+
 def test_figures_of_imported_designs_are_the_stored_ones():
     tables = stored("promises/imported.json")["tables"]
     (held, rendered), rows = (tables[name]["rows"][-1][1] for name in ("held", "rendered")), tables["elsewhere"]["rows"]
