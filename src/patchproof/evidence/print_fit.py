@@ -44,10 +44,10 @@ def fit_print(
     singular = np.linalg.svd(np.column_stack([expected, np.ones(len(expected))]), compute_uv=False)
     if singular[-1] < _LEAST_SPREAD * singular[0]:
         return None
-    each = np.moveaxis(_terms(promised), -1, 0)  # OpenCV averages four channels at most
-    terms = np.stack([cv2.resize(term, cells_px, interpolation=cv2.INTER_AREA)[inner] for term in each], -1)
+    # OpenCV averages four channels at most
+    terms = [cv2.resize(term, cells_px, interpolation=cv2.INTER_AREA)[inner] for term in _terms(promised)]
     ends = np.stack([np.ones(3), ink])
-    rows = np.concatenate([terms, _terms(ends)])
+    rows = np.concatenate([np.stack(terms, -1), _terms(ends).T])
     added = np.concatenate([pooled[inner] - expected, [np.zeros(3), ink_in_photos - ink]])
     # errors count as the eye sees them; paper and ink, which all photographs show, as much as all cells
     weight = np.concatenate([1 / (expected.mean(1) + 0.05) ** 0.6, np.full(2, np.sqrt(len(expected)))])[:, None]
@@ -56,15 +56,17 @@ def fit_print(
     coefficients = np.linalg.solve(square + ridge, (rows * weight).T @ (added * weight))
 
     def as_printed(linear: np.ndarray) -> np.ndarray:
-        return np.clip(linear + _terms(linear) @ coefficients, 0, 1).astype(np.float32)
+        height, width = linear.shape[:2]
+        added = coefficients.T.astype(np.float32) @ _terms(linear.astype(np.float32)).reshape(len(coefficients), -1)
+        return np.clip(linear + np.moveaxis(added.reshape(3, height, width), 0, -1), 0, 1).astype(np.float32)
 
     return as_printed
 
 
 def _terms(linear: np.ndarray) -> np.ndarray:
-    """`... × 10`: a quadratic's terms of linear light."""
+    """`10 × ...`: a quadratic's terms of linear light, each in one piece of memory."""
     r, g, b = np.moveaxis(np.clip(linear, 0, 1), -1, 0)
-    terms = np.ones((10, *r.shape))  # each in one piece of memory, which is four times as fast
-    for into, term in zip(terms[1:], (r, g, b, r * r, g * g, b * b, r * g, g * b, b * r), strict=True):
+    terms = np.empty((10, *r.shape), linear.dtype)
+    for into, term in zip(terms, (1.0, r, g, b, r * r, g * g, b * b, r * g, g * b, b * r), strict=True):
         into[...] = term
-    return np.moveaxis(terms, 0, -1)
+    return terms
