@@ -56,9 +56,9 @@ def fit_print(
     coefficients = np.linalg.solve(square + ridge, (rows * weight).T @ (added * weight))
 
     def as_printed(linear: np.ndarray) -> np.ndarray:
-        height, width = linear.shape[:2]
-        added = coefficients.T.astype(np.float32) @ _terms(linear.astype(np.float32)).reshape(len(coefficients), -1)
-        return np.clip(linear + np.moveaxis(added.reshape(3, height, width), 0, -1), 0, 1).astype(np.float32)
+        terms = _terms(linear.astype(np.float32))
+        added = coefficients.T.astype(np.float32) @ terms.reshape(len(terms), -1)
+        return np.clip(linear + added.T.reshape(linear.shape), 0, 1).astype(np.float32)
 
     return as_printed
 
