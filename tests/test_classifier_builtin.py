@@ -19,15 +19,6 @@ from patchproof.training.pictures import HELD_OUT, Pictures, augmented, pictures
 FRESH = 7_000_000  # renders that neither training nor its held-out set has seen
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Pictures this small gain nothing from threads, and lose much where another process wants the cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def builtin():
     return load_classifier("builtin", HERE)  # warnings are errors: its self-checks have no doubts

@@ -27,14 +27,6 @@ from onnx.reference import ReferenceEvaluator
 import onnx_files
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 class Prompted(ViT):
     """CLIP's way: cosines with the embeddings of prompts, which are constants."""
 

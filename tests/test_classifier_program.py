@@ -17,15 +17,6 @@ from patchproof.classifier.program import load_program
 from patchproof.strict import Refused
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Small batches gain nothing from threads, and lose much where another process wants the cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory) -> Path:
     path = save(tmp_path_factory.mktemp("honest"), exported(Small()))
