@@ -191,9 +191,10 @@ def _taps(
         per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
         share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
     x, y = share.unbind(1)
-    stride = size[:, 0].long() + 1
-    texel = torch.empty(len(center), 4, rows, columns, dtype=torch.long, device=center.device)
-    first = torch.add(low[:, 1].long() * stride, low[:, 0].long() + offset[:, None, None], out=texel[:, 0])
+    stride = size[:, 0].int() + 1
+    texel = torch.empty(len(center), 4, rows, columns, dtype=torch.int, device=center.device)
+    low = low.int()
+    first = torch.add(low[:, 1] * stride, low[:, 0] + offset[:, None, None].int(), out=texel[:, 0])
     torch.add(first, 1, out=texel[:, 1])
     torch.add(texel[:, :2], stride[:, None], out=texel[:, 2:])
     weight = torch.empty(len(center), 4, rows, columns, device=center.device)
@@ -235,7 +236,7 @@ class _LookUp(torch.autograd.Function):
         (gradient,) = gradients
         out = gradient.new_zeros(3, ctx.texels)
         for group in ctx.footprint.groups:
-            weight, texel = group.weight.to(gradient.dtype), group.texel.flatten()
+            weight, texel = group.weight.to(gradient.dtype), group.texel.flatten().long()
             own = gradient if group.fragment is None else gradient[group.fragment]
             for channel, part in zip(out, own.unbind(1), strict=True):
                 channel.scatter_add_(0, texel, (weight * part[:, None]).flatten())
