@@ -353,7 +353,7 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
     np.testing.assert_array_equal(load_run(tmp_path / "cut").design, resumed.design)
 
 
-@pytest.mark.skipif(not can_fork(), reason="this torch takes no gradients in forked processes")
+@pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
 def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatch):
     """A step of 5 views, the selection, promise and controls, and the search for a place among three."""
     monkeypatch.setattr(places, "PLACES", 3)

@@ -20,7 +20,7 @@ from patchproof import workers as processes
 from patchproof.strict import Refused
 from patchproof.workers import can_fork, free_cores, open_workers, result_of, sharing, threads
 
-forks = pytest.mark.skipif(not can_fork(gradients=False), reason="processes are forked on Linux without a GPU")
+forks = pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
 
 
 def test_results_come_in_the_order_of_items_with_progress():
@@ -70,7 +70,7 @@ def test_only_the_item_that_kills_its_worker_each_time_is_given_up():
         result_of(done[3])
 
 
-@pytest.mark.skipif(not can_fork(), reason="this torch takes no gradients in forked processes")
+@forks
 def test_a_share_has_what_its_function_refers_to_also_after_a_worker_died(tmp_path):
     """A lambda over an open network and a matrix: nothing of it could be pickled."""
     net, weights = torch.nn.Linear(3, 2), np.eye(3, dtype=np.float32)
@@ -87,7 +87,7 @@ def test_a_share_has_what_its_function_refers_to_also_after_a_worker_died(tmp_pa
             nested = inner.map(share, range(2)) == [os.getpid()] * 2
         return i * int(nested), float(net.weight.grad.sum()), torch.get_num_threads(), os.getpid()
 
-    with sharing(answer, 2, gradients=True) as (crew, share):
+    with sharing(answer, 2) as (crew, share):
         answers = crew.map(share, range(6))
     assert [a[:3] for a in answers] == [(i, 6.0 * i, 1) for i in range(6)]
     assert os.getpid() not in {a[3] for a in answers} and not (tmp_path / "2").exists()
@@ -114,7 +114,7 @@ def test_a_share_begins_where_torch_and_opencv_already_have_threads():
 
 
 def test_a_system_that_cannot_fork_works_here_on_as_many_threads(monkeypatch):
-    monkeypatch.setattr(processes, "can_fork", lambda gradients: False)
+    monkeypatch.setattr(processes, "can_fork", lambda: False)
     before = torch.get_num_threads()
     with threads(1):
         with sharing(lambda i: (os.getpid(), torch.get_num_threads()), 2) as (crew, share):

@@ -141,17 +141,15 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
 
 
 @contextmanager
-def sharing(
-    function: Callable[[Any], Any], jobs: int, gradients: bool = False
-) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
+def sharing(function: Callable[[Any], Any], jobs: int) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
     """`jobs` forked processes that have a function with everything that it refers to, as it is now, and what to call in
     them in its place; only items and results are sent. One job, and a process that was forked for a share itself, works
-    here; so does a system that cannot fork (`can_fork`, for functions that take `gradients`), on as many threads.
+    here; so does a system that cannot fork (`can_fork`), on as many threads.
     """
     if jobs == 1 or _function is not None:
         yield Workers(_Here, 1), function
         return
-    if not can_fork(gradients):
+    if not can_fork():
         with threads(jobs):
             yield Workers(_Here, 1), function
         return
@@ -159,14 +157,11 @@ def sharing(
         yield workers, _shared
 
 
-def can_fork(gradients: bool = True) -> bool:
-    """Whether a forked process can compute: on Linux without a GPU. Gradients need a torch that was built without one,
-    too: others refuse them in children of a process that has taken any.
-    """
+def can_fork() -> bool:
+    """Whether a forked process can compute: on Linux where torch sees no GPU or the like, for which it starts threads."""
     import torch
 
-    built_for_gpu = torch.backends.cuda.is_built()
-    return sys.platform == "linux" and not torch.cuda.is_available() and not (gradients and built_for_gpu)
+    return sys.platform == "linux" and not torch.accelerator.is_available()
 
 
 def free_cores() -> int:

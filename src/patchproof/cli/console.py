@@ -98,8 +98,7 @@ def _on_free_cores(given: dict[str, Any]) -> Iterator[None]:
         return
     from patchproof.workers import can_fork, free_cores, threads
 
-    shares = "cluster" not in given  # what is open here, and imports nothing
-    by_processes = can_fork(gradients=not shares) and given.get("device", "cpu") == "cpu"
+    by_processes = can_fork() and given.get("device", "cpu") == "cpu"
     if given["jobs"] is None:
         given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
     with threads(1) if by_processes else nullcontext():

@@ -110,7 +110,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
         design = torch.as_tensor(pixels, device=problem.device)
         return _tried(problem, seen(of), design) if isinstance(of, int) else part_of(problem, design, of, pictures)
 
-    with sharing(answer, problem.jobs, gradients=True) as (workers, share):
+    with sharing(answer, problem.jobs) as (workers, share):
         while state.number < settings.steps:
             first = state.number * settings.views
             drawn, last = conditions[first : first + settings.views], state.number + 1 == settings.steps

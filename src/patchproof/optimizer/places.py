@@ -212,7 +212,7 @@ class _Search:
     def _shared(self, look: Callable[[Problem], Any], problems: Sequence[Problem], passes: int) -> list[Any]:
         """What a look at each problem says, of so many passes; the processes share the problems."""
         before, jobs = self.passes, min(len(problems), self._stated[-1])
-        with sharing(lambda number: look(problems[number]), max(1, jobs), gradients=True) as (workers, share):
+        with sharing(lambda number: look(problems[number]), max(1, jobs)) as (workers, share):
             looks = range(len(problems))
             return workers.map(share, looks, lambda done, _: self._count(before + done * passes - self.passes))
 
