@@ -83,7 +83,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
     [
         ("promises", "promises", 6 * 2),
         ("ablation", "ablation", 4 * (1 + 16)),
-        ("families", "transfer", 3 * (1 + 5 + 3)),
+        ("families", "transfer", 7 * (1 + 5 + 3)),
     ],
 )
 def test_the_studies_that_are_quoted_can_be_run_again(folder, name, count):
@@ -244,6 +244,7 @@ def test_figures_of_a_network_s_forms_are_the_stored_ones():
 
 def test_figures_of_families_are_the_stored_ones():
     tables, page = stored("families/transfer.json")["tables"], NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    matrix = tables["matrix"]["rows"]
     gains: dict[str, list[str]] = {}
     for _, row, _, seen, _, _, gain, _ in tables["objects"]["rows"]:
         told = interval(gain["value"], gain["low"], gain["high"])
@@ -254,6 +255,14 @@ def test_figures_of_families_are_the_stored_ones():
     for _, _, _, _, before, after, gain, _ in tables["families"]["rows"]:
         told = interval(gain["value"], gain["low"], gain["high"])
         assert any(line.endswith(f" | {100 * before:.0f} % | {100 * after:.0f} % | {told} |") for line in page)
+    cnns, vits = ("builtin", "shufflenet", "resnet"), ("levit", "vit")
+    gains_of = {(scene, row, seen): gain["value"] for scene, _, row, seen, _, _, gain, *_ in matrix if gain}
+    for rows, seen in ((cnns, vits), (vits, cnns)):
+        first = ("truck", "carton", "chair")
+        gained = [np.mean([gains_of[scene, row, column] for row in rows for column in seen]) for scene in first]
+        over = student_mean(gained)
+        assert "{:.1f}, {:.1f} and {:.1f}".format(*(100 * gain for gain in gained)) in words(NOTEBOOK)
+        assert f"({interval(over.value, over.low, over.high)})" in words(NOTEBOOK)
 
 
 def rows_of(name: str) -> list[dict[str, str]]:

@@ -158,7 +158,7 @@ def sharing(function: Callable[[Any], Any], jobs: int) -> Iterator[tuple[Workers
 
 
 def can_fork() -> bool:
-    """Whether a forked process can compute: on Linux where torch sees no GPU or the like, for which it starts threads."""
+    """Whether a forked process can compute: on Linux, where torch sees no GPU, for which it would start threads."""
     import torch
 
     return sys.platform == "linux" and not torch.accelerator.is_available()
