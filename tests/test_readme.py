@@ -17,6 +17,7 @@ from patchproof.claims import student_mean
 from patchproof.optimizer.run import load_run
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
+from patchproof.study.record import hits_of
 from patchproof.study.study import load_study
 from test_imports import GROUND, MAY_IMPORT
 from test_journey import command
@@ -214,7 +215,37 @@ def test_our_photographs_differ_from_the_path_tracers_as_it_is_said():
         said.append(f"{sure.value:.3f} [{sure.low:.3f}, {sure.high:.3f}]")
         for row in ours:
             assert abs(float(row["confidence_off"])) < 0.03
+    said = [figure.replace("rate -0.0", "rate 0.0") for figure in said]
     assert "the design's {} and confidence {}, the bare object's {} and {}".format(*said) in words(NOTEBOOK)
+
+
+def test_what_sessions_lack_is_shared_out_as_it_is_said():
+    """Between promise and photographs by our renderer, and those and a path tracer's of the same sessions."""
+    (promised, traced), (_, ours) = (shown_by_run(f"promises/{name}.json") for name in ("again", "again_ours"))
+    for less, more in ((ours, promised), (traced, ours)):
+        off = student_mean(100 * (more - less))
+        assert f"{off.value:.1f} points less than" in words(NOTEBOOK)
+        assert f"[{off.low:.1f}, {off.high:.1f}]" in words(NOTEBOOK)
+
+
+def shown_by_run(name: str) -> np.ndarray:
+    """What was promised and the mean share of its sessions, 2 × runs."""
+    found = [cell["found"] for cell in stored(name)["cells"].values()]
+    return np.array(
+        [
+            (np.mean(hits_of(run["promised"])), np.mean([seen / judged for seen, judged in run["sessions"] if judged]))
+            for run in found
+        ]
+    ).T
+
+
+def test_what_jagged_outlines_cost_is_the_stored_figure():
+    told = []
+    for row in rows_of("views/edges.csv"):
+        told.append("{:.3f} [{:.3f}, {:.3f}]".format(*(float(row[f"1_{end}"]) for end in ("off", "low", "high"))))
+        assert abs(float(row["4_off"])) < 0.0055
+    said = "SUV {}, pickup {}, traffic light {}, letter box {}, mug {}, carton {}"
+    assert said.format(*told) in words(NOTEBOOK)
 
 
 def test_figures_of_imported_designs_are_the_stored_ones():
