@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 from pathlib import Path
 
 import pytest
 import torch
 
+from patchproof.workers import keep_freed_memory
+
 # the tests run side by side, a process per core, and so do the programs that they start
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
-# freed memory is kept for the next picture: to hand it out and clear it anew took the kernel a tenth of all the time
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of glibc's malloc.h
-if os.name == "posix" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-    libc.mallopt(M_MMAP_MAX, 0)
-    libc.mallopt(M_TRIM_THRESHOLD, 1 << 28)  # more is handed back, or limits of memory would be those of no user
+keep_freed_memory()
 
 LONG = ("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere")  # of the file's name
 
