@@ -67,7 +67,7 @@ def journey(tmp_path_factory):
             "object": {"mesh": "primitive:box_truck", "length_mm": 400},
             "patch": {"width_mm": 120, "height_mm": 120, "side": "+x"},
             "target": {"label": "box truck", "models": ["builtin-detector"], "least_score": 0.3},
-            "camera": {"photo_px": [320, 240]},
+            "camera": {"photo_px": [640, 480]},
             "optimize": {"steps": 1},
         }
     )
@@ -76,7 +76,7 @@ def journey(tmp_path_factory):
     pp.reprint(folder / "sheet.pdf", run, 3, folder / "photos")
     bare = folder / "controls" / "bare"
     bare.mkdir(parents=True)
-    pixels = pp.photograph(pp.set_stage(scene), None, scene.draw("reprint", 3), (320, 240))
+    pixels = pp.photograph(pp.set_stage(scene), None, scene.draw("reprint", 3), (640, 480))
     for number, picture in enumerate(pixels.permute(0, 2, 3, 1).numpy(), 1):
         Image.fromarray((picture * 255).round().astype(np.uint8)).save(bare / f"photo_{number:04d}.jpg", quality=95)
     return SimpleNamespace(folder=folder, sheet=folder / "sheet.json", photos=folder / "photos")
@@ -106,13 +106,13 @@ def test_a_report_s_boxes_are_where_the_object_is(journey):
         margin = (max(width, height) - min(width, height)) / 2
         x, y = (margin, 0) if width > height else (0, margin)  # a report knows what lies in the middle square
         inside = np.clip(box, (x, y, x, y), (width - x, height - y, width - x, height - y))
-        assert iou(torch.tensor(told[name])[None, None], torch.tensor(inside)[None]) > 0.85, name
+        assert iou(torch.tensor(told[name])[None, None], torch.tensor(inside)[None]) > 0.95, name
 
 
 def test_boxes_elsewhere_take_the_object_away_from_design_and_bare_photographs_even_when_a_run_goes_on(journey):
     names = [path.name for path in sorted(journey.photos.glob("*.jpg"))]
     names += [f"bare/{name}" for name in names]
-    corner = [(number, 1, [2 + 40 * (number % 2), 2, 6, 6]) for number in range(1, 7)]  # in and out of the square
+    corner = [(number, 1, [2 + 80 * (number % 2), 2, 12, 12]) for number in range(1, 7)]  # in and out of the square
     wrong = coco(journey.folder / "w.json", *corner, categories=("box truck",), images=names)
     options = {"controls": journey.folder / "controls"}
     (bare,) = verified(journey, "wrong", **options).controls

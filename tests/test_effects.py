@@ -170,6 +170,7 @@ def test_the_short_way_to_small_pictures_knows_every_effect(problem, effect, mon
     views = see(problem.stage, shown, conditions, (96, 96))
     cut = torch.zeros(4 * 96 * 96, dtype=torch.bool)
     cut[views.on_piece.pixel], cut[views.on_piece.back_pixel] = views.on_piece.share[:, 0] < 1 - FLOAT32, True
+    cut[views.outlines.pixel] = True
     ways = [expose(views, shown)]
     monkeypatch.setattr(photograph, "is_pointwise", lambda *arguments: False)
     ways.append(expose(views, shown))

@@ -242,8 +242,8 @@ def shown_by_run(name: str) -> np.ndarray:
 def test_what_jagged_outlines_cost_is_the_stored_figure():
     told = []
     for row in rows_of("views/edges.csv"):
-        told.append("{:.3f} [{:.3f}, {:.3f}]".format(*(float(row[f"1_{end}"]) for end in ("off", "low", "high"))))
-        assert abs(float(row["4_off"])) < 0.0055
+        told.append("{:.3f} [{:.3f}, {:.3f}]".format(*(float(row[f"jagged_{end}"]) for end in ("off", "low", "high"))))
+        assert abs(float(row["smooth_off"])) < 0.0065
     said = "SUV {}, pickup {}, traffic light {}, letter box {}, mug {}, carton {}"
     assert said.format(*told) in words(NOTEBOOK)
 

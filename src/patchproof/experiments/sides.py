@@ -48,9 +48,13 @@ def three_views(problem: Problem, lights: int) -> Conditions:
 
 
 def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tuple[int, int, int]:
-    """sRGB codes of the mean light of the object's pixels over a full turn in even white light."""
+    """sRGB codes of the mean light of the object's pixels, its outlines apart, over a full turn in even white light."""
     turned = problem.see(shown, from_sides(problem, np.arange(views) * 360 / views), side_px)
     with torch.no_grad():
-        light = shade(turned, shown).permute(0, 2, 3, 1).reshape(-1, 3)[turned.on_object.pixel]
+        light = shade(turned, shown).permute(0, 2, 3, 1).reshape(-1, 3)
+    within = torch.zeros(len(light), dtype=torch.bool, device=light.device)
+    within[turned.on_object.pixel] = True
+    within[turned.outlines.pixel] = False
+    light = light[within]
     red, green, blue = (srgb_from_linear(light.double().mean(0)) * 255).round().clamp(0, 255).int().tolist()
     return red, green, blue

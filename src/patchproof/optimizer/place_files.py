@@ -21,6 +21,7 @@ from patchproof.color import photo_codes_of, srgb_from_linear
 from patchproof.input import is_file, read_json
 from patchproof.optimizer.places import Candidate, Place
 from patchproof.output import write_whole
+from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import cameras, near_mm, see
@@ -64,8 +65,8 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
     scene, conditions = _plain(scene)
     stage, size, poses = set_stage(scene), (_SIDE_PX, _SIDE_PX), scene.camera_from_world(conditions)
     with torch.no_grad():
-        light = see(stage, None, conditions, size, supersample=2).bare
-    pictures = photo_codes_of(srgb_from_linear(light.clamp(0, 1)).reshape(len(poses), _SIDE_PX, _SIDE_PX, 3).numpy())
+        light = shade(see(stage, None, conditions, size), None)
+    pictures = photo_codes_of(srgb_from_linear(light.clamp(0, 1)).permute(0, 2, 3, 1).numpy())
     panels = []
     for pose, picture in zip(poses, pictures, strict=True):
         panel, depth = Image.fromarray(picture), _depth(stage, scene, pose)

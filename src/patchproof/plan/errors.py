@@ -161,8 +161,7 @@ def _squares(
         views, parts = _views(base, base.conditions[rows], size_px), []
         for setup in (base, *setups):
             conditions, known = setup.conditions[rows], base.conditions[rows]
-            same = setup.stage is base.stage and setup.supersample == base.supersample
-            same = same and (conditions.pose.printed_scale == known.pose.printed_scale).all()
+            same = setup.stage is base.stage and (conditions.pose.printed_scale == known.pose.printed_scale).all()
             shown = relit(views, conditions) if same else _views(setup, conditions, size_px)
             parts.append(_pictures(problem, shown, setup.shown))
         stack.append(torch.stack(parts))
@@ -171,7 +170,7 @@ def _squares(
 
 
 def _views(setup: Setup, conditions: Conditions, size_px: tuple[int, int]) -> Views:
-    return see(setup.stage, setup.shown, conditions, size_px, setup.supersample)
+    return see(setup.stage, setup.shown, conditions, size_px)
 
 
 def _pictures(problem: Problem, views: Views, shown: Shown) -> Tensor:

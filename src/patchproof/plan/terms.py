@@ -33,7 +33,6 @@ class Setup:
     stage: Stage
     shown: Shown
     conditions: Conditions
-    supersample: int = 1
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,6 @@ def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | Non
     if scene.HAS_PIECE:
         terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
     terms = (*terms, *effects["printer"], *effects["camera"], *(term for term in own.values() if term.key))
-    if scene.HAS_OBJECT:
-        terms = (*terms, Term("object at 2×2 samples", "", lambda setup: replace(setup, supersample=2), modeled=False))
     if other_surface is not None:
         lies = needs_patch(scene).placement
         name = "bent piece" if lies.is_flat else f"{lies.family}, not a card"

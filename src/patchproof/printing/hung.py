@@ -111,8 +111,8 @@ def straight_picture(
     plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
     shown = None if on_piece is None else PiecePicture(torch.tensor(on_piece, dtype=torch.float32) / 255)
     with torch.no_grad():
-        views = see(plain, shown, _even(distance, 0.55, 0.45), (width, height), supersample=2)
-        light = views.bare.clone()
+        views = see(plain, shown, _even(distance, 0.55, 0.45), (width, height))
+        light = _by_rows(shade(views, None))
         if shown is not None:
             covered = views.on_piece.pixel[views.on_piece.share[:, 0] > 0]
             if len(covered):

@@ -22,6 +22,9 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.camera_from_world)
 
+    def __getitem__(self, some: slice) -> Cameras:
+        return Cameras(self.camera_from_world[some], self.matrix_px[some], self.size_px)
+
 
 @dataclass(frozen=True)
 class Fragments:

@@ -41,34 +41,33 @@ def photograph(
     conditions: Conditions,
     size_px: tuple[int, int],
     jpeg: bool = True,
-    supersample: int = 1,
 ) -> Tensor:
     """N×3×H×W sRGB pictures of `size_px`; `shown=None` is the bare object.
 
     A design may be shown as it is: a float tensor in [0, 1] (3×h×w of any grid for a piece, 3×1×M for textures), in
     which the pictures are differentiable, or its uint8 pixels h×w×3. A square size shows the photograph's centered
-    square. `jpeg` as in `channel.camera.develop`, `supersample` as in `see`.
+    square. `jpeg` as in `channel.camera.develop`.
     """
     if isinstance(shown, np.ndarray):
         shown = torch.tensor(shown, dtype=torch.float32, device=stage.device).permute(2, 0, 1) / 255
     if isinstance(shown, Tensor):
         shown = stage.look.shown(shown)
-    return expose(see(stage, shown, conditions, size_px, supersample), shown, jpeg)
+    return expose(see(stage, shown, conditions, size_px), shown, jpeg)
 
 
 def shade(views: Views, shown: Shown) -> Tensor:
     """N×3×H×W linear light before lens and sensor; differentiable in what is shown."""
     if isinstance(shown, ObjectTextures):
-        return _as_pictures(views, views.object_light(light_texels(shown.srgb, views.reduced)))
+        return _smooth(views, views.object_light(light_texels(shown.srgb, views.reduced)), views.reduced)
     image = views.bare
     if shown is None:
-        return _as_pictures(views, image)
+        return _smooth(views, image, views.reduced)
     piece, own = views.on_piece, _own_blur_and_noise(views)
     image = _blend(image, piece.back_pixel, piece.back_share, image.new_full((1, 3), PAPER_BACK_LINEAR), views.reduced)
     light = _piece_light(views, shown)
     if own is not None:
         return _pasted(views, image, light, *own)
-    return _as_pictures(views, _blend(image, piece.pixel, piece.share, light, views.reduced))
+    return _smooth(views, _blend(image, piece.pixel, piece.share, light, views.reduced), views.reduced)
 
 
 def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
@@ -91,7 +90,7 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
         light = _piece_light(views, shown) * views.gains.index_select(0, piece.view)
         image = _blend(image, piece.pixel, piece.share, encoded(light, camera), False)
-    return _as_pictures(views, image)
+    return _smooth(views, image, by_code=False)
 
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:
@@ -159,6 +158,11 @@ def _own_blur_and_noise(views: Views) -> tuple[np.ndarray, np.ndarray] | None:
 def _scale(views: Views) -> float:
     """The pictures' size over the photograph's."""
     return min(views.size_px) / min(views.stage.scene.settings.camera.photo_px)
+
+
+def _smooth(views: Views, image: Tensor, by_code: bool) -> Tensor:
+    """Pixels by rows as pictures with smooth outlines, mixed as they are or, light `by_code`, as code values."""
+    return _as_pictures(views, image if views.outlines is None else views.outlines.smooth(image, by_code))
 
 
 def _as_pictures(views: Views, image: Tensor) -> Tensor:

@@ -19,10 +19,24 @@ from patchproof.render.surfaces import ObjectSurface, PieceSurface
 from patchproof.render.texture import Footprint, footprint, layout, texel_table
 
 # Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
-# optimized designs 20 to 200 px wide, four 30. Four leave an object's own texture within 0.003 of the confidence that a
-# network has with eight (60 photographs of a textured car), one within 0.073.
-DESIGN_TAPS, OBJECT_TAPS = 8, 4
-_LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
+# optimized designs 20 to 200 px wide, four 30.
+DESIGN_TAPS = 8
+LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
+
+
+@dataclass(frozen=True)
+class Look:
+    """How pixels look at textures: each over `side` of its own width and height, at the object's in so many `taps`
+    along its footprint's shorter side.
+    """
+
+    taps: int
+    side: float
+
+
+# Four taps leave an object's own texture within 0.003 of the confidence that a network has with eight (60 photographs
+# of a textured car), one within 0.073.
+PHOTOGRAPHED = Look(taps=4, side=1.0)
 
 
 @dataclass(frozen=True)
@@ -54,7 +68,7 @@ Shown = PiecePicture | ObjectTextures | None
 
 @dataclass(frozen=True)
 class ObjectPixels:
-    """The object's fragments: in which pixel (of `samples`² each), what texels they look at, and how they are lit."""
+    """The object's fragments: in which pixel, what texels they look at, and how they are lit."""
 
     pixel: Tensor
     view: Tensor
@@ -62,7 +76,6 @@ class ObjectPixels:
     color: Tensor  # P×3: what the texture is multiplied by
     normal: Tensor
     position_mm: Tensor | None  # where light needs it
-    samples: int
 
 
 @dataclass(frozen=True)
@@ -87,6 +100,7 @@ def piece_pixels(
     piece: PiecePicture,
     fragments: Fragments,
     hidden: Tensor | None,
+    look: Look = PHOTOGRAPHED,
     needs_position: bool = False,
     white_coefficients: Tensor | None = None,
 ) -> PiecePixels:
@@ -98,8 +112,8 @@ def piece_pixels(
     low, high = (torch.minimum((mm + k * half).clamp_min(0), size) for k in (-1, 1))
     share = ((high - low) / (2 * half)).prod(1)
     if hidden is not None:
-        share = share * (1 - hidden)
-    shown = share > _LEAST_SHARE
+        share = share.masked_fill(hidden, 0)
+    shown = share > LEAST_SHARE
     kept = fragments.where(shown & fragments.front)
     front, back = ((shown & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
     mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
@@ -108,7 +122,7 @@ def piece_pixels(
         kept.pixel,
         kept.view,
         share.index_select(0, front)[:, None],
-        _piece_footprint(piece, mm / size, mm_dx / size, mm_dy / size),
+        _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size),
         torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
         position,
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
@@ -124,21 +138,18 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
 
 
-def object_pixels(
-    surface: ObjectSurface, fragments: Fragments, pixel: Tensor, samples: int, needs_position: bool, taps: int
-) -> ObjectPixels:
+def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look) -> ObjectPixels:
     """The object's fragments; faces seen from behind turn their normal round."""
     at, (uv_dx, uv_dy) = _weighted(surface.corners, fragments), _slopes(surface.corner_uv, fragments)
     material = surface.material.index_select(0, fragments.face)
     turned = torch.nn.functional.normalize(at[:, 5:8], dim=-1) * torch.where(fragments.front, 1.0, -1.0)[:, None]
     return ObjectPixels(
-        pixel,
+        fragments.pixel,
         fragments.view,
-        footprint(surface.layout, material, at[:, :2], uv_dx, uv_dy, taps),
+        footprint(surface.layout, material, at[:, :2], uv_dx * look.side, uv_dy * look.side, look.taps),
         at[:, 2:5],
         turned,
         _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,
-        samples,
     )
 
 

@@ -48,19 +48,17 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float)
         raise Refused(f"at most {_FACE_MASK} faces", str(len(faces)), "render the mesh in parts")
     width, height = cameras.size_px
     shape, vertices = (len(cameras), height, width), vertices.double()
-    # homogeneous pixel coordinates (x·z, y·z, z) from the world: K [R t]
-    matrix = cameras.matrix_px.double() @ cameras.camera_from_world.double()[:, :3]
     at_once = max(1, CHUNK // max(len(vertices), len(faces), width * height, 1))
     groups = range(0, len(cameras), at_once)
     nearest = torch.zeros(math.prod(shape), dtype=torch.int64, device=faces.device)
     for view in groups:
         keys = nearest[view * height * width : (view + at_once) * height * width]
-        _settle(keys, _points(vertices, matrix[view : view + at_once]), faces, cameras.size_px, near_mm)
+        _settle(keys, homogeneous(vertices, cameras[view : view + at_once]), faces, cameras.size_px, near_mm)
     fragments = _allocated(nearest, shape)
     del nearest
     slopes = [fragments.slopes]
     for view in groups:
-        points = _points(vertices, matrix[view : view + at_once])
+        points = homogeneous(vertices, cameras[view : view + at_once])
         ends = fragments.pixel.new_tensor([view, view + at_once]) * (height * width)
         first, last = torch.searchsorted(fragments.pixel, ends).tolist()
         for start in range(first, last, CHUNK):
@@ -70,9 +68,12 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float)
     return replace(fragments, slopes=torch.cat(slopes, 1))
 
 
-def _points(vertices: Tensor, matrix: Tensor) -> Tensor:
-    """3×N×V homogeneous pixel coordinates; written out, because a matrix product rounds as its size has it."""
+def homogeneous(vertices: Tensor, cameras: Cameras) -> Tensor:
+    """3×N×V homogeneous pixel coordinates (x·z, y·z, z); written out, because a matrix product rounds as its size has
+    it.
+    """
     x, y, z = vertices.T
+    matrix = cameras.matrix_px.double() @ cameras.camera_from_world.double()[:, :3]  # K [R t]
     m = matrix.transpose(0, 1)[..., None]
     return m[:, :, 0] * x + m[:, :, 1] * y + m[:, :, 2] * z + m[:, :, 3]
 
@@ -199,7 +200,7 @@ def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[
     """Of each row of the trapezoids: pixel count, first pixel, 1/z there, its change per pixel, and the face key."""
     first, count, *edges = trapezoids
     owner = torch.repeat_interleave(count)
-    row = _ramp(count, first, owner)
+    row = ramp(count, first, owner)
     y = row.double()
     n, k, d, *short = (t.index_select(0, owner) for t in edges)
     x0, x1 = (n.addcmul_(k, y).div_(d).ceil_().clamp_(0, width) for n, k, d in ((n, k, d), short))
@@ -212,7 +213,7 @@ def _spans(trapezoids: list[Tensor], owners: list[Tensor], width: int) -> tuple[
     return length, first_pixel + row * width + x.long(), inverse, a, face_key
 
 
-def _ramp(count: Tensor, first: Tensor, owner: Tensor) -> Tensor:
+def ramp(count: Tensor, first: Tensor, owner: Tensor) -> Tensor:
     """first, first + 1, ... for each owner, `count` of them."""
     shift = first - count.cumsum(0) + count
     return torch.arange(len(owner), device=owner.device).add_(shift.index_select(0, owner))
@@ -223,7 +224,7 @@ def _fill(nearest: Tensor, length: Tensor, pixel: Tensor, inverse: Tensor, slope
     for part in _chunks(length):
         count, first = length[part], pixel[part]
         owner = torch.repeat_interleave(count)
-        step = _ramp(count, torch.zeros_like(count), owner)
+        step = ramp(count, torch.zeros_like(count), owner)
         value = inverse[part].index_select(0, owner).addcmul_(slope[part].index_select(0, owner), step)
         # bits of positive floats order like the numbers; beyond its horizon a face is far away
         key = value.clamp_min_(1e-30).view(torch.int64).bitwise_and_(~_FACE_MASK)
@@ -249,7 +250,7 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     view = (row / height).floor_()
     x, y = at.sub_(row, alpha=width).add_(0.5), row.sub_(view, alpha=height).add_(0.5)
     pair = view.long().sub_(view0).mul_(len(faces)).add_(fragments.face[part])
-    owner, rank = _ranked(pair, points.shape[1] * len(faces))
+    owner, rank = ranked(pair, points.shape[1] * len(faces))
     corners = _taken(points, [i.index_select(0, owner) for i in _corner_index(points, faces)])
     planes, volume = _planes(corners, near)
     second, third, inverse = (_at_center(plane, rank, x, y) for plane in planes)
@@ -264,7 +265,7 @@ def _resolve(fragments: Fragments, part: slice, points: Tensor, faces: Tensor, v
     return torch.stack([t for plane in planes for t in plane[:2]]).float()
 
 
-def _ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
+def ranked(values: Tensor, limit: int) -> tuple[Tensor, Tensor]:
     """The distinct values below `limit`, ascending, and where each value lies among them; `unique` would sort."""
     present = torch.zeros(limit, dtype=torch.bool, device=values.device).index_fill_(0, values, True)
     distinct = present.nonzero()[:, 0]

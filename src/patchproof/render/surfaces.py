@@ -15,6 +15,7 @@ from torch import Tensor
 
 from patchproof.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
+from patchproof.render.edges import Edges, edges_of
 from patchproof.render.texture import Layout, layout, texel_table
 from patchproof.scene.interface import PieceScene
 
@@ -45,6 +46,7 @@ class ObjectSurface:
     material: Tensor
     textures_srgb: tuple[Tensor, ...]  # H×W×3 in [0, 1], one per material
     layout: Layout
+    edges: Edges
 
     @cached_property
     def corner_uv(self) -> Tensor:
@@ -92,6 +94,7 @@ def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
         on(mesh.face_material),
         textures,
         layout([(t.shape[1], t.shape[0]) for t in textures], wrap=True, device=device),
+        edges_of(mesh, device),
     )
 
 

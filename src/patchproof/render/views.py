@@ -5,8 +5,8 @@ pixel of the piece how much of it the piece covers, which texels it looks at and
 happens here and nowhere else: views that were seen can be lit, printed and photographed anew (`relit`) at a fraction of
 the cost, and shaded with any number of designs.
 
-The object's edges take one sample per pixel, or `supersample`² on demand; those of the piece are antialiased always
-(see `pixels`). Left out on purpose: transparency.
+Each pixel takes one sample; outlines are smoothed from their edges (see `outlines`), those of the piece from its own
+millimeters (see `pixels`). Left out on purpose: transparency.
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ from torch import Tensor
 from patchproof.channel.camera import encoded, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
-from patchproof.color import LIGHT_OF_CODE, linear_from_srgb, srgb_from_linear
-from patchproof.render.fragments import Cameras, Fragments
+from patchproof.color import LIGHT_OF_CODE
+from patchproof.render.fragments import Cameras
+from patchproof.render.outlines import Outlines, outlines
 from patchproof.render.pixels import (
-    OBJECT_TAPS,
+    LEAST_SHARE,
+    PHOTOGRAPHED,
+    Look,
     ObjectPixels,
     PiecePicture,
     PiecePixels,
@@ -35,7 +38,6 @@ from patchproof.render.pixels import (
 )
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage
-from patchproof.render.surfaces import ObjectSurface, PieceSurface
 from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions, with_poses_of
 from patchproof.scene.mesh_scene import MeshScene
@@ -57,6 +59,7 @@ class Views:
     background: np.ndarray  # uint8 N×H×W×3 sRGB
     object: ObjectPixels | None
     piece: PiecePixels | None
+    outlines: Outlines | None
 
     @property
     def reduced(self) -> bool:
@@ -84,20 +87,12 @@ class Views:
 
     @cached_property
     def bare(self) -> Tensor:
-        """The lit object without the piece, N·H·W × 3."""
+        """The lit object without the piece, its outlines jagged, N·H·W × 3."""
         return self._behind if self.object is None else self.object_light(self._own_texels)
 
     def object_light(self, texels: Tensor) -> Tensor:
-        """The lit object with these texels before its background, N·H·W × 3; differentiable."""
-        pixels, color = self.on_object, self._object_color(texels)
-        if pixels.samples == 1:
-            return self._behind.index_copy(0, pixels.pixel, color)
-        share = torch.full_like(color[:, :1], 1 / pixels.samples**2)
-        covered = torch.zeros_like(self._behind[:, :1]).index_add_(0, pixels.pixel, share)
-        if not self.reduced:
-            return (self._behind * (1 - covered)).index_add(0, pixels.pixel, color * share)
-        codes = srgb_from_linear(self._behind) * (1 - covered)
-        return linear_from_srgb(codes.index_add(0, pixels.pixel, srgb_from_linear(color) * share))
+        """The same with these texels; differentiable."""
+        return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels))
 
     def _object_color(self, texels: Tensor) -> Tensor:
         """The light P×3 of the object's fragments."""
@@ -121,10 +116,8 @@ class Views:
 
     @cached_property
     def bare_exposed(self) -> Tensor:
-        """The bare object as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
+        """The bare object, its outlines jagged, as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
         camera = self.stage.camera
-        if self.object is not None and self.object.samples > 1:
-            return encoded((self.bare.view(len(self.conditions), -1, 3) * self.gains[:, None]).view(-1, 3), camera)
         # the background has 256 codes per view and channel, which are exposed as a table
         light = torch.tensor(LIGHT_OF_CODE)[:, None] * self.gains[:, None].cpu().double()
         image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
@@ -155,53 +148,52 @@ class Views:
 
 
 def see(
-    stage: Stage,
-    shown: Shown,
-    conditions: Conditions,
-    size_px: tuple[int, int],
-    supersample: int = 1,
-    taps: int = OBJECT_TAPS,
+    stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], look: Look = PHOTOGRAPHED
 ) -> Views:
     """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
-    be shown in them; the object behind it is seen, too, in so many `taps` of its texture unless that is learned.
+    be shown in them; the object behind it is seen, too.
     """
     piece = shown if isinstance(shown, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
         return _see_pictures(stage, piece, conditions, size_px)
-    scene = needs_mesh(stage.scene)
+    scene, surface = needs_mesh(stage.scene), stage.object_surface
     frame = lens_frame(stage, scene, size_px)
     poses = scene.camera_from_world(conditions)
     light = _light(scene, stage.device, conditions)
-    eye = torch.as_tensor(-(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], dtype=torch.float32)
-
-    def drawn(surface: ObjectSurface | PieceSurface, poses: np.ndarray, samples: int) -> Fragments:
-        width, height = frame.size_px
-        fine = np.diag([samples, samples, 1]) @ frame.matrix_px
-        matrices = np.broadcast_to(fine, (len(poses), 3, 3))
-        placed = cameras(poses, matrices, (width * samples, height * samples), stage)
-        return rasterize(surface.vertices, surface.faces, placed, near_mm(scene))
-
-    fine = drawn(stage.object_surface, poses, supersample)
-    parts, taps = None, OBJECT_TAPS if scene.LEARNED else taps
+    eye = torch.as_tensor(-(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], device=stage.device)
+    matrices, near = np.broadcast_to(frame.matrix_px, (len(poses), 3, 3)), near_mm(scene)
+    placed = cameras(poses, matrices, frame.size_px, stage)
+    fragments = rasterize(surface.vertices, surface.faces, placed, near)
+    nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
+    nearest[fragments.pixel] = fragments.depth
+    look, parts = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None
     if piece is not None:
-        printed = scene.camera_from_print(conditions)
-        surface = drawn(stage.piece_surface, printed, 1)
-        covering = surface if supersample == 1 else drawn(stage.piece_surface, printed, supersample)
-        hidden = _hidden_share(surface, covering, fine, supersample)
+        printed = cameras(scene.camera_from_print(conditions), matrices, frame.size_px, stage)
+        own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
+        hidden = nearest.index_select(0, own.pixel) < own.depth
         needs_position = light.lamp is not None or light.gloss is not None
-        parts = piece_pixels(stage.piece_surface, piece, surface, hidden, needs_position)
-    pixel, local = _coarse_pixel(fine, supersample), light.lamp is not None
+        parts = piece_pixels(stage.piece_surface, piece, own, hidden, look, needs_position)
     return Views(
         stage,
         conditions,
         size_px,
         frame.size_px,
         light,
-        eye.to(stage.device),
+        eye.float(),
         backgrounds(scene, conditions, size_px, frame),
-        object_pixels(stage.object_surface, fine, pixel, supersample, local, taps),
+        object_pixels(surface, fragments, light.lamp is not None, look),
         parts,
+        outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
     )
+
+
+def _covered(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
+    """Which of N·H·W pixels the piece covers wholly."""
+    covered = torch.zeros_like(nearest, dtype=torch.bool)
+    if piece is not None:
+        for pixel, share in ((piece.pixel, piece.share), (piece.back_pixel, piece.back_share)):
+            covered[pixel] = share[:, 0] > 1 - LEAST_SHARE
+    return covered
 
 
 def relit(views: Views, conditions: Conditions) -> Views:
@@ -227,30 +219,6 @@ def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Li
     return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, scene.middle_mm, device)
 
 
-def _coarse_pixel(fine: Fragments, samples: int) -> Tensor:
-    """The pixel that each fragment lies in of a picture with `samples`² of them to the pixel."""
-    if samples == 1:
-        return fine.pixel
-    _, height, width = fine.shape
-    x, row = fine.pixel % width, fine.pixel // width
-    y = row % height
-    return (fine.view * (height // samples) + y // samples) * (width // samples) + x // samples
-
-
-def _hidden_share(piece: Fragments, covering: Fragments, front: Fragments, samples: int) -> Tensor:
-    """Per fragment of the piece, the share of the piece's samples in its pixel that the object lies in front of."""
-    nearest = torch.full((math.prod(covering.shape),), torch.inf, device=piece.depth.device)
-    nearest[front.pixel] = front.depth
-    hidden = (nearest.index_select(0, covering.pixel) < covering.depth).float()
-    if samples == 1:
-        return hidden
-    pixel = _coarse_pixel(covering, samples)
-    sums = torch.zeros(2, math.prod(piece.shape), device=hidden.device)
-    sums[0].index_add_(0, pixel, hidden)
-    sums[1].index_add_(0, pixel, torch.ones_like(hidden))
-    return (sums[0] / sums[1].clamp_min(1)).index_select(0, piece.pixel)
-
-
 def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:
     """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
     scene, parts = needs_pictures(stage.scene), None
@@ -260,7 +228,9 @@ def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditio
         fragments = rasterize(surface.vertices, surface.faces, flat, 1e-9)
         coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=stage.device)
         parts = piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
-    return Views(stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts)
+    return Views(
+        stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts, None
+    )
 
 
 def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:
