@@ -144,6 +144,8 @@ def listening(app):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
+        while not server.started and thread.is_alive():  # else the socket closes under it, if nobody calls
+            time.sleep(0.01)
         yield f"http://127.0.0.1:{listener.getsockname()[1]}/{TOKEN}/"
         server.should_exit = True
         thread.join(20)
