@@ -301,6 +301,16 @@ def rows_of(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def test_figures_of_a_step_are_the_stored_ones():
+    told = {"mobilenet_v2_1.0_224": "MobileNetV2 1.0", "squeezenet1.1_224": "SqueezeNet 1.1"}
+    rows = rows_of("speed/step.csv")
+    assert len(rows) == 8
+    for alone, shared in zip(rows[::2], rows[1::2], strict=True):
+        name = told.get(alone["network"], "ResNet-50 of random weights")
+        name = "with every effect on" if alone["scene"] == "effects" else name
+        assert f"| {name} | {float(alone['ratio']):.2f} | {float(shared['ratio']):.2f} |" in words(NOTEBOOK)
+
+
 def test_figures_of_views_are_the_stored_ones():
     page, rows = words(NOTEBOOK), rows_of("views/views.csv")
     assert len(rows) == 10

@@ -2,7 +2,8 @@
 
 In: scene files of this folder. Out, per scene, two lines of `traced.csv`: of a design that is optimized first as its
 scene says, and of the bare object, means over the conditions with 95 % intervals (Student's). One design each.
-Run in this folder, with `pip install "patchproof[pathtrace]"`: python traced.py suv postbox light carton kaykit pickup mug box
+Run in this folder, with `pip install "patchproof[pathtrace]"`:
+python traced.py suv postbox light carton kaykit pickup mug box
 """
 
 import csv

@@ -18,7 +18,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
 from patchproof.render.raster import rasterize
-from patchproof.render.views import Views, cameras, near_mm, see
+from patchproof.render.views import Views, cameras, near_mm
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import needs_mesh
 from patchproof.strict import Strict
@@ -98,19 +98,23 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
 
 def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dict[str, float], Views]:
     """(milliseconds of the parts of `see`, the views)."""
-    size, clock = (problem.training_px, problem.training_px), _Clock(problem.device)
-    views = problem.see(shown, conditions, problem.training_px)
+    side_px = problem.training_px
+    problem.see(None, conditions, 16)  # brings the places behind the object into memory, which a run does once
+    clock = _Clock(problem.device)
+    views = problem.see(shown, conditions, side_px)
     whole = clock.lap()
-    see(problem.stage, None, conditions, size)
+    problem.see(None, conditions, side_px)
     parts = {"see: background": clock.lap()}
     if problem.scene.HAS_OBJECT:
         scene = needs_mesh(problem.scene)
         poses, surface = scene.camera_from_world(conditions), problem.stage.object_surface
-        matrices = np.broadcast_to(scene.matrix_px(size), (len(poses), 3, 3))
-        rasterize(surface.vertices, surface.faces, cameras(poses, matrices, size, problem.stage), near_mm(scene))
+        matrices = np.broadcast_to(scene.matrix_px((side_px, side_px)), (len(poses), 3, 3))
+        rasterize(
+            surface.vertices, surface.faces, cameras(poses, matrices, (side_px, side_px), problem.stage), near_mm(scene)
+        )
         rasterizing = min(clock.lap(), parts["see: background"])
         rest = parts.pop("see: background") - rasterizing
-        parts |= {"see: rasterize object": rasterizing, "see: object's texels, background": rest}
+        parts |= {"see: rasterize object": rasterizing, "see: object's texels, outlines, background": rest}
     if views.piece is not None:
         parts["see: piece's footprints"] = max(0.0, whole - sum(parts.values()))
     return parts, views
