@@ -54,7 +54,8 @@ def mean_color(problem: Problem, shown: Shown, views: int, side_px: int) -> tupl
         light = shade(turned, shown).permute(0, 2, 3, 1).reshape(-1, 3)
     within = torch.zeros(len(light), dtype=torch.bool, device=light.device)
     within[turned.on_object.pixel] = True
-    within[turned.outlines.pixel] = False
+    if turned.outlines is not None:
+        within[turned.outlines.pixel] = False
     light = light[within]
     red, green, blue = (srgb_from_linear(light.double().mean(0)) * 255).round().clamp(0, 255).int().tolist()
     return red, green, blue
