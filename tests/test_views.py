@@ -20,10 +20,10 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
 from patchproof.render.photograph import expose, photograph, shade
-from patchproof.render.pixels import Look, ObjectTextures, PiecePicture
+from patchproof.render.pixels import ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
-from patchproof.render.views import relit, see
+from patchproof.render.views import relit, see, seen_again
 from patchproof.scene.conditions import draw, with_poses_of, with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import marker_image
@@ -161,12 +161,17 @@ def test_views_lit_anew_are_views_seen_anew(tmp_path, tables):
     scene = scene_of(tmp_path, tables=tables)
     stage, piece, poses, other = set_stage(scene), piece_of(scene), scene.draw("train", 3), scene.draw("select", 3)
     textures = ObjectTextures(stage.object.textures_srgb)
-    seen = see(stage, piece, poses, (96, 96))
-    before = expose(seen, piece)
-    anew = see(stage, piece, with_poses_of(other, poses), (96, 96))
+    there = with_poses_of(other, poses)
+    elsewhere = replace(there, pose=replace(there.pose, background=other.pose.background))
     for shown in (piece, None, textures):
-        assert torch.equal(expose(relit(seen, other), shown), expose(anew, shown))
-    assert torch.equal(expose(seen, piece), before) and not torch.equal(expose(anew, piece), before)
+        laid_out = textures if shown is textures else piece
+        seen = see(stage, laid_out, poses, (96, 96))
+        before = expose(seen, shown)
+        for again, anew in ((relit(seen, other), there), (seen_again(seen, other), elsewhere)):
+            pictures = expose(again, shown)
+            assert torch.equal(pictures, expose(see(stage, laid_out, anew, (96, 96)), shown))
+            assert not torch.equal(pictures, before)
+        assert torch.equal(expose(seen, shown), before)
 
 
 def both_ways(monkeypatch, stage, shown, conditions, side):
@@ -415,9 +420,10 @@ def test_more_taps_of_an_object_s_texture_bring_views_nearer_to_reduced_photogra
     reduced = avg_pool2d(photograph(stage, None, conditions, (768, 768), jpeg=False), 4)
     off = {}
     for taps in (1, 2, 4):
-        view = expose(see(stage, None, conditions, (192, 192), Look(taps, 1.0)), None, jpeg=False)
+        view = expose(see(stage, None, conditions, (192, 192), taps), None, jpeg=False)
         off[taps] = float(((view - reduced) ** 2).mean().sqrt())
     assert off[4] < off[2] < 0.8 * off[1], off
     problem = set_problem(scene)
-    small, figure = (problem.see(None, conditions, side).object.texels for side in (96, problem.figure_px))
+    textures = ObjectTextures(stage.object.textures_srgb)
+    small, figure = (problem.see(textures, conditions, side).object.texels for side in (96, problem.figure_px))
     assert len(small.groups) == 1 < len(figure.groups), "views smaller than figures are looked at once a pixel"

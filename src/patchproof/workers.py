@@ -24,6 +24,7 @@ from concurrent import futures
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -142,17 +143,21 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
 
 
 @contextmanager
-def sharing(function: Callable[[Any], Any], jobs: int) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
+def sharing(
+    function: Callable[[Any], Any], jobs: int, in_turn: bool = False
+) -> Iterator[tuple[Workers, Callable[[Any], Any]]]:
     """`jobs` forked processes that have a function with everything that it refers to, as it is now, and what to call in
     them in its place; only items and results are sent. One job, and a process that was forked for a share itself, works
-    here; so does a system that cannot fork (`can_fork`), on as many threads.
+    here; so does a system that cannot fork (`can_fork`), on as many threads. Items that go round `in_turn` find what
+    their process kept of an earlier one; otherwise the first that is free takes the next.
     """
     alone = jobs == 1 or _function is not None
     if alone or not can_fork():
         with nullcontext() if alone else threads(jobs):
             yield Workers(_Here, 1), function
         return
-    with threads(1), closing(Workers(partial(_processes, jobs, True, function), 2 * jobs)) as workers:
+    start = partial(_InTurn if in_turn else _processes, jobs, True, function)
+    with threads(1), closing(Workers(start, 2 * jobs)) as workers:
         yield workers, _shared
 
 
@@ -242,6 +247,21 @@ def _processes(jobs: int, forks: bool, function: Callable[[Any], Any] | None = N
     context = multiprocessing.get_context("fork" if forks else "spawn")
     executor = _Quietly(jobs, context, _begin, (os.getpid(), function))
     return executor if forks else _OneThreadEach(executor)
+
+
+class _InTurn(Executor):
+    """Processes that get items one after the other."""
+
+    def __init__(self, jobs: int, forks: bool, function: Callable[[Any], Any]):
+        self._executors = [_processes(1, forks, function) for _ in range(jobs)]
+        self._next = cycle(self._executors)
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        return next(self._next).submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        for executor in self._executors:
+            executor.shutdown(wait, cancel_futures=cancel_futures)
 
 
 class _Quietly(futures.ProcessPoolExecutor):

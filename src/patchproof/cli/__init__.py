@@ -23,6 +23,7 @@ from patchproof.cli.journey import demo, optimize, promise, reprint, sheet, veri
 from patchproof.output import disk_is_full
 from patchproof.strict import Refused
 from patchproof.version import __version__
+from patchproof.workers import keep_freed_memory
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -65,6 +66,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # Windows gives pipes its code page, which has no ε
             stream.reconfigure(encoding="utf-8")
+    keep_freed_memory()
     warnings.formatwarning = lambda message, *where: f"warning: {message}\n"
     try:
         app()

@@ -23,7 +23,7 @@ import torch
 from patchproof.claims import student_mean
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import draft, part_of, start, views_seen
+from patchproof.optimizer.loop import draft, part_of, seen, start, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
@@ -227,7 +227,7 @@ class _Search:
 
 def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:
     """The loss of gray, and the decrease that its gradient promises."""
-    part = part_of(problem, start(problem).design, conditions, pictures=False)
+    part = part_of(problem, start(problem).design, seen(problem, conditions))
     gradient = torch.as_tensor(part.gradient)
     coarse = problem.subject.levels(gradient)[-1]
     return part.loss, _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()

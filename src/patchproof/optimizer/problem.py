@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Subject
 from patchproof.optimizer.texture import Texture
-from patchproof.render.pixels import PHOTOGRAPHED, Look, Shown
+from patchproof.render.pixels import PHOTOGRAPHED_TAPS, Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, see
@@ -32,12 +33,10 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
-# Sides at which views are rendered: this many pixels at least, for figures at least so many times the largest input.
-# There a view stands for a photograph that the network reduces more: averaging textures over three quarters of a pixel
-# leaves it as sharp. Mean confidences of designs are then within 0.007 of 200 full photographs' in four of five scenes
-# and 0.026 too low in one; over a whole pixel a textured car's are 0.04 too low.
-LEAST_PX, FIGURE_SCALE = 192, 2
-TRAINED, FIGURED = Look(taps=1, side=1.0), Look(taps=3, side=0.75)
+# Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
+# no less than so many pixels, since each of them takes one sample. Training's are of the network's own side, with one
+# look at an object's texture, but for small networks.
+FIGURE_SCALE, LEAST_PX, SMALL_PX, TRAINED_TAPS = 1.5, 128, 192, 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +54,17 @@ class Problem:
 
     @property
     def training_px(self) -> int:
-        """The side at which views are rendered for training and selection: the smallest whole multiple of the largest
-        input size that is no less than `LEAST_PX`.
-        """
-        return self._multiple(1)
+        """The side at which views are rendered for training and selection."""
+        return self.figure_px if self.network_px < SMALL_PX else min(self.network_px, self._photo_px)
 
     @property
     def figure_px(self) -> int:
         """The side at which views are rendered for figures that people will read."""
-        return self._multiple(FIGURE_SCALE)
+        return min(max(math.ceil(FIGURE_SCALE * self.network_px), LEAST_PX), self._photo_px)
+
+    @property
+    def _photo_px(self) -> int:
+        return min(self.scene.settings.camera.photo_px)
 
     def losses(self, classifier: Classifier, logits: Tensor, indices: Sequence[int]) -> Tensor:
         """N losses to descend on, of what a network answers."""
@@ -77,8 +78,14 @@ class Problem:
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
-        look = TRAINED if side_px < self.figure_px else FIGURED if side_px == self.figure_px else PHOTOGRAPHED
-        return see(self.stage, shown, conditions, (side_px, side_px), look)
+        taps = TRAINED_TAPS if side_px < self.figure_px else PHOTOGRAPHED_TAPS
+        return see(self.stage, shown, conditions, (side_px, side_px), taps)
+
+    @cached_property
+    def laid_out(self) -> Shown:
+        """What is seen before anything is known of a design: any takes its place in the same views."""
+        with torch.no_grad():
+            return self.subject.shown(self.subject.start())
 
     def before(self, chosen: Sequence[int]) -> Problem:
         """The same before some of its networks, by number."""
@@ -102,10 +109,6 @@ class Problem:
     def network_px(self) -> int:
         """The largest input size."""
         return max(classifier.input_px for classifier in self.classifiers)
-
-    def _multiple(self, at_least: int) -> int:
-        times = max(at_least, math.ceil(LEAST_PX / self.network_px))
-        return min(times * self.network_px, min(self.scene.settings.camera.photo_px))
 
     @property
     def device(self) -> torch.device:

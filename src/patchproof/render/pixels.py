@@ -24,19 +24,9 @@ DESIGN_TAPS = 8
 LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
 
 
-@dataclass(frozen=True)
-class Look:
-    """How pixels look at textures: each over `side` of its own width and height, at the object's in so many `taps`
-    along its footprint's shorter side.
-    """
-
-    taps: int
-    side: float
-
-
-# Four taps leave an object's own texture within 0.003 of the confidence that a network has with eight (60 photographs
-# of a textured car), one within 0.073.
-PHOTOGRAPHED = Look(taps=4, side=1.0)
+# The same at the object's own texture. Four leave it within 0.003 of the confidence that a network has with eight (60
+# photographs of a textured car), one within 0.073.
+PHOTOGRAPHED_TAPS = 4
 
 
 @dataclass(frozen=True)
@@ -72,7 +62,7 @@ class ObjectPixels:
 
     pixel: Tensor
     view: Tensor
-    texels: Footprint
+    texels: Footprint | None  # None where the object's own texture, which nothing replaces, is in `color`
     color: Tensor  # P×3: what the texture is multiplied by
     normal: Tensor
     position_mm: Tensor | None  # where light needs it
@@ -100,7 +90,6 @@ def piece_pixels(
     piece: PiecePicture,
     fragments: Fragments,
     hidden: Tensor | None,
-    look: Look = PHOTOGRAPHED,
     needs_position: bool = False,
     white_coefficients: Tensor | None = None,
 ) -> PiecePixels:
@@ -122,7 +111,7 @@ def piece_pixels(
         kept.pixel,
         kept.view,
         share.index_select(0, front)[:, None],
-        _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size),
+        _piece_footprint(piece, mm / size, mm_dx / size, mm_dy / size),
         torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
         position,
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
@@ -138,7 +127,7 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
 
 
-def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look) -> ObjectPixels:
+def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: bool, taps: int) -> ObjectPixels:
     """The object's fragments; faces seen from behind turn their normal round."""
     at, (uv_dx, uv_dy) = _weighted(surface.corners, fragments), _slopes(surface.corner_uv, fragments)
     material = surface.material.index_select(0, fragments.face)
@@ -146,7 +135,7 @@ def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: 
     return ObjectPixels(
         fragments.pixel,
         fragments.view,
-        footprint(surface.layout, material, at[:, :2], uv_dx * look.side, uv_dy * look.side, look.taps),
+        footprint(surface.layout, material, at[:, :2], uv_dx, uv_dy, taps),
         at[:, 2:5],
         turned,
         _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,

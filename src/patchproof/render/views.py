@@ -27,9 +27,9 @@ from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines
 from patchproof.render.pixels import (
     LEAST_SHARE,
-    PHOTOGRAPHED,
-    Look,
+    PHOTOGRAPHED_TAPS,
     ObjectPixels,
+    ObjectTextures,
     PiecePicture,
     PiecePixels,
     Shown,
@@ -69,7 +69,7 @@ class Views:
         colors is darker that way. Textures of smaller pictures are therefore averaged as code values: at twice a
         network's size, 40 photographs had 0.04 less confidence than promised that way, 0.09 when light was averaged.
         """
-        return min(self.size_px) < min(self.stage.scene.settings.camera.photo_px)
+        return _reduced(self.stage, self.size_px)
 
     @property
     def on_object(self) -> ObjectPixels:
@@ -91,12 +91,14 @@ class Views:
         return self._behind if self.object is None else self.object_light(self._own_texels)
 
     def object_light(self, texels: Tensor) -> Tensor:
-        """The same with these texels; differentiable."""
+        """The same with these texels; differentiable. Only views that were seen for textures can show others."""
         return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels))
 
     def _object_color(self, texels: Tensor) -> Tensor:
         """The light P×3 of the object's fragments."""
-        return look_up(self.on_object.texels, texels) * (self.on_object.color * self._irradiance(self.on_object))
+        pixels = self.on_object
+        reflected = pixels.color if pixels.texels is None else look_up(pixels.texels, texels) * pixels.color
+        return reflected * self._irradiance(pixels)
 
     def _irradiance(self, pixels: ObjectPixels | PiecePixels) -> Tensor:
         """The light P×1 that falls on pixels."""
@@ -148,10 +150,10 @@ class Views:
 
 
 def see(
-    stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], look: Look = PHOTOGRAPHED
+    stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], taps: int = PHOTOGRAPHED_TAPS
 ) -> Views:
     """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
-    be shown in them; the object behind it is seen, too.
+    be shown in them; the object behind it is seen, too, its texture with so many `taps`.
     """
     piece = shown if isinstance(shown, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
@@ -166,13 +168,13 @@ def see(
     fragments = rasterize(surface.vertices, surface.faces, placed, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
     nearest[fragments.pixel] = fragments.depth
-    look, parts = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None
+    taps, parts = PHOTOGRAPHED_TAPS if scene.LEARNED else taps, None
     if piece is not None:
         printed = cameras(scene.camera_from_print(conditions), matrices, frame.size_px, stage)
         own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
         hidden = nearest.index_select(0, own.pixel) < own.depth
         needs_position = light.lamp is not None or light.gloss is not None
-        parts = piece_pixels(stage.piece_surface, piece, own, hidden, look, needs_position)
+        parts = piece_pixels(stage.piece_surface, piece, own, hidden, needs_position)
     return Views(
         stage,
         conditions,
@@ -181,10 +183,22 @@ def see(
         light,
         eye.float(),
         backgrounds(scene, conditions, size_px, frame),
-        object_pixels(surface, fragments, light.lamp is not None, look),
+        _own_looked_up(stage, shown, size_px, object_pixels(surface, fragments, light.lamp is not None, taps)),
         parts,
         outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
     )
+
+
+def _own_looked_up(stage: Stage, shown: Shown, size_px: tuple[int, int], pixels: ObjectPixels) -> ObjectPixels:
+    """The object's pixels with its own texture in their color, unless others will take its place."""
+    if pixels.texels is None or needs_mesh(stage.scene).LEARNED or isinstance(shown, ObjectTextures):
+        return pixels
+    own = stage.object_surface.texels(_reduced(stage, size_px))
+    return replace(pixels, texels=None, color=look_up(pixels.texels, own) * pixels.color)
+
+
+def _reduced(stage: Stage, size_px: tuple[int, int]) -> bool:
+    return min(size_px) < min(stage.scene.settings.camera.photo_px)
 
 
 def _covered(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
@@ -202,6 +216,17 @@ def relit(views: Views, conditions: Conditions) -> Views:
     if light is not None:
         light = _light(needs_mesh(views.stage.scene), views.stage.device, conditions)
     return replace(views, conditions=conditions, light=light)
+
+
+def seen_again(views: Views, conditions: Conditions) -> Views:
+    """`relit`, and with the object before the conditions' own backgrounds; pictures that are all of a view stay."""
+    views = relit(views, conditions)
+    if not views.stage.scene.HAS_OBJECT:
+        return views
+    pose = replace(views.conditions.pose, background=conditions.pose.background)
+    conditions, scene = replace(conditions, pose=pose), needs_mesh(views.stage.scene)
+    frame = lens_frame(views.stage, scene, views.size_px)
+    return replace(views, conditions=conditions, background=backgrounds(scene, conditions, views.size_px, frame))
 
 
 def cameras(poses: np.ndarray, matrices: np.ndarray, size_px: tuple[int, int], stage: Stage) -> Cameras:
