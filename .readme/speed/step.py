@@ -1,8 +1,10 @@
 """A step of the optimizer beside its network's own work: the share that is ours.
 
-In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`: medians over rounds, in milliseconds,
-of a step of four views, selections apart, and of the network's forward and backward pass of four such pictures in the
-same round; so many processes share the views, so many threads the pass. Run in this folder, idle: python step.py
+In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`, in milliseconds: a step of four views,
+selections apart, and the network's forward and backward pass of four such pictures in the same round; so many processes
+share the views, so many threads the pass. Means over rounds of the medians in each: poses come round as in a run of
+default length, so that a quarter of the rounds sees them for the first time. Freed memory is kept as the command line
+keeps it, by the pass, too. Run in this folder, idle: python step.py
 """
 
 import csv
@@ -16,6 +18,7 @@ from torch import nn
 import patchproof as pp
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
+from patchproof.workers import keep_freed_memory
 
 ROUNDS, STEPS = 12, 4
 NAMES = [f"label {i}" for i in range(999)] + ["jeep"]
@@ -65,6 +68,7 @@ def measured(name: str, scene: str, processes: int) -> dict:
     asked = pp.load_scene(f"{scene}.toml").settings.changed(optimize={"steps": (ROUNDS + 1) * STEPS})
     scene = pp.make_scene(asked)
     problem = replace(set_problem(scene, models=models), jobs=processes)
+    loop.POSES = 0  # a quarter of the views
     pictures = torch.rand(4, 3, problem.training_px, problem.training_px)
     problem.see(None, scene.draw("train", 256), 16)  # makes the places that training knows, once
     running, rounds = loop.steps(problem), []
@@ -80,12 +84,12 @@ def measured(name: str, scene: str, processes: int) -> dict:
                 steps.append(1000 * (time.perf_counter() - start))
         rounds.append((statistics.median(steps), statistics.median(passes)))
     running.close()
-    step_ms, own_ms = (statistics.median(values) for values in zip(*rounds[1:], strict=True))
-    ratio = statistics.median(step / own for step, own in rounds[1:])
-    return {"step_ms": round(step_ms, 1), "pass_ms": round(own_ms, 1), "ratio": round(ratio, 3)}
+    step_ms, own_ms = (statistics.mean(values) for values in zip(*rounds[1:], strict=True))
+    return {"step_ms": round(step_ms, 1), "pass_ms": round(own_ms, 1), "ratio": round(step_ms / own_ms, 3)}
 
 
 if __name__ == "__main__":
+    keep_freed_memory()
     kinds = [(n, "suv") for n in ("mobilenet_v2_1.0_224", "squeezenet1.1_224", "resnet50")]
     with open("step.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, ("network", "scene", "processes", "step_ms", "pass_ms", "ratio"))

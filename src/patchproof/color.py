@@ -46,7 +46,9 @@ def clamped(values):
     and a pixel of full black or white would never move again.
     """
     xp = _library(values)
-    return xp.where(values < 0, 0.0, xp.where(values > 1, 1.0, values))
+    if xp is np or values.requires_grad:
+        return xp.where(values < 0, 0.0, xp.where(values > 1, 1.0, values))
+    return values.clamp(0, 1)
 
 
 def codes_of(srgb):

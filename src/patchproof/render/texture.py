@@ -79,11 +79,18 @@ def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
     for level in textures:
         for k in range(max(level.shape[:2]).bit_length()):
             if k:
-                level = _halved(_halved(level).transpose(0, 1)).transpose(0, 1)
+                level = _smaller(level)
             edge = 0 if wrap else -1
             padded = torch.cat([level, level[:, edge, None]], 1)
             parts.append(torch.cat([padded, padded[edge, None]]).flatten(0, 1))
     return torch.cat(parts)
+
+
+def _smaller(level: Tensor) -> Tensor:
+    """Half the rows and columns of H×W×3."""
+    if level.shape[0] % 2 or level.shape[1] % 2:
+        return _halved(_halved(level).transpose(0, 1)).transpose(0, 1)
+    return F.avg_pool2d(level.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)  # the same by a tenth of the operations
 
 
 def _halved(level: Tensor) -> Tensor:
