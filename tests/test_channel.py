@@ -130,12 +130,12 @@ def test_motion_is_each_pictures_own_and_too_short_a_one_costs_nothing():
     assert moved(pictures, torch.tensor([0.0, 1.0, 1.3]), angles) is pictures
 
 
-def test_only_what_treats_pixels_alone_and_alike_is_pointwise():
+def test_only_what_treats_pixels_alone_is_pointwise():
     def pointwise(**camera):
         return is_pointwise(sensor(3, **camera), 1.0, False)
 
-    assert pointwise() and pointwise(exposure_ev=[-1, 1], white_balance=0.1, motion_px=[0, 1])
-    for term in ({"vignetting": [0, 0.2]}, {"motion_px": [4, 4]}, {"blur_px": [2, 2]}, {"noise": [0.05, 0.05]}):
+    assert pointwise() and pointwise(exposure_ev=[-1, 1], white_balance=0.1, motion_px=[0, 1], vignetting=[0, 0.2])
+    for term in ({"motion_px": [4, 4]}, {"blur_px": [2, 2]}, {"noise": [0.05, 0.05]}):
         assert not pointwise(**term), term
 
 

@@ -25,7 +25,7 @@ from patchproof.optimizer.promise_later import promise_run
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import load_run, optimize_scene
 from patchproof.render.photograph import photograph
-from patchproof.scene.conditions import with_values
+from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
@@ -355,16 +355,46 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
 
 @pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
 def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatch):
-    """A step of 5 views, the selection, promise and controls, and the search for a place among three."""
+    """A step of 5 views, the selection, promise and controls, and the search for a place among three; nor does it what
+    of the five poses a process keeps.
+    """
+    monkeypatch.setattr(loop, "POSES", 5)
     monkeypatch.setattr(places, "PLACES", 3)
     monkeypatch.setattr(places, "SHARE", 0)
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
+    files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with threads(1):
-        for jobs in (1, 3):
+        for jobs, kept_px in ((1, loop.KEPT_PX), (3, loop.KEPT_PX), (2, 0)):
+            monkeypatch.setattr(loop, "KEPT_PX", kept_px)
             optimize_scene(scene, tmp_path / str(jobs), jobs=jobs)
-    assert same_files(
-        tmp_path / "1", tmp_path / "3", ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
-    )
+    assert same_files(tmp_path / "1", tmp_path / "3", files) and same_files(tmp_path / "1", tmp_path / "2", files)
+
+
+def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "POSES", 6)
+    scene = scene_with(tmp_path, optimize__steps=10)
+    drawn, trained, settings = scene.draw("train", 40), loop.trained_on(scene), scene.settings.optimize
+    assert loop.new_share(settings) == 12 / 40  # a quarter of 40 views, in whole steps of four
+    for name, rounds in (("azimuth_deg", True), ("distance_mm", True), ("background", False)):
+        values, own = getattr(trained.pose, name), getattr(drawn.pose, name)
+        assert np.array_equal(values[:12], own[:12]) and np.array_equal(values[36:], own[:4] if rounds else own[36:])
+    trained, drawn = fields_of(trained), fields_of(drawn)
+    alike = {name for name, values in drawn.items() if np.array_equal(trained[name], values)}
+    assert alike >= {"ambient", "light_azimuth_deg", "dot_gain", "exposure_ev", "noise_seed", "background"}
+    monkeypatch.setattr(loop, "POSES", 240)
+    assert loop.new_share(settings) == 1
+    assert np.array_equal(loop.trained_on(scene).pose.azimuth_deg, drawn["azimuth_deg"])
+
+
+def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
+    problem = set_problem(scene_with(tmp_path))
+    monkeypatch.setattr(loop, "KEPT_PX", 2 * loop.TOGETHER * problem.training_px**2)
+    seen, kept = [], loop._Kept(problem)
+    monkeypatch.setattr(loop, "seen", lambda problem, drawn: seen.append(len(drawn)) or problem.see(None, drawn, 16))
+    drawn = problem.scene.draw("train", 6)
+    for first in (0, 2, 4, 0, 2, 4):
+        kept.lit(first, drawn[first : first + 2])
+    assert seen == [2] * 4, "the third pair is seen twice"
 
 
 def test_an_odd_view_counts_as_much_as_those_that_are_seen_together(tmp_path):

@@ -160,12 +160,12 @@ def test_the_marker_rule_by_hand(tmp_path):
 
 
 def test_stronger_terms_leave_more_and_small_views_may_not_show_them(tmp_path):
-    """A blur of 0.7 px at 300 px is 0.4 px at training's 192, which is rendered; at 600 px it would be 0.2."""
-    weak, _ = errors_of(scene_with(tmp_path, camera__blur_px=[0.7, 0.7], camera__noise=[0.01, 0.01]))
+    """A blur of 1 px at 300 px is 0.4 px at training's 128, which is rendered; at 600 px it would be 0.2."""
+    weak, _ = errors_of(scene_with(tmp_path, camera__blur_px=[1, 1], camera__noise=[0.01, 0.01]))
     strong, _ = errors_of(scene_with(tmp_path, camera__blur_px=[3, 3], camera__noise=[0.1, 0.1]))
     for name in ("blur", "noise"):
         assert strong[name].codes_mean > 2 * weak[name].codes_mean > 0
-    small = {"camera__photo_px": [800, 600], "camera__blur_px": [0.7, 0.7]}
+    small = {"camera__photo_px": [800, 600], "camera__blur_px": [1, 1]}
     unseen, _ = errors_of(scene_with(tmp_path, **small))
     assert weak["blur"].in_training is True and unseen["blur"].in_training is False
     assert unseen["blur"].codes_mean > 0 and unseen["noise"].verdict == "off"

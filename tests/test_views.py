@@ -181,18 +181,19 @@ def both_ways(monkeypatch, stage, shown, conditions, side):
         return quick, photograph(stage, shown, conditions, (side, side))
 
 
-def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch):
-    """Front, back and bare object, with lamp and gloss; but for pixels that the piece's edge or an outline cuts, whose
-    parts the short cut clips and mixes as they are in the end.
+@pytest.mark.parametrize("lost", [0.0, np.array([0.3, 0.2, 0.0])])
+def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch, lost):
+    """Front, back and bare object, with lamp, gloss and vignetting; but for pixels that the piece's edge or an outline
+    cuts, whose parts the short cut clips and mixes as they are in the end.
     """
     scene = scene_of(tmp_path, tables=LIGHT)
     stage, piece = set_stage(scene), piece_of(scene)
-    conditions = with_values(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]))
+    conditions = with_values(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]), vignetting=lost)
     seen = see(stage, piece, conditions, (192, 192))
     part, cut = seen.piece, torch.zeros(3 * 192 * 192, dtype=torch.bool)
-    cut[seen.outlines.pixel] = True
     for pixel, share in ((part.pixel, part.share), (part.back_pixel, part.back_share)):
         cut[pixel] = share[:, 0] < 1 - FLOAT32
+    cut[seen.outlines.pixel] = True
     whole = ~cut.view(3, 1, 192, 192).expand(3, 3, 192, 192)
     for shown in (None, piece):
         quick, slow = both_ways(monkeypatch, stage, shown, conditions, 192)

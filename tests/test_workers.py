@@ -96,6 +96,20 @@ def test_a_share_has_what_its_function_refers_to_also_after_a_worker_died(tmp_pa
 
 
 @forks
+def test_items_in_turn_go_to_the_process_that_had_the_one_so_many_before(tmp_path):
+    had = {}
+
+    def before(i: int) -> tuple[int, int]:
+        had.setdefault(i % 3, []).append(i)
+        return os.getpid(), len(had[i % 3])
+
+    with sharing(before, 3, in_turn=True) as (crew, share):
+        answers = [answer for _ in range(4) for answer in crew.map(share, range(6))]
+    assert len({pid for pid, _ in answers}) == 3
+    assert [times for _, times in answers] == [at // 3 + 1 for at in range(24)]
+
+
+@forks
 def test_a_share_begins_where_torch_and_opencv_already_have_threads():
     """Children that told OpenCV to leave the threads of their parent, which they do not have, waited forever."""
     before = torch.get_num_threads(), cv2.getNumThreads()

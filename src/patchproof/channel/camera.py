@@ -12,6 +12,8 @@ by whoever writes it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -57,15 +59,11 @@ def develop(
 
 
 def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
-    """Whether `develop` treats every pixel alone and alike, so that a changed part can be developed without the rest.
-
-    Vignetting is not alike: it depends on the place.
-    """
+    """Whether `develop` treats every pixel alone, so that a changed part can be developed without the rest."""
     sharp = sensor.blur_px.max() * scale < SMALLEST_BLUR_PX
     still = (sensor.motion_px * scale).max() < SMALLEST_MOTION_PX
-    even = not sensor.vignetting.any()
     clean = (sensor.noise * scale).max() < SMALLEST_NOISE
-    return bool(sharp and still and even and clean and not _is_stored(sensor, scale, jpeg))
+    return bool(sharp and still and clean and not _is_stored(sensor, scale, jpeg))
 
 
 def _is_stored(sensor: Sensor, scale: float, jpeg: bool) -> bool:
@@ -90,18 +88,25 @@ def encoded(linear: Tensor, camera: Camera | None = None) -> Tensor:
 
 
 def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tensor:
-    """Light that falls off from the middle as cos⁴ of an angle does; the photograph's corners lose the share `lost` N.
+    """Light of which the photograph's corners lose the share `lost` N, see `falloff`."""
+    left = falloff(linear.shape[-2:], lost, diagonal_share)
+    return linear if left is None else linear * left
 
-    At r, as a share of the photograph's half diagonal, (1 + t²r²)⁻² of the light is left, with t² from `lost` < 1.
+
+def falloff(size: Sequence[int], lost: Tensor, diagonal_share: float = 1.0) -> Tensor | None:
+    """What is left of the light, N×1×H×W of `size` (H, W), where it falls off from the middle as cos⁴ of an angle does
+    and the photograph's corners lose the share `lost` N, below 1; None where none loses any.
+
+    At r, as a share of the photograph's half diagonal, it is (1 + t²r²)⁻², with t² from `lost`.
     """
     if not bool(lost.any()):
-        return linear
-    height, width = linear.shape[-2:]
-    y = torch.arange(height).to(linear) + 0.5 - height / 2
-    x = torch.arange(width).to(linear) + 0.5 - width / 2
+        return None
+    height, width = size
+    y = torch.arange(height).to(lost) + 0.5 - height / 2
+    x = torch.arange(width).to(lost) + 0.5 - width / 2
     square = (y[:, None] ** 2 + x**2) * (4 * diagonal_share**2 / (height**2 + width**2))
     tangent_square = (1 - lost) ** -0.5 - 1
-    return linear * (1 + tangent_square[:, None, None, None] * square) ** -2
+    return (1 + tangent_square[:, None, None, None] * square) ** -2
 
 
 def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:

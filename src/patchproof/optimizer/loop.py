@@ -165,6 +165,11 @@ def trained_on(scene: Scene) -> Conditions:
     return replace(conditions, pose=pose)
 
 
+def new_share(settings: OptimizeSettings) -> float:
+    """The share of a run's views that show a pose for the first time, from 0 to 1."""
+    return min(1.0, _poses(settings) / (settings.steps * settings.views))
+
+
 def _poses(settings: OptimizeSettings) -> int:
     """How many poses a run has: those of whole steps."""
     return math.ceil(max(POSES, settings.steps * settings.views / LOOKS) / settings.views) * settings.views

@@ -1,7 +1,8 @@
 """What one step of optimization costs on this machine, and where the time goes.
 
 In: a problem and a design. Out: `Cost`: median milliseconds of each part over a few steps' views, after a warm-up. The
-parts are those of the loop; what cannot be timed inside of `see` is the difference of two calls of it.
+parts are those of the loop, where views that share a pose share what it takes to see it; what cannot be timed inside of
+`see` is the difference of two calls of it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.optimizer.loop import new_share
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
@@ -76,6 +78,8 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     """Milliseconds of each part of one step, in the order of the loop."""
     design = design.clone().requires_grad_()
     parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
+    share = new_share(problem.scene.settings.optimize)
+    parts = {name: ms * share for name, ms in parts.items()}
     clock = _Clock(problem.device)
     shown = problem.subject.shown(design)
     parts[problem.subject.LOOK] = clock.lap()

@@ -86,9 +86,9 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
     if shown is not None:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = encoded(PAPER_BACK_LINEAR * views.gains.index_select(0, piece.back_pixel // pixels), camera)
+        back = encoded(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel, piece.back_pixel // pixels), camera)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
-        light = _piece_light(views, shown) * views.gains.index_select(0, piece.view)
+        light = _piece_light(views, shown) * views.exposure(piece.pixel, piece.view)
         image = _blend(image, piece.pixel, piece.share, encoded(light, camera), False)
     return _smooth(views, image, by_code=False)
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.channel.camera import encoded, gains
+from patchproof.channel.camera import diagonal_share_of, encoded, falloff, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
 from patchproof.color import LIGHT_OF_CODE
@@ -120,18 +120,34 @@ class Views:
     def bare_exposed(self) -> Tensor:
         """The bare object, its outlines jagged, as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
         camera = self.stage.camera
-        # the background has 256 codes per view and channel, which are exposed as a table
-        light = torch.tensor(LIGHT_OF_CODE)[:, None] * self.gains[:, None].cpu().double()
-        image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
+        if self._falloff is None:
+            # the background has 256 codes per view and channel, which are exposed as a table
+            light = torch.tensor(LIGHT_OF_CODE)[:, None] * self._gains[:, None].cpu().double()
+            image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
+        else:
+            each = self._behind.view(len(self._gains), -1, 3)
+            image = encoded(each * self._gains[:, None] * self._falloff.view(len(each), -1, 1), camera).view(-1, 3)
         if self.object is None:
             return image
-        color = self._object_color(self._own_texels) * self.gains.index_select(0, self.object.view)
+        color = self._object_color(self._own_texels) * self.exposure(self.object.pixel, self.object.view)
         return image.index_copy(0, self.object.pixel, encoded(color, camera))
 
+    def exposure(self, pixel: Tensor, view: Tensor) -> Tensor:
+        """The camera's factors of the light at pixels P of views P, P×3."""
+        factors = self._gains.index_select(0, view)
+        return factors if self._falloff is None else factors * self._falloff.index_select(0, pixel)
+
     @cached_property
-    def gains(self) -> Tensor:
-        """The camera's factors, N×3."""
+    def _gains(self) -> Tensor:
         return gains(self.conditions.sensor, torch.zeros(0, device=self.stage.device))
+
+    @cached_property
+    def _falloff(self) -> Tensor | None:
+        """What vignetting leaves of the light, N·H·W × 1; None where it takes none."""
+        lost = torch.as_tensor(self.conditions.sensor.vignetting, dtype=torch.float32, device=self.stage.device)
+        share = diagonal_share_of(self.size_px, self.stage.scene.settings.camera.photo_px)
+        left = falloff(self.size_px[::-1], lost, share)
+        return None if left is None else left.view(-1, 1)
 
     @cached_property
     def piece_white(self) -> Tensor:
