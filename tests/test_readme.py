@@ -311,6 +311,35 @@ def test_figures_of_a_step_are_the_stored_ones():
         assert f"| {name} | {float(alone['ratio']):.2f} | {float(shared['ratio']):.2f} |" in words(NOTEBOOK)
 
 
+def test_figures_of_poses_that_come_round_are_the_stored_ones():
+    rows = rows_of("speed/poses.csv")
+    assert len(rows) == 18
+
+    def beside_each(name: str, kind: str):
+        values = np.array([[float(row[f"{of}_{kind}"]) for of in (name, "each")] for row in rows])
+        return student_mean(np.diff(np.log(values) if kind == "loss" else values)[:, 0] * -100)
+
+    for name in ("again", "kept"):
+        loss, rate = beside_each(name, "loss"), beside_each(name, "rate")
+        assert (
+            f"{loss.value:.1f} % [{loss.low:.1f}, {loss.high:.1f}] more loss and {rate.value:+.1f} points "
+            f"[{rate.low:.1f}, {rate.high:.1f}]" in words(NOTEBOOK)
+        )
+
+
+def test_figures_of_a_whole_run_are_the_stored_ones():
+    rows = rows_of("speed/whole.csv")
+    by_commit: dict[str, list[float]] = {}
+    for row in rows:
+        by_commit.setdefault(row["commit"], []).append(float(row["all_s"]))
+    (before, now), page = by_commit.values(), words(NOTEBOOK)
+    assert len(before) == len(now) >= 2
+    for seconds in (before, now):
+        assert " and ".join(f"{s:.0f}" for s in seconds) + " s" in page
+    share = np.mean([b / a for a, b in zip(before, now, strict=True)])
+    assert f"**{share:.2f}** of the time" in page
+
+
 def test_figures_of_views_are_the_stored_ones():
     page, rows = words(NOTEBOOK), rows_of("views/views.csv")
     assert len(rows) == 10

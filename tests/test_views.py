@@ -20,7 +20,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
 from patchproof.render.photograph import expose, photograph, shade
-from patchproof.render.pixels import ObjectTextures, PiecePicture
+from patchproof.render.pixels import Look, ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import relit, see, seen_again
@@ -193,7 +193,8 @@ def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch, lost):
     part, cut = seen.piece, torch.zeros(3 * 192 * 192, dtype=torch.bool)
     for pixel, share in ((part.pixel, part.share), (part.back_pixel, part.back_share)):
         cut[pixel] = share[:, 0] < 1 - FLOAT32
-    cut[seen.outlines.pixel] = True
+    for outlined in (seen, see(stage, None, conditions, (192, 192))):
+        cut[outlined.outlines.pixel] = True
     whole = ~cut.view(3, 1, 192, 192).expand(3, 3, 192, 192)
     for shown in (None, piece):
         quick, slow = both_ways(monkeypatch, stage, shown, conditions, 192)
@@ -421,7 +422,7 @@ def test_more_taps_of_an_object_s_texture_bring_views_nearer_to_reduced_photogra
     reduced = avg_pool2d(photograph(stage, None, conditions, (768, 768), jpeg=False), 4)
     off = {}
     for taps in (1, 2, 4):
-        view = expose(see(stage, None, conditions, (192, 192), taps), None, jpeg=False)
+        view = expose(see(stage, None, conditions, (192, 192), Look(taps, 1.0)), None, jpeg=False)
         off[taps] = float(((view - reduced) ** 2).mean().sqrt())
     assert off[4] < off[2] < 0.8 * off[1], off
     problem = set_problem(scene)

@@ -1,10 +1,10 @@
 """A step of the optimizer beside its network's own work: the share that is ours.
 
-In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`, in milliseconds: a step of four views,
-selections apart, and the network's forward and backward pass of four such pictures in the same round; so many processes
-share the views, so many threads the pass. Means over rounds of the medians in each: poses come round as in a run of
-default length, so that a quarter of the rounds sees them for the first time. Freed memory is kept as the command line
-keeps it, by the pass, too. Run in this folder, idle: python step.py
+In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`, in milliseconds: a step of four
+views, selections apart, and the network's forward and backward pass of four such pictures in the same round; so many
+processes share the views, so many threads the pass. Means over rounds of the medians in each: poses come round as in a
+run of default length, so that a quarter of the rounds sees them for the first time. Freed memory is kept as the command
+line keeps it, by the pass, too. Run in this folder, idle: python step.py
 """
 
 import csv

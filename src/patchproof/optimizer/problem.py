@@ -24,7 +24,7 @@ from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Subject
 from patchproof.optimizer.texture import Texture
-from patchproof.render.pixels import PHOTOGRAPHED_TAPS, Shown
+from patchproof.render.pixels import PHOTOGRAPHED, Look, Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, see
@@ -34,9 +34,10 @@ from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
 
 # Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
-# no less than so many pixels, since each of them takes one sample. Training's are of the network's own side, with one
-# look at an object's texture, but for small networks.
-FIGURE_SCALE, LEAST_PX, SMALL_PX, TRAINED_TAPS = 1.5, 128, 192, 1
+# no less than so many pixels, since each of them takes one sample. Averaging textures over nine tenths of a pixel
+# leaves them as sharp. Training's views are of the network's own side, but for small networks.
+FIGURE_SCALE, LEAST_PX, SMALL_PX = 1.5, 128, 192
+TRAINED, FIGURED = Look(taps=1, side=1.0), Look(taps=3, side=0.9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +79,8 @@ class Problem:
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
-        taps = TRAINED_TAPS if side_px < self.figure_px else PHOTOGRAPHED_TAPS
-        return see(self.stage, shown, conditions, (side_px, side_px), taps)
+        look = TRAINED if side_px < self.figure_px else FIGURED if side_px == self.figure_px else PHOTOGRAPHED
+        return see(self.stage, shown, conditions, (side_px, side_px), look)
 
     @cached_property
     def laid_out(self) -> Shown:

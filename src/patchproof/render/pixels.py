@@ -24,9 +24,19 @@ DESIGN_TAPS = 8
 LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
 
 
-# The same at the object's own texture. Four leave it within 0.003 of the confidence that a network has with eight (60
-# photographs of a textured car), one within 0.073.
-PHOTOGRAPHED_TAPS = 4
+@dataclass(frozen=True)
+class Look:
+    """How pixels look at textures: each over `side` of its own width and height, at the object's in so many `taps`
+    along its footprint's shorter side.
+    """
+
+    taps: int
+    side: float
+
+
+# Four taps leave an object's own texture within 0.003 of the confidence that a network has with eight (60 photographs
+# of a textured car), one within 0.073.
+PHOTOGRAPHED = Look(taps=4, side=1.0)
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,7 @@ def piece_pixels(
     piece: PiecePicture,
     fragments: Fragments,
     hidden: Tensor | None,
+    look: Look = PHOTOGRAPHED,
     needs_position: bool = False,
     white_coefficients: Tensor | None = None,
 ) -> PiecePixels:
@@ -111,7 +122,7 @@ def piece_pixels(
         kept.pixel,
         kept.view,
         share.index_select(0, front)[:, None],
-        _piece_footprint(piece, mm / size, mm_dx / size, mm_dy / size),
+        _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size),
         torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
         position,
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
@@ -127,7 +138,7 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
 
 
-def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: bool, taps: int) -> ObjectPixels:
+def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look) -> ObjectPixels:
     """The object's fragments; faces seen from behind turn their normal round."""
     at, (uv_dx, uv_dy) = _weighted(surface.corners, fragments), _slopes(surface.corner_uv, fragments)
     material = surface.material.index_select(0, fragments.face)
@@ -135,7 +146,7 @@ def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: 
     return ObjectPixels(
         fragments.pixel,
         fragments.view,
-        footprint(surface.layout, material, at[:, :2], uv_dx, uv_dy, taps),
+        footprint(surface.layout, material, at[:, :2], uv_dx * look.side, uv_dy * look.side, look.taps),
         at[:, 2:5],
         turned,
         _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,

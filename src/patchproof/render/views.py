@@ -27,7 +27,8 @@ from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines
 from patchproof.render.pixels import (
     LEAST_SHARE,
-    PHOTOGRAPHED_TAPS,
+    PHOTOGRAPHED,
+    Look,
     ObjectPixels,
     ObjectTextures,
     PiecePicture,
@@ -166,10 +167,10 @@ class Views:
 
 
 def see(
-    stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], taps: int = PHOTOGRAPHED_TAPS
+    stage: Stage, shown: Shown, conditions: Conditions, size_px: tuple[int, int], look: Look = PHOTOGRAPHED
 ) -> Views:
     """The views of `conditions`, with nothing on the object unless a piece is `shown`. Any picture of the same size can
-    be shown in them; the object behind it is seen, too, its texture with so many `taps`.
+    be shown in them; the object behind it is seen, too.
     """
     piece = shown if isinstance(shown, PiecePicture) else None
     if not stage.scene.HAS_OBJECT:
@@ -184,13 +185,13 @@ def see(
     fragments = rasterize(surface.vertices, surface.faces, placed, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
     nearest[fragments.pixel] = fragments.depth
-    taps, parts = PHOTOGRAPHED_TAPS if scene.LEARNED else taps, None
+    look, parts = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None
     if piece is not None:
         printed = cameras(scene.camera_from_print(conditions), matrices, frame.size_px, stage)
         own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
         hidden = nearest.index_select(0, own.pixel) < own.depth
         needs_position = light.lamp is not None or light.gloss is not None
-        parts = piece_pixels(stage.piece_surface, piece, own, hidden, needs_position)
+        parts = piece_pixels(stage.piece_surface, piece, own, hidden, look, needs_position)
     return Views(
         stage,
         conditions,
@@ -199,7 +200,7 @@ def see(
         light,
         eye.float(),
         backgrounds(scene, conditions, size_px, frame),
-        _own_looked_up(stage, shown, size_px, object_pixels(surface, fragments, light.lamp is not None, taps)),
+        _own_looked_up(stage, shown, size_px, object_pixels(surface, fragments, light.lamp is not None, look)),
         parts,
         outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
     )

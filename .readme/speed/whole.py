@@ -1,0 +1,48 @@
+"""A run from nothing to its page, by the code of several checkouts in turn: `optimize`, its promise, `sheet`.
+
+In: `whole.toml`, and `src` folders of checkouts (git worktree add). Out: `whole.csv`: by checkout and round the seconds
+of a new process and of its parts, and what it promised. Run in this folder, idle: python whole.py ROUNDS SRC [SRC ...]
+"""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+RUN = """
+import json, sys, time
+begin = time.perf_counter()
+import patchproof as pp
+ends = []
+scene = pp.load_scene("whole.toml")
+jobs = {"jobs": 2} if "jobs" in pp.optimize.__code__.co_varnames else {}  # before, two threads
+folder = sys.argv[1]
+run = pp.optimize(scene, folder + "/run", on_step=lambda step, total: ends.append(time.perf_counter()), **jobs)
+promised = time.perf_counter()
+pp.sheet(run, folder + "/sheet.pdf")
+end = time.perf_counter()
+parts = {"steps_s": ends[-1] - begin, "promise_s": promised - ends[-1], "sheet_s": end - promised, "all_s": end - begin}
+low, high = run.promise.interval
+print(json.dumps(parts | {"rate": run.promise.rate, "low": low, "high": high}))
+"""
+
+
+def measured(source: Path, number: int) -> dict:
+    """A line of the table."""
+    with TemporaryDirectory() as folder:
+        command, environment = [sys.executable, "-c", RUN, folder], {**os.environ, "PYTHONPATH": str(source.resolve())}
+        said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+    commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
+    values = json.loads(said.splitlines()[-1])
+    return {"commit": commit.stdout.strip(), "round": number} | {name: round(v, 4) for name, v in values.items()}
+
+
+if __name__ == "__main__":
+    rows = [measured(Path(source), n) for n in range(int(sys.argv[1])) for source in sys.argv[2:]]
+    with open("whole.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
