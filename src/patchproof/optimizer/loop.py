@@ -38,7 +38,7 @@ SELECT_VIEWS = 64
 SELECT_CHUNK = 4
 TOGETHER = 2  # views of a step that one process sees: one at a time, seeing took 1.4 times as long
 # A run has this many poses, or a quarter as many as views if that is more. Over 18 pairs of object and seed the loss
-# was 0.7 % [-0.1, 1.4] higher than with a pose to each view, and as many views were recognized. With a background to
+# was 0.7 % [-0.2, 1.5] higher than with a pose to each view, and as many views were recognized. With a background to
 # each pose, too, it was 2 %; with one pose for four steps in a row, 25 to 33 %.
 POSES, LOOKS = 240, 4
 KEPT_PX = 240 * 224**2  # of the views that a process keeps, with 20 to 60 bytes to a pixel
