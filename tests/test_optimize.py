@@ -373,21 +373,23 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatc
 def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "POSES", 6)
     scene = scene_with(tmp_path, optimize__steps=10)
-    drawn, trained, settings = scene.draw("train", 40), loop.trained_on(scene), scene.settings.optimize
-    assert loop.new_share(settings) == 12 / 40  # a quarter of 40 views, in whole steps of four
+    drawn, trained = scene.draw("train", 40), loop.trained_on(scene)
+    assert loop.new_share(scene) == 12 / 40  # a quarter of 40 views, in whole steps of four
     for name, rounds in (("azimuth_deg", True), ("distance_mm", True), ("background", False)):
         values, own = getattr(trained.pose, name), getattr(drawn.pose, name)
         assert np.array_equal(values[:12], own[:12]) and np.array_equal(values[36:], own[:4] if rounds else own[36:])
     trained, drawn = fields_of(trained), fields_of(drawn)
     alike = {name for name, values in drawn.items() if np.array_equal(trained[name], values)}
     assert alike >= {"ambient", "light_azimuth_deg", "dot_gain", "exposure_ev", "noise_seed", "background"}
+    assert loop.new_share(SimpleNamespace(HAS_OBJECT=False, settings=scene.settings)) == 1, "pictures are all of a view"
     monkeypatch.setattr(loop, "POSES", 240)
-    assert loop.new_share(settings) == 1
+    assert loop.new_share(scene) == 1
     assert np.array_equal(loop.trained_on(scene).pose.azimuth_deg, drawn["azimuth_deg"])
 
 
 def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     problem = set_problem(scene_with(tmp_path))
+    monkeypatch.setattr(loop, "POSES", 6)
     monkeypatch.setattr(loop, "KEPT_PX", 2 * loop.TOGETHER * problem.training_px**2)
     seen, kept = [], loop._Kept(problem)
     monkeypatch.setattr(loop, "seen", lambda problem, drawn: seen.append(len(drawn)) or problem.see(None, drawn, 16))

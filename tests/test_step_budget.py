@@ -41,7 +41,8 @@ class Counted(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_a_step_keeps_within_its_budget_of_operations_and_waits(tmp_path):
+def test_a_step_keeps_within_its_budget_of_operations_and_waits(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "POSES", 8)
     problem = set_problem(scene_with(tmp_path))
     state, drawn, kept = loop.start(problem), problem.scene.draw("train", 8), loop._Kept(problem)
 

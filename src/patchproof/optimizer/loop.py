@@ -6,10 +6,11 @@ PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every
 fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
 promise set is never touched here.
 
-A run's poses come round several times, each time before another background, under other light, with another print and
-camera: what was seen is kept, as far as memory allows, and only lit anew. A step depends on the state and its own
-number alone, so that a run that was stopped goes on to the same bytes. Its views are seen two at a time by as many
-processes as the problem has, and gradients are added in the views' order, so that their number changes no byte either.
+Where there is an object, a run's poses come round several times, each time before another background, under other
+light, with another print and camera: what was seen is kept, as far as memory allows, and only lit anew. A step depends
+on the state and its own number alone, so that a run that was stopped goes on to the same bytes. Its views are seen two
+at a time by as many processes as the problem has, and gradients are added in the views' order, so that their number
+changes no byte either.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
     """The steps from `state` (or from the start) to the last one that the scene's settings ask for."""
     state = start(problem) if state is None else state
     settings = problem.scene.settings.optimize
-    conditions, poses = trained_on(problem.scene), _poses(settings)
+    conditions, poses = trained_on(problem.scene), _poses(problem.scene)
     selection = problem.scene.draw("select", SELECT_VIEWS)
     kept = _Kept(problem)  # by each process what it has seen
     for_selection = lru_cache(lambda first: seen(problem, selection[first : first + SELECT_CHUNK]))
@@ -159,20 +160,23 @@ def trained_on(scene: Scene) -> Conditions:
     """A run's training conditions, whose poses come round again; what lies behind an object does not."""
     settings = scene.settings.optimize
     conditions = scene.draw("train", settings.steps * settings.views)
-    pose = conditions.pose[np.arange(len(conditions)) % _poses(settings)]
+    pose = conditions.pose[np.arange(len(conditions)) % _poses(scene)]
     if scene.HAS_OBJECT:
         pose = replace(pose, background=conditions.pose.background)
     return replace(conditions, pose=pose)
 
 
-def new_share(settings: OptimizeSettings) -> float:
+def new_share(scene: Scene) -> float:
     """The share of a run's views that show a pose for the first time, from 0 to 1."""
-    return min(1.0, _poses(settings) / (settings.steps * settings.views))
+    settings = scene.settings.optimize
+    return min(1.0, _poses(scene) / (settings.steps * settings.views))
 
 
-def _poses(settings: OptimizeSettings) -> int:
-    """How many poses a run has: those of whole steps."""
-    return math.ceil(max(POSES, settings.steps * settings.views / LOOKS) / settings.views) * settings.views
+def _poses(scene: Scene) -> int:
+    """How many poses a run has: those of whole steps; of pictures, which are all of a view, all."""
+    settings = scene.settings.optimize
+    views = settings.steps * settings.views
+    return math.ceil(max(POSES, views / LOOKS) / settings.views) * settings.views if scene.HAS_OBJECT else views
 
 
 def _together(drawn: Conditions) -> list[tuple[int, Conditions]]:
@@ -190,7 +194,8 @@ class _Kept:
 
     def __init__(self, problem: Problem):
         self._problem, self._views = problem, dict[int, Views]()
-        self._most = KEPT_PX // (TOGETHER * problem.training_px**2)
+        comes_round = new_share(problem.scene) < 1
+        self._most = KEPT_PX // (TOGETHER * problem.training_px**2) if comes_round else 0
 
     def lit(self, pose: int, drawn: Conditions) -> Views:
         """The views of these conditions, whose poses begin with that number."""

@@ -78,7 +78,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     """Milliseconds of each part of one step, in the order of the loop."""
     design = design.clone().requires_grad_()
     parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
-    share = new_share(problem.scene.settings.optimize)
+    share = new_share(problem.scene)
     parts = {name: ms * share for name, ms in parts.items()}
     clock = _Clock(problem.device)
     shown = problem.subject.shown(design)

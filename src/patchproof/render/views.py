@@ -236,10 +236,10 @@ def relit(views: Views, conditions: Conditions) -> Views:
 
 
 def seen_again(views: Views, conditions: Conditions) -> Views:
-    """`relit`, and with the object before the conditions' own backgrounds; pictures that are all of a view stay."""
+    """`relit`, and with the object before the conditions' own backgrounds."""
     behind = views.conditions.pose.background
     views = relit(views, conditions)
-    if not views.stage.scene.HAS_OBJECT or np.array_equal(behind, conditions.pose.background):
+    if np.array_equal(behind, conditions.pose.background):
         return views
     pose = replace(views.conditions.pose, background=conditions.pose.background)
     conditions, scene = replace(conditions, pose=pose), needs_mesh(views.stage.scene)
