@@ -23,7 +23,7 @@ from patchproof.geometry import rect_corners
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
 from patchproof.photo.detect import LIGHT
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight
-from patchproof.photo.rectify import crop, least_px_per_mm, rectify
+from patchproof.photo.rectify import averaged, crop, flattened, least_px_per_mm, rectified_px
 
 _CELLS = (6, 48)  # least and most along the design's shorter side
 MOST_CLIPPED = 0.5  # share of the design at full white, where color is unknown
@@ -54,8 +54,9 @@ def appearance(
     part, px_from_mm = crop(srgb, px_from_mm, rect_corners(surface.rect_mm), 4 * step)
     linear = _reduced_light(part, step)
     px_from_mm = np.diag([1 / step, 1 / step, 1.0]) @ px_from_mm
-    flat = partial(rectify, linear, px_from_mm, surface.rect_mm)
-    *lit, clipped = cv2.split(flat(cells_per_mm))
+    size = rectified_px(surface.rect_mm, cells_per_mm)
+    flat = flattened(linear, px_from_mm, surface.rect_mm, size)
+    *lit, clipped = cv2.split(averaged(flat, size))
     lit, clipped = np.dstack(lit).astype(float), clipped > 0.05
     blur_mm = geometry.blur_px / geometry.px_per_mm
     expected = coarse(promised.design, lit.shape[:2], blur_mm * promised.design.shape[1] / surface.rect_mm[2])
@@ -80,7 +81,7 @@ def appearance(
     )
     if not with_pictures:
         return color, {}
-    seen = flat(picture_per_mm)[..., :3]
+    seen = averaged(flat, rectified_px(surface.rect_mm, picture_per_mm))[..., :3]
     fitted = fit.apply(seen)
     pictures = {
         "seen": photo_codes_of(srgb_from_linear(seen)),
@@ -100,11 +101,11 @@ def _reduced_light(srgb: np.ndarray, step: int) -> np.ndarray:
     rows = max(1, _STRIP_PX // srgb.shape[1] // step)
     for top in range(0, height, rows):
         strip, into = srgb[top * step : (top + rows) * step], means[top : top + rows]
-        averaged = partial(cv2.resize, dsize=into.shape[1::-1], interpolation=cv2.INTER_AREA)
-        into[..., :3] = averaged(cv2.LUT(strip, _LIGHT))
+        shrunk = partial(cv2.resize, dsize=into.shape[1::-1], interpolation=cv2.INTER_AREA)
+        into[..., :3] = shrunk(cv2.LUT(strip, _LIGHT))
         unclipped = cv2.inRange(strip, (0, 0, 0), 3 * (CLIPPED_CODE - 1,))
         if cv2.countNonZero(unclipped) < unclipped.size:
-            into[..., 3] = averaged((unclipped == 0).astype(np.float32))
+            into[..., 3] = shrunk((unclipped == 0).astype(np.float32))
     return means
 
 
@@ -154,5 +155,4 @@ def coarse(design: np.ndarray, shape: tuple[int, ...], blur_design_px: float) ->
     """The promised light blurred and averaged to `shape` cells."""
     if blur_design_px > 0.3:
         design = cv2.GaussianBlur(design, (0, 0), float(blur_design_px), borderType=cv2.BORDER_REPLICATE)
-    way = cv2.INTER_AREA if shape[1] <= design.shape[1] else cv2.INTER_LINEAR
-    return cv2.resize(design, (shape[1], shape[0]), interpolation=way).astype(float)
+    return averaged(design, (shape[1], shape[0])).astype(float)

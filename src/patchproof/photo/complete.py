@@ -61,7 +61,7 @@ def find_sheet(
     borders: dict[int, Borders] = {}
     box, view = whole(srgb), MarkersInView({}, (), ())
     for level in levels(srgb, box, coarsest_px):
-        before = sum(map(len, detections.values()))
+        before, foreign = sum(map(len, detections.values())), view.foreign
         look(srgb, box, level, printed, detections)
         if sum(map(len, detections.values())) != before:
             detected = fitted(srgb, detections, set(corners_mm), dictionary, borders)
@@ -69,8 +69,10 @@ def find_sheet(
         wanted = expected - view.markers.keys()
         if wanted and view.markers:
             wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
-        # one marker at two places is clutter, or the first that is read of a second print: a finer level tells
-        if not wanted and len(view.doubled) != 1:
+        # one marker at two places, or of another sheet, is clutter, or the first that is read of a second print: a
+        # finer level tells
+        first = len(view.doubled) == 1 or (len(view.foreign) == 1 and view.foreign != foreign)
+        if not wanted and not first:
             break
     return view
 
@@ -154,5 +156,7 @@ def _agreement(srgb: np.ndarray, corners_px: np.ndarray, code: np.ndarray, moved
     box = part_around(centers, 1, srgb.shape)
     light = luminance(np.ascontiguousarray(srgb[box]))
     cells = sample(light, centers - [box[1].start, box[0].start]).reshape(len(moved), -1)
-    shown = cells[cells.std(1) > 1e-6]
-    return max((float(np.corrcoef(place, code[1:-1, 1:-1].ravel())[0, 1]) for place in shown), default=-1.0)
+    shown, printed = cells[cells.std(1) > 1e-6], code[1:-1, 1:-1].ravel()
+    shown, printed = shown - shown.mean(1, keepdims=True), printed - printed.mean()
+    correlation = shown @ printed / (np.linalg.norm(shown, axis=1) * np.linalg.norm(printed))
+    return float(correlation.max(initial=-1.0))

@@ -29,7 +29,7 @@ INWARD, OUTWARD = 1.0, 0.6
 REACH_SIGMAS, LEAST_REACH_PX = 4.0, 2.5
 # what sampling adds to the blur: a pixel's own width (1/12 px²) and bilinear interpolation (mean over phases 1/6 px²)
 _SAMPLING_VARIANCE = 1 / 12 + 1 / 6
-_MOST_STEPS, _SETTLED_PX = (6, 5), 1e-3
+_MOST_STEPS, _SETTLED_PX = (6, 5), (0.02, 1e-3)  # the first round only says where the second one samples
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray
     behind = np.stack([cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1)
     corners, good = rough, np.zeros(len(rough), bool)
     sigma, reach_px = np.zeros((len(rough), 4)), np.full((len(rough), 4), np.inf)
-    for _ in range(2):  # the second round samples across the borders that the first one found, no farther than needed
-        met, good, sigma = _fit_round(luminance, corners, behind, reach_px)
+    for settled_px in _SETTLED_PX:  # the second round samples across the borders that the first one found, no farther
+        met, good, sigma = _fit_round(luminance, corners, behind, reach_px, settled_px)
         moved = np.linalg.norm(met - rough, axis=2).max(1)
         good &= moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
         corners = np.where(good[:, None, None], met, rough)
@@ -83,7 +83,7 @@ def _module_px(corners: np.ndarray, modules: int) -> np.ndarray:
     return np.maximum(depth, 1e-3) / modules
 
 
-def _fit_round(luminance, corners, behind, reach_px):
+def _fit_round(luminance, corners, behind, reach_px, settled_px):
     middle, half, normal = border_frame(corners)
     module = _module_px(corners, behind.shape[2])
     inward = np.clip(INWARD * module, 1.2, np.minimum(reach_px, 12.0))
@@ -99,7 +99,7 @@ def _fit_round(luminance, corners, behind, reach_px):
     count = len(corners) * 4
     along_px = np.linalg.norm(half, axis=-1)
     model = _Model(s, t.reshape(count, ACROSS), module.ravel(), along_px.ravel(), behind.reshape(count, -1))
-    fit = _fit_steps(light.reshape(count, ALONG, ACROSS), model)
+    fit = _fit_steps(light.reshape(count, ALONG, ACROSS), model, settled_px)
     d, a, sigma, black, white = (fit[:, i].reshape(-1, 4) for i in range(5))
     ends = [middle + sign * half + (d + sign * a)[..., None] * normal for sign in (-1, 1)]
     fitted = (white - black > 0.01).all(1) & (np.abs(d) < outward).all(1) & np.isfinite(fit).reshape(-1, 20).all(1)
@@ -154,14 +154,14 @@ def _bell(z):
     return np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
 
 
-def _fit_steps(light, model):
+def _fit_steps(light, model, settled_px):
     """Parameters K×5 (d, a, σ, black, white) of K borders from K×ALONG×ACROSS samples."""
     reach = model.t[:, -1]
     black, white = light[:, :, 4:9].min(2).mean(1), light[:, :, -4:].mean((1, 2))
     theta = np.stack([0 * reach, 0 * reach, np.log(np.maximum(0.25 * reach, 0.5)), black, white], 1)
     weight, now = np.ones(light.shape[:2]), _light(theta, model)
     for round_, most in enumerate(_MOST_STEPS):
-        theta = _gauss_newton(theta, now, light, model, weight, reach, most)
+        theta = _gauss_newton(theta, now, light, model, weight, reach, most, settled_px)
         if round_ == 0:  # stretches that fit far worse than the border's typical one show something else
             now = _light(theta, model)
             misfit = np.sqrt(((now[0] - light) ** 2).mean(2))
@@ -177,9 +177,9 @@ def _light(theta, model):
     return black + (white - black) * shares[0], *shares
 
 
-def _gauss_newton(theta, now, light, model, weight, reach, most):
-    """Damped Gauss-Newton of all borders at once, each until it moves by less than a thousandth of a pixel; `now` is
-    the light at `theta`.
+def _gauss_newton(theta, now, light, model, weight, reach, most, settled_px):
+    """Damped Gauss-Newton of all borders at once, each until it moves by less than `settled_px`; `now` is the light at
+    `theta`.
     """
     fitted, going = theta.copy(), np.arange(len(theta))
     damping, root = np.full(len(theta), 1e-3), np.sqrt(weight)[..., None]
@@ -199,7 +199,7 @@ def _gauss_newton(theta, now, light, model, weight, reach, most):
         moved = np.abs(trial - theta)[:, :2].max(1)
         theta, cost = np.where(better[:, None], trial, theta), np.where(better, new, cost)
         fitted[going] = theta
-        on = ~(moved < _SETTLED_PX)  # borders that show none never settle, and the others need not wait for them
+        on = ~(moved < settled_px)  # borders that show none never settle, and the others need not wait for them
         if not on.any():
             break
         now = tuple(np.where(better[on, None, None], a[on], b[on]) for a, b in zip(then, now, strict=True))

@@ -110,10 +110,22 @@ def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: floa
 
     `pixels` is H×W×C, uint8 or float32 (pass linear light to measure); outside of the photo its rim is repeated.
     """
+    size = rectified_px(rect_mm, px_per_mm)
+    return averaged(flattened(pixels, px_from_mm, rect_mm, size), size)
+
+
+def rectified_px(rect_mm, px_per_mm: float) -> tuple[int, int]:
+    """Width and height of a rectangle at `px_per_mm`."""
+    return max(1, round(rect_mm[2] * px_per_mm)), max(1, round(rect_mm[3] * px_per_mm))
+
+
+def flattened(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, size: tuple[int, int]) -> np.ndarray:
+    """The rectangle as seen from straight above, so many times as wide and high as `size` that samples are as dense as
+    the photograph's own pixels.
+    """
     x, y, width_mm, height_mm = rect_mm
-    size = max(1, round(width_mm * px_per_mm)), max(1, round(height_mm * px_per_mm))
     finest = max(np.linalg.norm(np.linalg.inv(j), 2) for j in _mm_from_px(px_from_mm, rect_corners(rect_mm)))
-    fine = max(1, int(np.ceil(finest * width_mm / size[0])))  # samples at least as dense as the photo's own pixels
+    fine = max(1, int(np.ceil(finest * width_mm / size[0])))
     fine = max(1, min(fine, _LARGEST_PIXELS // max(size)))
     grid = size[0] * fine, size[1] * fine
     part, px_from_mm = crop(pixels, px_from_mm, rect_corners(rect_mm), 2)
@@ -122,8 +134,15 @@ def rectify(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, px_per_mm: floa
     index_from_px = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
     index_from_index = index_from_px @ px_from_mm @ mm_from_index
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(part, index_from_index, grid, None, flags, cv2.BORDER_REPLICATE)
-    return warped if fine == 1 else cv2.resize(warped, size, interpolation=cv2.INTER_AREA)
+    return cv2.warpPerspective(part, index_from_index, grid, None, flags, cv2.BORDER_REPLICATE)
+
+
+def averaged(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Means over area at a width and height; between pixels where these are larger."""
+    if pixels.shape[1::-1] == size:
+        return pixels
+    way = cv2.INTER_AREA if size[0] <= pixels.shape[1] else cv2.INTER_LINEAR
+    return cv2.resize(pixels, size, interpolation=way)
 
 
 def least_px_per_mm(px_from_mm: np.ndarray, rect_mm) -> float:

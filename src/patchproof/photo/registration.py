@@ -19,7 +19,7 @@ import numpy as np
 from patchproof.color import LUMINANCE
 from patchproof.geometry import rect_corners
 from patchproof.photo.detect import luminance
-from patchproof.photo.rectify import crop, rectify
+from patchproof.photo.rectify import averaged, crop, rectify
 
 _CELLS = 8  # along the rectangle's shorter side
 _FINEST_PX = 256  # of the shorter side: shifts are found to a tenth of such a pixel
@@ -52,21 +52,19 @@ def register(
     height, width = light.shape[:2]
     light = light.reshape(height, width)
     printed = _blurred(design @ np.array(LUMINANCE, np.float32), blur_px / px_per_mm * design.shape[1] / w)
-    way = cv2.INTER_AREA if width <= design.shape[1] else cv2.INTER_LINEAR
-    printed = cv2.resize(printed, (width, height), interpolation=way)
+    printed = averaged(printed, (width, height))
     size = max(8, round(min(width, height) / _CELLS))
     reach = max(3, round(_SEARCH * size))
     around = cv2.copyMakeBorder(light, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    starts = [(top, left) for top in _starts(height, size) for left in _starts(width, size)]
+    cells = np.stack([printed[top : top + size, left : left + size] for top, left in starts])
     rows = []
-    for top in _starts(height, size):
-        for left in _starts(width, size):
-            cell = printed[top : top + size, left : left + size]
-            vague = _vagueness(cell)
-            if vague is not None:
-                window = around[top : top + size + 2 * reach, left : left + size + 2 * reach]
-                dx, dy, peak = _peak(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
-                sigma = vague * np.sqrt(1 / peak**2 - 1)
-                rows.append([left + size / 2, top + size / 2, dx - reach, dy - reach, sigma])
+    for (top, left), cell, vague in zip(starts, cells, _vagueness(cells), strict=True):
+        if np.isfinite(vague):
+            window = around[top : top + size + 2 * reach, left : left + size + 2 * reach]
+            dx, dy, peak = _peak(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
+            sigma = vague * np.sqrt(1 / peak**2 - 1)
+            rows.append([left + size / 2, top + size / 2, dx - reach, dy - reach, sigma])
     table = np.array(rows).reshape(-1, 5) / finer
     return Registration(table[:, :2] + [x, y], table[:, 2:4], table[:, 4])
 
@@ -79,16 +77,16 @@ def _starts(length: int, size: int) -> np.ndarray:
     return np.round(np.linspace(0, length - size, max(1, round(length / size)))).astype(int)
 
 
-def _vagueness(cell: np.ndarray) -> float | None:
-    """Pixels that a shift is off for a residual as large as the cell's contrast; None without texture."""
-    rim = round(_RIM * len(cell))
-    inner = cell[rim:-rim, rim:-rim]
-    contrast = float(cell.std())
-    if min(contrast, float(inner.std())) < _LEAST_TEXTURE:
-        return None
-    rows, columns = np.gradient(inner)
-    least = np.linalg.eigvalsh(np.cov(np.stack([rows.ravel(), columns.ravel()]), bias=True))[0]
-    return None if least < 1e-9 else contrast / float(np.sqrt(least * _INDEPENDENT))
+def _vagueness(cells: np.ndarray) -> np.ndarray:
+    """Pixels that a shift is off for a residual as large as the contrast of cells M×n×n; infinity without texture."""
+    rim = round(_RIM * cells.shape[1])
+    inner = cells[:, rim:-rim, rim:-rim]
+    contrast = cells.std((1, 2))
+    slopes = np.stack(np.gradient(inner, axis=(1, 2)), 1).reshape(len(cells), 2, -1)
+    slopes -= slopes.mean(2, keepdims=True)
+    least = np.linalg.eigvalsh(slopes @ slopes.transpose(0, 2, 1) / slopes.shape[2])[:, 0]
+    plain = (np.minimum(contrast, inner.std((1, 2))) < _LEAST_TEXTURE) | (least < 1e-9)
+    return np.where(plain, np.inf, contrast / np.sqrt(np.maximum(least, 1e-9) * _INDEPENDENT))
 
 
 def _peak(correlation: np.ndarray) -> tuple[float, float, float]:
