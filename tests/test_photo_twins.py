@@ -15,7 +15,7 @@ from patchproof.evidence.classify import squares_of
 from patchproof.evidence.measure import identify, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
-from patchproof.photo import complete, detect
+from patchproof.photo import colorfit, complete, detect, edges
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import LIGHT, cells_of, find_markers, luminance, refine
@@ -23,6 +23,7 @@ from patchproof.photo.edges import fit_borders
 from patchproof.photo.limits import edges_in, squares_in
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
+from patchproof.photo.registration import _vagueness
 from test_photo_synthetic import PIECE_IDS, make_manifest, page_raster, photograph, view
 
 IDS = frozenset(PIECE_IDS)
@@ -143,3 +144,61 @@ def test_colors_are_those_of_all_pixels(piece, surface, monkeypatch):
     # the 12-megapixel photographs that were compared differ by 0.0125 at most
     assert reduced.delta_e00_mean == pytest.approx(whole.delta_e00_mean, abs=0.03)
     assert reduced.clipped_share == whole.clipped_share and reduced.glossy_share == whole.glossy_share
+
+
+@pytest.mark.parametrize(("azimuth_deg", "distance_mm", "blur_px"), [(0, 350, 0.6), (35, 500, 0.6), (20, 700, 1.2)])
+def test_a_reduced_picture_seen_through_one_window_gives_the_markers_of_three(
+    piece, surface, monkeypatch, azimuth_deg, distance_mm, blur_px
+):
+    sensor = {"fine": 2, "blur_px": blur_px, "noise": 0.01}
+    photo = photograph(piece, view(azimuth_deg, 5, distance_mm, size_px=(1600, 1200)), (1600, 1200), **sensor)
+    one = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    inner = detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda picture, printed, whole_px, _: inner(picture, printed, whole_px))
+    three = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    assert one.keys() == three.keys() == IDS
+    for marker_id, corners in one.items():
+        np.testing.assert_allclose(corners, three[marker_id], atol=0.02, rtol=0)
+
+
+def test_a_first_round_that_only_nears_the_borders_leaves_them_where_they_were(piece, surface, monkeypatch):
+    photo = photograph(piece, view(25, 10, 400, 8), blur_px=0.7, noise=0.01)
+    nearing = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    monkeypatch.setattr(edges, "_SETTLED_PX", (1e-3, 1e-3))
+    settled = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    assert nearing.keys() == settled.keys() == IDS
+    assert max(np.abs(nearing[i] - settled[i]).max() for i in IDS) < 2e-3
+
+
+def test_a_color_map_that_stops_where_it_settles_is_that_of_all_turns(monkeypatch):
+    rng = np.random.default_rng(0)
+    promised = rng.random((2000, 3))
+    seen = promised @ np.array([[0.6, 0.1, 0.02], [0.05, 0.7, 0.03], [0.01, 0.08, 0.5]]) + 0.03
+    seen += rng.standard_t(2, seen.shape) * 0.01
+    seen[:300] += 0.3  # gloss
+    stopped = colorfit.affine12(seen, promised)
+    monkeypatch.setattr(colorfit, "_SETTLED", 0)
+    turned = colorfit.affine12(seen, promised)
+    assert stopped is not None and turned is not None
+    np.testing.assert_allclose(stopped.apply(seen), turned.apply(seen), atol=5e-4)
+
+
+def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
+    rng = np.random.default_rng(0)
+    cells = rng.random((5, 30, 30), np.float32)
+    cells[0] = 0.5
+    cells[1] = np.linspace(0, 1, 30)  # texture along one side alone
+    vague = _vagueness(cells)
+    assert np.isinf(vague[:2]).all()
+    for cell, figure in zip(cells[2:], vague[2:], strict=True):
+        slopes = np.stack([slope.ravel() for slope in np.gradient(cell[5:-5, 5:-5])])
+        least = np.linalg.eigvalsh(np.cov(slopes, bias=True))[0]
+        assert figure == pytest.approx(cell.std() / np.sqrt(16 * least), rel=1e-4)
+    code = (rng.random((7, 7)) < 0.5).astype(float)
+    srgb = rng.integers(0, 256, (70, 70, 3), np.uint8)
+    quad = np.array([[0, 0], [70, 0], [70, 70], [0, 70]], float)
+    centers = np.mgrid[1:6, 1:6].reshape(2, -1) * 10 + 5
+    light = edges.sample(luminance(srgb), centers.T[:, ::-1].astype(float))
+    expected = np.corrcoef(light, code[1:-1, 1:-1].ravel())[0, 1]
+    assert complete._agreement(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
+    assert complete._agreement(np.full_like(srgb, 9), quad, code) == -1
