@@ -1,7 +1,8 @@
 """A run from nothing to its page, by the code of several checkouts in turn: `optimize`, its promise, `sheet`.
 
-In: `whole.toml`, and `src` folders of checkouts (git worktree add). Out: `whole.csv`: by checkout and round the seconds
-of a new process and of its parts, and what it promised. Run in this folder, idle: python whole.py ROUNDS SRC [SRC ...]
+In: a scene's file, and `src` folders of checkouts (git worktree add). Out: a table of its name, here: by
+checkout and round the seconds of a new process and of its parts, and what it promised. Run in this folder, idle:
+python whole.py SCENE ROUNDS SRC [SRC ...]
 """
 
 import csv
@@ -17,7 +18,7 @@ import json, sys, time
 begin = time.perf_counter()
 import patchproof as pp
 ends = []
-scene = pp.load_scene("whole.toml")
+scene = pp.load_scene(sys.argv[2])
 jobs = {"jobs": 2} if "jobs" in pp.optimize.__code__.co_varnames else {}  # before, two threads
 folder = sys.argv[1]
 run = pp.optimize(scene, folder + "/run", on_step=lambda step, total: ends.append(time.perf_counter()), **jobs)
@@ -30,10 +31,13 @@ print(json.dumps(parts | {"rate": run.promise.rate, "low": low, "high": high}))
 """
 
 
-def measured(source: Path, number: int) -> dict:
+def measured(source: Path, number: int, scene: str) -> dict:
     """A line of the table."""
     with TemporaryDirectory() as folder:
-        command, environment = [sys.executable, "-c", RUN, folder], {**os.environ, "PYTHONPATH": str(source.resolve())}
+        command, environment = (
+            [sys.executable, "-c", RUN, folder, scene],
+            {**os.environ, "PYTHONPATH": str(source.resolve())},
+        )
         said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
     commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
     values = json.loads(said.splitlines()[-1])
@@ -41,8 +45,9 @@ def measured(source: Path, number: int) -> dict:
 
 
 if __name__ == "__main__":
-    rows = [measured(Path(source), n) for n in range(int(sys.argv[1])) for source in sys.argv[2:]]
-    with open("whole.csv", "w", newline="") as file:
+    scene, rounds, *sources = sys.argv[1:]
+    rows = [measured(Path(source), n, scene) for n in range(int(rounds)) for source in sources]
+    with open(f"{Path(scene).stem}.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
