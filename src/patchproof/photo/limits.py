@@ -66,7 +66,7 @@ def squares_in(gray: np.ndarray, perimeter_px: float = 36, most: int = 0) -> int
         _, labels, stats, _ = cv2.connectedComponentsWithStats(dark)
         large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= perimeter_px / 2
         large[0] = False  # what is not dark
-        dark = np.take(large.view(np.uint8), labels)
+        dark = large.view(np.uint8)[labels.astype(np.int32, copy=False)]
         if edges_in(dark) <= most * perimeter_px:
             return 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)

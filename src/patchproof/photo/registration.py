@@ -82,7 +82,7 @@ def _vagueness(cells: np.ndarray) -> np.ndarray:
     rim = round(_RIM * cells.shape[1])
     inner = cells[:, rim:-rim, rim:-rim]
     contrast = cells.std((1, 2))
-    slopes = np.stack(np.gradient(inner, axis=(1, 2)), 1).reshape(len(cells), 2, -1)
+    slopes = np.stack([np.gradient(inner, axis=axis) for axis in (1, 2)], 1).reshape(len(cells), 2, -1)
     slopes -= slopes.mean(2, keepdims=True)
     least = np.linalg.eigvalsh(slopes @ slopes.transpose(0, 2, 1) / slopes.shape[2])[:, 0]
     plain = (np.minimum(contrast, inner.std((1, 2))) < _LEAST_TEXTURE) | (least < 1e-9)
