@@ -15,6 +15,8 @@ from PIL import Image
 from patchproof.bench import chart as charts
 from patchproof.bench import measure, run
 from patchproof.bench.chart import Chart, Check, Point, all_checks, pareto, points_table
+from patchproof.bench.render import resolution_chart
+from patchproof.bench.world import demo_problem
 from patchproof.claims import Estimate
 
 
@@ -102,3 +104,11 @@ def test_an_unknown_benchmark_is_refused_with_the_nearest(tmp_path):
 def test_a_default_is_checked_where_it_stands():
     (check,) = all_checks(chart())
     assert check.claim.startswith("knob: ") and check.figure == 0
+
+
+def test_the_default_is_among_the_sides_of_training_s_views():
+    problem = demo_problem()
+    drawn = problem.subject.start()
+    chart = resolution_chart(problem, drawn, views=2, rounds=1, on_stage=lambda *_: None)
+    (points,) = chart.series.values()
+    assert [point.setting for point in points if point.default] == [f"{problem.training_px} px"]

@@ -25,7 +25,7 @@ from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import take_photo
 from patchproof.scene.conditions import Conditions
 
-SIDES_PX = (96, 128, 192, 224, 384)
+SIDES_PX = (96, 128, 192, 224, 384)  # and the default's
 
 
 def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
@@ -50,14 +50,14 @@ def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int,
         logits = classifier.logits(pictures(side, problem.patch.shown(design), conditions[:8]))
         torch.autograd.grad(problem.losses(classifier, logits, indices).mean(), design)
 
-    truth = []
+    sides, truth = sorted({*SIDES_PX, problem.training_px}), []
     with torch.no_grad():
         for i in range(views):
             photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
             truth.append(confidence(from_pixels(photo)[None])[0])
             on_stage("photographs", i + 1, views)
-    seconds, points, rows = timed({side: lambda side=side: step(side) for side in SIDES_PX}, rounds), [], []
-    for side in SIDES_PX:
+    seconds, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
+    for side in sides:
         with torch.no_grad():
             off = confidence(pictures(side, shown, conditions)) - truth
         cost, is_default = ratio(seconds, side, problem.training_px), side == problem.training_px
