@@ -71,8 +71,8 @@ def find_sheet(
             wanted, box = _still_wanted(srgb, wanted, view, corners_mm, level.scale)
         # one marker at two places, or of another sheet, is clutter, or the first that is read of a second print: a
         # finer level tells
-        first = len(view.doubled) == 1 or (len(view.foreign) == 1 and view.foreign != foreign)
-        if not wanted and not first:
+        unclear = len(view.doubled) == 1 or (len(view.foreign) == 1 and view.foreign != foreign)
+        if not wanted and not unclear:
             break
     return view
 

@@ -39,8 +39,8 @@ DARK = 70  # median code value below which local contrast helps; in light photos
 _FAR_PX, _FAR = 16.0, 0.2
 SMALLEST_MARKER_PX = 9.0  # side at its level: 7 modules of 1.3 px are the least that has been read
 # A reduced picture is looked at through one window of the detector's threshold, a full one through its three, which
-# take twice the time: what that leaves is found where the others say that it lies, or at a finer level.
-REDUCED_WINDOW_PX = 5
+# take twice the time: markers that one misses are found where the others say that they lie, or at a finer level.
+_REDUCED_WINDOW_PX = 5
 
 Box = tuple[slice, slice]
 """Rows and columns of a part of the photograph."""
@@ -221,7 +221,7 @@ def _detect(
     """Ids and corners of one gray picture, part of one whose longer side has `whole_px` pixels."""
     settings = detector_settings()
     if is_reduced:
-        settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = REDUCED_WINDOW_PX
+        settings.adaptiveThreshWinSizeMin = settings.adaptiveThreshWinSizeMax = _REDUCED_WINDOW_PX
     settings.minDistanceToBorder = 0
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     settings.relativeCornerRefinmentWinSize = 0.3

@@ -49,7 +49,7 @@ def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray
     behind = np.stack([cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1)
     corners, good = rough, np.zeros(len(rough), bool)
     sigma, reach_px = np.zeros((len(rough), 4)), np.full((len(rough), 4), np.inf)
-    for settled_px in _SETTLED_PX:  # the second round samples across the borders that the first one found, no farther
+    for settled_px in _SETTLED_PX:  # the second round samples across what the first one found, no farther than needed
         met, good, sigma = _fit_round(luminance, corners, behind, reach_px, settled_px)
         moved = np.linalg.norm(met - rough, axis=2).max(1)
         good &= moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
