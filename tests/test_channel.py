@@ -14,16 +14,19 @@ from patchproof.channel.camera import (
     develop,
     diagonal_share_of,
     encoded,
+    encoded_by_table,
     gains,
     is_pointwise,
     moved,
     noisy,
     vignetted,
 )
+from patchproof.channel.lens import load_camera
 from patchproof.color import linear_from_srgb
 from patchproof.scene.conditions import draw
 from patchproof.settings import SceneSettings
 from patchproof.strict import validated
+from tolerances import BY_TABLE, CODE
 
 
 def sensor(n, **camera):
@@ -35,6 +38,14 @@ def sensor(n, **camera):
         "camera": quiet | camera,
     }
     return draw(validated(SceneSettings, settings, "test"), "promise", n, 0).sensor
+
+
+def test_codes_by_table_are_those_of_the_curve():
+    light = torch.cat([torch.linspace(-0.5, 1.5, 100_001), 2.0 ** torch.linspace(-30, 0, 10_001)]).double()[:, None]
+    for camera in (None, load_camera("phone")):
+        quick = encoded_by_table(light.float().expand(-1, 3), camera)
+        off = (quick.double() - encoded(light, camera)).abs()
+        assert quick.shape == (len(light), 3) and float(off.max()) < BY_TABLE < CODE / 70
 
 
 def test_a_perfect_camera_only_encodes():

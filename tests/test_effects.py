@@ -21,7 +21,7 @@ from patchproof.settings import CameraSettings, LightSettings, PrinterSettings
 from patchproof.validation import ablation
 from test_conditions import EVERYTHING, STREAMS
 from test_optimize import scene_with
-from tolerances import FLOAT32
+from tolerances import BY_TABLE, FLOAT32
 
 # Of the fields below in rows 0 to 39 of seed 3, as they were drawn when one function sampled all of them in order.
 DIGESTS = {
@@ -175,7 +175,7 @@ def test_the_short_way_to_small_pictures_knows_every_effect(problem, effect, mon
     monkeypatch.setattr(photograph, "is_pointwise", lambda *arguments: False)
     ways.append(expose(views, shown))
     quick, slow = (pictures.permute(0, 2, 3, 1).reshape(-1, 3)[~cut] for pictures in ways)
-    torch.testing.assert_close(quick, slow, atol=1e-5, rtol=0)
+    torch.testing.assert_close(quick, slow, atol=BY_TABLE, rtol=0)
 
 
 def test_what_is_not_given_is_off_and_one_row_stands_for_all():

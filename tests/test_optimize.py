@@ -389,14 +389,15 @@ def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path
 
 def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     problem = set_problem(scene_with(tmp_path))
-    monkeypatch.setattr(loop, "POSES", 6)
-    monkeypatch.setattr(loop, "KEPT_PX", 2 * loop.TOGETHER * problem.training_px**2)
-    seen, kept = [], loop._Kept(problem)
+    monkeypatch.setattr(loop, "POSES", 24)
+    monkeypatch.setattr(loop, "KEPT_PX", 5 * loop.TOGETHER * problem.training_px**2)
+    drawn, seen = problem.scene.draw("train", 24), []
     monkeypatch.setattr(loop, "seen", lambda problem, drawn: seen.append(len(drawn)) or problem.see(None, drawn, 16))
-    drawn = problem.scene.draw("train", 6)
-    for first in (0, 2, 4, 0, 2, 4):
+    kept = loop._Kept(problem, drawn)
+    for first in (0, 4, 8, 12, 16, 20, 0, 4, 8, 12, 16, 20):
         kept.lit(first, drawn[first : first + 2])
-    assert seen == [2] * 4, "the third pair is seen twice"
+    assert seen == [2 * loop.AHEAD, 4, 2], "the last pair is seen twice"
+    assert not kept._ahead, "what is not kept is seen once"
 
 
 def test_an_odd_view_counts_as_much_as_those_that_are_seen_together(tmp_path):

@@ -42,7 +42,7 @@ def facing(scene, **values):
 
 
 def plain(scene, level: float) -> PiecePicture:
-    return PiecePicture(torch.full((64, 64, 3), level))
+    return PiecePicture.of(torch.full((64, 64, 3), level))
 
 
 def test_surroundings_light_a_surface_as_ours_do(scene):
@@ -118,7 +118,7 @@ def test_the_piece_lies_where_the_truth_has_it(scene, monkeypatch):
     conditions, stage = facing(scene, ambient=0.8, directional=0.0, azimuth_deg=35.0, roll_deg=10.0), set_stage(scene)
     srgb = torch.ones(64, 64, 3)
     srgb[8:20, 36:56] = 0.0  # a black field on white, off the middle in both axes
-    traced = photograph_traced(stage, PiecePicture(srgb), conditions, PINHOLE)
+    traced = photograph_traced(stage, PiecePicture.of(srgb), conditions, PINHOLE)
     homography = scene.piece_homographies(conditions, (200, 150))[0]
     field_mm = geometry.rect_corners([36, 8, 20, 12]) * np.array(scene.piece.size_mm) / 64
     around_mm = geometry.rect_corners([32, 4, 28, 20]) * np.array(scene.piece.size_mm) / 64

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -13,6 +11,7 @@ from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.plan.terms import Setup, scene_terms
 from patchproof.render.photograph import expose, photograph, shade
+from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.conditions import with_values
@@ -52,7 +51,7 @@ def test_each_view_shows_its_own_misregistration(tmp_path):
     both = photograph(stage, piece, with_values(conditions, misregistration_mm=shifts_mm), size, jpeg=False)
     px_per_mm = piece.srgb.shape[1] / scene.piece.size_mm[0]
     for i, shift in enumerate(shifts_mm):
-        alone = replace(piece, srgb=misregistered(piece.srgb, torch.tensor(shift * px_per_mm)))
+        alone = PiecePicture.of(misregistered(piece.srgb, torch.tensor(shift * px_per_mm)))
         twin = photograph(stage, alone, conditions[i : i + 1], size, jpeg=False)
         torch.testing.assert_close(both[i : i + 1], twin, rtol=0, atol=2e-5)
     plain = photograph(stage, piece, conditions, size, jpeg=False)

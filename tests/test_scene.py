@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -39,7 +37,7 @@ def scene_of(tmp_path, text):
 def piece_of(scene, design_px=(180, 180)):
     """Its markers, and middle gray between them."""
     image, reserved = marker_image(scene.piece, design_px)
-    return PiecePicture(torch.tensor(np.where(reserved[..., None], image, np.float32(0.5))))
+    return PiecePicture.of(torch.tensor(np.where(reserved[..., None], image, np.float32(0.5))))
 
 
 def test_a_scene_knows_its_piece_card_and_id(scene_file):
@@ -111,7 +109,7 @@ def test_a_photograph_shows_the_piece_where_the_homography_says(tmp_path):
     trimesh.creation.box((300, 300, 300)).export(tmp_path / "box.ply")  # the carton's ridge hides some of the edge
     scene = scene_of(tmp_path, SCENE.replace("primitive:carton", "box.ply"))
     stage, conditions = set_stage(scene), scene.draw("promise", 5)
-    piece = PiecePicture(torch.ones(64, 64, 3))
+    piece = PiecePicture.of(torch.ones(64, 64, 3))
     for size in ((800, 600), (300, 300)):
         seen = see(stage, piece, conditions, size)
         homographies = scene.piece_homographies(conditions, size)
@@ -161,7 +159,7 @@ def test_a_patch_turned_away_is_not_seen(tmp_path):
 def test_views_seen_once_can_be_shaded_with_another_design(tmp_path, scene_file):
     scene = load_scene(scene_file)
     stage, conditions, piece = set_stage(scene), scene.draw("train", 3), piece_of(scene)
-    dark = replace(piece, srgb=piece.srgb * 0.3)
+    dark = PiecePicture.of(piece.srgb * 0.3)
     seen = see(stage, piece, conditions, (96, 96))
     torch.testing.assert_close(expose(seen, dark), photograph(stage, dark, conditions, (96, 96)))
     assert not torch.equal(expose(seen, dark), expose(seen, piece))

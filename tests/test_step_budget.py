@@ -44,12 +44,13 @@ class Counted(TorchDispatchMode):
 def test_a_step_keeps_within_its_budget_of_operations_and_waits(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "POSES", 8)
     problem = set_problem(scene_with(tmp_path))
-    state, drawn, kept = loop.start(problem), problem.scene.draw("train", 8), loop._Kept(problem)
+    state, drawn = loop.start(problem), problem.scene.draw("train", 8)
+    kept = loop._Kept(problem, drawn)
 
     def step(first: int) -> None:
         parts = loop._together(drawn[first : first + 4])
         views = [kept.lit(first + at, rows) for at, rows in parts]
-        loop._step(problem, state, [loop.part_of(problem, state.design, part) for part in views])
+        loop._step(problem, state, lambda printed: [loop.part_of(problem, printed, part) for part in views])
 
     step(0)  # what is made once
     for operations, waits in zip(OPERATIONS, WAITS, strict=True):

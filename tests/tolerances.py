@@ -8,3 +8,5 @@ SNAP_PX = 0.5 / 256
 FINITE_DIFFERENCE = 1e-6
 # an 8-bit code value
 CODE = 1 / 255
+# code values of a table of light in 2^18 steps, half a step off where the curve is steepest, 12.92; and float32
+BY_TABLE = 12.92 / 2**19 + FLOAT32

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -49,6 +50,11 @@ class Mesh:
     face_material: np.ndarray  # int64 F, into materials
     materials: tuple[Material, ...]
     warnings: tuple[str, ...] = ()  # what was assumed or left out
+
+    @cached_property
+    def ends_mm(self) -> tuple[np.ndarray, np.ndarray]:
+        """The bounding box's lowest and highest corner."""
+        return self.vertices.min(0), self.vertices.max(0)
 
 
 def from_parts(parts: Sequence[Part], length_mm: float, warnings: Sequence[str] = ()) -> Mesh:

@@ -16,9 +16,9 @@ changes no byte either.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from torch import Tensor
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose
-from patchproof.render.views import Views, seen_again
+from patchproof.render.views import Views, apart, seen_again
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
 from patchproof.settings import OptimizeSettings
@@ -38,6 +38,7 @@ SELECT_AFTER = 120  # training views
 SELECT_VIEWS = 64
 SELECT_CHUNK = 4
 TOGETHER = 2  # views of a step that one process sees: one at a time, seeing took 1.4 times as long
+AHEAD = 4  # steps whose views a process sees together: alone, seeing took 1.4 times as long
 # A run has this many poses, or a quarter as many as views if that is more. Over 18 pairs of object and seed the loss
 # was 0.7 % [-0.2, 1.5] higher than with a pose to each view, and as many views were recognized. With a background to
 # each pose, too, it was 2 %; with one pose for four steps in a row, 25 to 33 %.
@@ -60,7 +61,7 @@ class State:
 
 @dataclass(frozen=True)
 class _Part:
-    """What some of a step's views say: means over them, and the gradient of their mean loss as float32 3×h×w."""
+    """What some of a step's views say: means over them, and the gradient of their mean loss at what is printed."""
 
     views: int
     loss: float
@@ -68,6 +69,9 @@ class _Part:
     rate: float
     gradient: np.ndarray
     pictures: np.ndarray | None
+
+
+Asked = Callable[[Tensor], Sequence[_Part]]  # what views say of what is printed
 
 
 @dataclass(frozen=True)
@@ -111,26 +115,30 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
     settings = problem.scene.settings.optimize
     conditions, poses = trained_on(problem.scene), _poses(problem.scene)
     selection = problem.scene.draw("select", SELECT_VIEWS)
-    kept = _Kept(problem)  # by each process what it has seen
+    kept = _Kept(problem, conditions)  # by each process what it has seen
     for_selection = lru_cache(lambda first: seen(problem, selection[first : first + SELECT_CHUNK]))
 
     def answer(task: tuple[np.ndarray, int, Conditions | None, bool]) -> tuple[float, float] | _Part:
-        pixels, first, drawn, pictures = task
-        design = torch.as_tensor(pixels, device=problem.device)
+        printed, first, drawn, pictures = task
+        printed = torch.as_tensor(printed, device=problem.device)
         if drawn is None:
-            return _tried(problem, for_selection(first), design)
-        return part_of(problem, design, kept.lit(first, drawn), pictures)
+            return _tried(problem, for_selection(first), printed)
+        return part_of(problem, printed, kept.lit(first, drawn), pictures)
 
     with sharing(answer, problem.jobs, in_turn=True) as (workers, share):
+
+        def asked(printed: Tensor, tasks: list[tuple[int, Conditions | None, bool]]) -> list:
+            sent = printed.cpu().numpy()
+            return workers.map(share, [(sent, *task) for task in tasks])
+
         while state.number < settings.steps:
             first, last = state.number * settings.views, state.number + 1 == settings.steps
-            pixels, drawn = state.design.cpu().numpy(), _together(conditions[first : first + settings.views])
-            parts = [(pixels, (first + at) % poses, rows, last) for at, rows in drawn]
-            step = _step(problem, state, workers.map(share, parts))
+            drawn = _together(conditions[first : first + settings.views])
+            tasks = [((first + at) % poses, rows, last) for at, rows in drawn]
+            step = _step(problem, state, partial(asked, tasks=tasks))
             if selects(settings, step.state.number):
-                printed = from_pixels(as_pixels(step.state.design), torch.device("cpu")).numpy()
-                parts = [(printed, at, None, False) for at in range(0, SELECT_VIEWS, SELECT_CHUNK)]
-                step = _select(step, workers.map(share, parts))
+                printed = problem.subject.printed(from_pixels(as_pixels(step.state.design), problem.device))
+                step = _select(step, asked(printed, [(at, None, False) for at in range(0, SELECT_VIEWS, SELECT_CHUNK)]))
             state = step.state
             yield step
 
@@ -153,7 +161,8 @@ def draft(problem: Problem, conditions: Conditions, views: int) -> Tensor:
 
 def step_on(problem: Problem, state: State, drawn: Conditions) -> Step:
     """One step on these conditions, in this process."""
-    return _step(problem, state, [part_of(problem, state.design, seen(problem, rows)) for _, rows in _together(drawn)])
+    views = [seen(problem, rows) for _, rows in _together(drawn)]
+    return _step(problem, state, lambda printed: [part_of(problem, printed, part) for part in views])
 
 
 def trained_on(scene: Scene) -> Conditions:
@@ -190,39 +199,62 @@ def seen(problem: Problem, drawn: Conditions) -> Views:
 
 
 class _Kept:
-    """Views that a process has seen, the first that fit."""
+    """Views that a process has seen, the first that fit, and those of its next steps, which it sees together."""
 
-    def __init__(self, problem: Problem):
-        self._problem, self._views = problem, dict[int, Views]()
+    def __init__(self, problem: Problem, conditions: Conditions):
+        self._problem, self._conditions = problem, conditions
+        self._poses = min(_poses(problem.scene), len(conditions))
+        self._views, self._ahead = dict[int, Views](), dict[int, Views]()
         comes_round = new_share(problem.scene) < 1
         self._most = KEPT_PX // (TOGETHER * problem.training_px**2) if comes_round else 0
 
     def lit(self, pose: int, drawn: Conditions) -> Views:
         """The views of these conditions, whose poses begin with that number."""
-        views = self._views.get(pose) or seen(self._problem, drawn)
+        if pose not in self._views and pose not in self._ahead:
+            self._look_ahead(pose, len(drawn))
+        views = self._views.get(pose) or self._ahead.pop(pose)
         if len(self._views) < self._most:
             self._views[pose] = views
         return seen_again(views, drawn)
 
+    def _look_ahead(self, pose: int, count: int) -> None:
+        views = self._problem.scene.settings.optimize.views
+        poses = range(pose, self._poses, views)[:AHEAD]
+        rows = np.concatenate([np.arange(first, first + count) for first in poses])
+        together = seen(self._problem, self._conditions[rows])
+        self._ahead |= zip(poses, apart(together, count), strict=True)
 
-def part_of(problem: Problem, design: Tensor, views: Views, pictures: bool = False) -> _Part:
-    """Photograph the design in these views and ask which way it goes down."""
-    design = design.clone().requires_grad_()
-    shown = problem.subject.shown(design)
-    photos = expose(views, shown)
+
+def part_of(problem: Problem, printed: Tensor, views: Views, pictures: bool = False) -> _Part:
+    """Photograph what is printed in these views and ask which way it goes down."""
+    printed = printed.detach().requires_grad_()
+    photos = expose(views, problem.subject.showing(printed))
     loss, confidence, rate = score(problem, photos, views.conditions)
-    (gradient,) = torch.autograd.grad(loss, design)
+    (gradient,) = torch.autograd.grad(loss, printed)
     kept = photos.detach().cpu().numpy() if pictures else None
     return _Part(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), kept)
 
 
-def _step(problem: Problem, state: State, parts: Sequence[_Part]) -> Step:
-    design, share = state.design.clone().requires_grad_(), [part.views / sum(p.views for p in parts) for part in parts]
+def gradient_of(problem: Problem, design: Tensor, asked: Asked) -> tuple[Tensor, Sequence[_Part], list[float]]:
+    """The gradient of the views' mean loss at a design, printed once for all of them; what they say, and the share of
+    each part in a mean.
+    """
+    design = design.detach().requires_grad_()
+    printed = problem.subject.printed(design)
+    parts = asked(printed.detach())
+    share = [part.views / sum(p.views for p in parts) for part in parts]
+    gradient = sum(weight * part.gradient for weight, part in zip(share, parts, strict=True))
+    (gradient,) = torch.autograd.grad(printed, design, torch.as_tensor(gradient, device=problem.device))
+    return gradient, parts, share
+
+
+def _step(problem: Problem, state: State, asked: Asked) -> Step:
+    gradient, parts, share = gradient_of(problem, state.design, asked)
 
     def mean(values):
         return sum(weight * value for weight, value in zip(share, values, strict=True))
 
-    gradient = torch.as_tensor(mean(part.gradient for part in parts), device=problem.device)
+    design = state.design.detach().requires_grad_()
     largest, penalty = float(gradient.abs().max()), problem.subject.penalty(design)
     if not math.isfinite(largest):  # one such step would turn the design into nothing for good
         do = "check its number format: some pictures lead it to infinity"
@@ -272,9 +304,9 @@ def score(problem: Problem, pictures: Tensor, conditions: Conditions) -> tuple[T
 
 
 @torch.no_grad()
-def _tried(problem: Problem, seen: Views, design: Tensor) -> tuple[float, float]:
-    """Loss and rate of a design in selection views."""
-    loss, _, rate = score(problem, expose(seen, problem.subject.shown(design)), seen.conditions)
+def _tried(problem: Problem, seen: Views, printed: Tensor) -> tuple[float, float]:
+    """Loss and rate of what is printed, in selection views."""
+    loss, _, rate = score(problem, expose(seen, problem.subject.showing(printed)), seen.conditions)
     return float(loss), rate
 
 

@@ -85,6 +85,14 @@ class Patch:
         """The printed piece with a design of any grid (the optimized one, or as printed); differentiable."""
         return self._printed.shown(design, kind)
 
+    def printed(self, design: Tensor) -> Tensor:
+        """The printed piece's texels T×3, of an optimized design; differentiable."""
+        return self.shown(design).codes
+
+    def showing(self, printed: Tensor) -> PiecePicture:
+        """The piece with these texels."""
+        return PiecePicture(printed, self.design_px)
+
     def printed_by(self, printer: Printer) -> Patch:
         """The same patch as another printer prints it."""
         return replace(self, printer=printer)

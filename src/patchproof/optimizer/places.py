@@ -18,12 +18,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 
 from patchproof.claims import student_mean
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import draft, part_of, seen, start, views_seen
+from patchproof.optimizer.loop import draft, gradient_of, part_of, seen, start, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.responses import responses
@@ -227,8 +226,8 @@ class _Search:
 
 def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:
     """The loss of gray, and the decrease that its gradient promises."""
-    part = part_of(problem, start(problem).design, seen(problem, conditions))
-    gradient = torch.as_tensor(part.gradient)
+    views, gray = seen(problem, conditions), start(problem).design
+    gradient, (part,), _ = gradient_of(problem, gray, lambda printed: [part_of(problem, printed, views)])
     coarse = problem.subject.levels(gradient)[-1]
     return part.loss, _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
 

@@ -71,6 +71,14 @@ class Subject(Protocol):
         """What photographs show of a design, or of a control with the markers of its own sheet; differentiable."""
         ...
 
+    def printed(self, design: Tensor) -> Tensor:
+        """What all pictures of an optimized design have in common, so that a step makes it once; differentiable."""
+        ...
+
+    def showing(self, printed: Tensor) -> Shown:
+        """What photographs show of that; differentiable."""
+        ...
+
     def printed_by(self, printer: Printer) -> Self:
         """The same subject as another printer prints it."""
         ...

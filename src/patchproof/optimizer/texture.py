@@ -122,6 +122,14 @@ class Texture:
         """The object's textures with a design; differentiable."""
         return self.surface.shown(design)
 
+    def printed(self, design: Tensor) -> Tensor:
+        """The design itself: nothing is printed."""
+        return design
+
+    def showing(self, printed: Tensor) -> ObjectTextures:
+        """The object's textures with it."""
+        return self.shown(printed)
+
     def printed_by(self, printer: Printer) -> Texture:
         """The texture itself: nothing is printed."""
         return self

@@ -109,7 +109,7 @@ def straight_picture(
     settings = scene.settings.changed(view=view, camera={"photo_px": (width, height), "file": None})
     white = load_backgrounds(BackgroundSettings(color=(1.0, 1.0, 1.0)), Path())
     plain = replace(stage, scene=replace(scene, settings=settings, frame=frame, backgrounds=white, camera=None))
-    shown = None if on_piece is None else PiecePicture(torch.tensor(on_piece, dtype=torch.float32) / 255)
+    shown = None if on_piece is None else PiecePicture.of(torch.tensor(on_piece, dtype=torch.float32) / 255)
     with torch.no_grad():
         views = see(plain, shown, _even(distance, 0.55, 0.45), (width, height))
         light = _by_rows(shade(views, None))

@@ -34,7 +34,7 @@ class PrintedPiece:
         """The printed piece with a design 3×h×w, on the design's own grid, and the markers of that kind of sheet."""
         height, width = design.shape[1:]
         markers, reserved = self._markers(kind, (width, height))
-        return PiecePicture(torch.where(reserved, markers, self._printed(design)))
+        return PiecePicture.of(torch.where(reserved, markers, self._printed(design)))
 
     @lru_cache(maxsize=8)  # noqa: B019 - it lives as long as its stage
     def _markers(self, kind: str, design_px: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -37,15 +37,45 @@ class Outlines:
     source: Tensor
     share: Tensor
 
+    def part(self, views: range, pixels: int) -> Outlines:
+        """Those of some views, of so many pixels each, as if no others had been seen."""
+        first = views.start * pixels
+        low, high = torch.searchsorted(self.pixel, self.pixel.new_tensor([first, views.stop * pixels])).tolist()
+        of = ((self.of >= low) & (self.of < high)).nonzero()[:, 0]
+        source, share = self.source.index_select(0, of) - first, self.share.index_select(0, of)
+        return Outlines(
+            self.pixel[low:high] - first, self.own[low:high], self.of.index_select(0, of) - low, source, share
+        )
+
     def smooth(self, image: Tensor, by_code: bool) -> Tensor:
         """Pixels by rows, with their shares mixed; of light `by_code`, as code values. Differentiable."""
         if not len(self.pixel):
             return image
-        own, other = image.index_select(0, self.pixel), image.index_select(0, self.source)
-        if by_code:
-            own, other = srgb_from_linear(own), srgb_from_linear(other)
-        mixed = (own * self.own).index_add(0, self.of, other * self.share)
-        return image.index_copy(0, self.pixel, linear_from_srgb(mixed) if by_code else mixed)
+        if not by_code:
+            return _Mixed.apply(image, self)
+        own, other = (srgb_from_linear(image.index_select(0, index)) for index in (self.pixel, self.source))
+        return image.index_copy(0, self.pixel, linear_from_srgb(self.mixed(own, other)))
+
+    def mixed(self, own: Tensor, other: Tensor) -> Tensor:
+        """U×3 of the values at `pixel` and S×3 of those at `source`."""
+        return (own * self.own).index_add_(0, self.of, other * self.share)
+
+
+class _Mixed(torch.autograd.Function):
+    """Shares of values as they are. The library's own gradient of the same goes five times over the whole picture."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, shares: Outlines) -> Tensor:
+        ctx.shares = shares
+        own, other = image.index_select(0, shares.pixel), image.index_select(0, shares.source)
+        return image.index_copy(0, shares.pixel, shares.mixed(own, other))
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        (gradient,), shares = gradients, ctx.shares
+        at_outlines = gradient.index_select(0, shares.pixel)
+        passed = gradient.index_copy(0, shares.pixel, at_outlines * shares.own)
+        return passed.index_add_(0, shares.source, at_outlines.index_select(0, shares.of) * shares.share), None
 
 
 @torch.no_grad()

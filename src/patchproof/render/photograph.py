@@ -126,12 +126,11 @@ def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
 
 def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[PiecePicture]]:
     """Each view's own print of the picture, and footprints on all of them."""
-    (height, width, _), (width_mm, height_mm) = picture.srgb.shape, views.stage.piece_surface.size_mm
-    shifts = torch.as_tensor(views.conditions.print.misregistration_mm).to(picture.srgb)
+    (width, height), (width_mm, height_mm) = picture.size_px, views.stage.piece_surface.size_mm
+    shifts = torch.as_tensor(views.conditions.print.misregistration_mm).to(picture.codes)
     shifts = shifts * shifts.new_tensor([width / width_mm, height / height_mm])
-    prints = [PiecePicture(misregistered(picture.srgb, shift)) for shift in shifts]
-    texels = sum((max(width >> k, 1) + 1) * (max(height >> k, 1) + 1) for k in range(max(width, height).bit_length()))
-    return on_copies(views.on_piece.texels, views.on_piece.view * texels), prints
+    prints = [PiecePicture.of(misregistered(picture.srgb, shift)) for shift in shifts]
+    return on_copies(views.on_piece.texels, views.on_piece.view * len(picture.codes)), prints
 
 
 def _pasted(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:

@@ -41,18 +41,28 @@ PHOTOGRAPHED = Look(taps=4, side=1.0)
 
 @dataclass(frozen=True)
 class PiecePicture:
-    """The whole piece as it looks on paper, H×W×3 sRGB up to the cut line."""
+    """The whole piece of `size_px` (width, height) as it looks on paper, up to the cut line: the sRGB texels T×3 of all
+    levels, averaged as code values, which is what a reduced photograph shows.
+    """
 
-    srgb: Tensor
+    codes: Tensor
+    size_px: tuple[int, int]
 
-    @cached_property
-    def codes(self) -> Tensor:
-        """Its texels T×3 of all levels, averaged as code values: what a reduced photograph shows."""
-        return texel_table([self.srgb], wrap=False)
+    @classmethod
+    def of(cls, srgb: Tensor) -> PiecePicture:
+        """The piece that looks like H×W×3."""
+        return cls(texel_table([srgb], wrap=False), (srgb.shape[1], srgb.shape[0]))
+
+    @property
+    def srgb(self) -> Tensor:
+        """H×W×3."""
+        width, height = self.size_px
+        finest = self.codes[: (height + 1) * (width + 1)]
+        return finest.view(height + 1, width + 1, 3)[:height, :width]
 
     @cached_property
     def light(self) -> Tensor:
-        """The same averaged as light, linear: a fifth of a photograph's time, so once for all that show it."""
+        """Its texels averaged as light, linear: a fifth of a photograph's time, so once for all that show it."""
         return texel_table([linear_from_srgb(self.srgb)], wrap=False)
 
 
@@ -77,6 +87,18 @@ class ObjectPixels:
     normal: Tensor
     position_mm: Tensor | None  # where light needs it
 
+    def part(self, views: range, pixels: int) -> ObjectPixels:
+        """Those of some views, of so many pixels each, as if no others had been seen."""
+        rows = _rows(self.pixel, views, pixels)
+        return ObjectPixels(
+            self.pixel[rows] - views.start * pixels,
+            self.view[rows] - views.start,
+            None if self.texels is None else self.texels.part(rows.start, rows.stop),
+            self.color[rows],
+            self.normal[rows],
+            None if self.position_mm is None else self.position_mm[rows],
+        )
+
 
 @dataclass(frozen=True)
 class PiecePixels:
@@ -93,6 +115,26 @@ class PiecePixels:
     white: Tensor | None
     back_pixel: Tensor  # where its back is seen
     back_share: Tensor
+
+    def part(self, views: range, pixels: int) -> PiecePixels:
+        """Those of some views, of so many pixels each, as if no others had been seen."""
+        rows, back = (_rows(pixel, views, pixels) for pixel in (self.pixel, self.back_pixel))
+        return PiecePixels(
+            self.pixel[rows] - views.start * pixels,
+            self.view[rows] - views.start,
+            self.share[rows],
+            self.texels.part(rows.start, rows.stop),
+            self.normal[rows],
+            None if self.position_mm is None else self.position_mm[rows],
+            None if self.white is None else self.white[rows],
+            self.back_pixel[back] - views.start * pixels,
+            self.back_share[back],
+        )
+
+
+def _rows(pixel: Tensor, views: range, pixels: int) -> slice:
+    """Which of ascending pixels lie in these views."""
+    return slice(*torch.searchsorted(pixel, pixel.new_tensor([views.start, views.stop]) * pixels).tolist())
 
 
 def piece_pixels(
@@ -133,8 +175,7 @@ def piece_pixels(
 
 def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor) -> Footprint:
     """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
-    height, width, _ = piece.srgb.shape
-    where, texture = layout([(width, height)], wrap=False, device=at.device), at.new_zeros(len(at), dtype=torch.long)
+    where, texture = layout([piece.size_px], wrap=False, device=at.device), at.new_zeros(len(at), dtype=torch.long)
     return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
 
 

@@ -56,6 +56,18 @@ class Footprint:
     groups: tuple[Group, ...]
     fragments: int
 
+    def part(self, first: int, last: int) -> Footprint:
+        """What the fragments from `first` up to `last` see."""
+        groups = []
+        for group in self.groups:
+            if group.fragment is None:
+                groups.append(Group(None, group.texel[first:last], group.weight[first:last]))
+                continue
+            low, high = torch.searchsorted(group.fragment, group.fragment.new_tensor([first, last])).tolist()
+            if low < high:
+                groups.append(Group(group.fragment[low:high] - first, group.texel[low:high], group.weight[low:high]))
+        return Footprint(tuple(groups), last - first)
+
 
 def layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str = "cpu") -> Layout:
     """The layout for textures of (width, height) sizes; `wrap` repeats them, else the border texel goes on."""

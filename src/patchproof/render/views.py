@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.channel.camera import diagonal_share_of, encoded, falloff, gains
+from patchproof.channel.camera import diagonal_share_of, encoded, encoded_by_table, falloff, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
 from patchproof.color import LIGHT_OF_CODE
@@ -127,11 +127,12 @@ class Views:
             image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
         else:
             each = self._behind.view(len(self._gains), -1, 3)
-            image = encoded(each * self._gains[:, None] * self._falloff.view(len(each), -1, 1), camera).view(-1, 3)
+            light = each * self._gains[:, None] * self._falloff.view(len(each), -1, 1)
+            image = encoded_by_table(light, camera).view(-1, 3)
         if self.object is None:
             return image
         color = self._object_color(self._own_texels) * self.exposure(self.object.pixel, self.object.view)
-        return image.index_copy(0, self.object.pixel, encoded(color, camera))
+        return image.index_copy_(0, self.object.pixel, encoded_by_table(color, camera))
 
     def exposure(self, pixel: Tensor, view: Tensor) -> Tensor:
         """The camera's factors of the light at pixels P of views P, P×3."""
@@ -187,7 +188,7 @@ def see(
     nearest[fragments.pixel] = fragments.depth
     look, parts = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None
     if piece is not None:
-        printed = cameras(scene.camera_from_print(conditions), matrices, frame.size_px, stage)
+        printed = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
         own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
         hidden = nearest.index_select(0, own.pixel) < own.depth
         needs_position = light.lamp is not None or light.gloss is not None
@@ -247,6 +248,24 @@ def seen_again(views: Views, conditions: Conditions) -> Views:
     return replace(views, conditions=conditions, background=backgrounds(scene, conditions, views.size_px, frame))
 
 
+def apart(views: Views, size: int) -> list[Views]:
+    """Views that were seen together, `size` at a time, each to the bit as if it had been seen without the others."""
+    pixels, parts = views.frame_px[0] * views.frame_px[1], []
+    for first in range(0, len(views.conditions), size):
+        some = slice(first, first + size)
+        own = replace(views, conditions=views.conditions[some], background=views.background[some])
+        numbers = range(first, first + len(own.conditions))
+        own = replace(
+            own,
+            **{
+                name: None if part is None else part.part(numbers, pixels)
+                for name, part in (("object", views.object), ("piece", views.piece), ("outlines", views.outlines))
+            },
+        )
+        parts.append(relit(replace(own, eye_mm=None if views.eye_mm is None else views.eye_mm[some]), own.conditions))
+    return parts
+
+
 def cameras(poses: np.ndarray, matrices: np.ndarray, size_px: tuple[int, int], stage: Stage) -> Cameras:
     """Cameras N×4×4 with matrices N×3×3 on a stage's device."""
     poses_on, matrices_on = (torch.as_tensor(part.copy(), device=stage.device) for part in (poses, matrices))
@@ -286,15 +305,16 @@ def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Fram
 def backgrounds(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
     """What lies behind N views, uint8 N×H×W×3 before exposure; its edge goes on in a lens's margin."""
     photo_px = scene.settings.camera.photo_px
-    pictures = [scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.pose.background]
+    pictures = np.stack([scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.pose.background])
     margin = ((0, 0), (frame.top, frame.bottom), (frame.left, frame.right), (0, 0))
-    return np.pad(np.stack(pictures), margin, mode="edge")
+    return np.pad(pictures, margin, mode="edge") if frame.size_px != size_px else pictures
 
 
 def _looked_up(codes: np.ndarray, tables: np.ndarray, device: torch.device) -> Tensor:
     """uint8 pictures N×H×W×3 through tables N×256×3, pixels by rows."""
     import cv2
 
-    pairs = zip(codes, tables.astype(np.float32), strict=True)
-    pictures = [cv2.LUT(np.ascontiguousarray(code), table[None]) for code, table in pairs]
-    return torch.as_tensor(np.stack(pictures), device=device).view(-1, 3)
+    pictures = np.empty(codes.shape, np.float32)
+    for code, table, picture in zip(codes, tables.astype(np.float32), pictures, strict=True):
+        cv2.LUT(np.ascontiguousarray(code), table[None], picture)
+    return torch.as_tensor(pictures, device=device).view(-1, 3)

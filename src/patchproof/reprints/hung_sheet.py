@@ -94,7 +94,7 @@ class HungSheet:
 
     def printed(self, shows: Callable[[Tensor], Tensor]) -> PiecePicture:
         """The piece as a print shows it that makes sRGB as seen of sRGB as sent, 1×3×H×W both."""
-        return PiecePicture(shows(self.sent)[0].permute(1, 2, 0).contiguous())
+        return PiecePicture.of(shows(self.sent)[0].permute(1, 2, 0).contiguous())
 
     def photograph(self, conditions: Conditions) -> bytes:
         """A JPEG file of one view, of the drawn quality, with the camera's focal length in its EXIF data."""

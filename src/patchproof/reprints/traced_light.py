@@ -89,5 +89,5 @@ def sky_radiance(toward: np.ndarray, light: Light) -> np.ndarray:
     ambient, even = light.ambient[0], np.ones(toward.shape[:-1])
     if not light.sh2.any():
         return ambient * even
-    basis = irradiance_basis(torch.tensor(toward)).numpy() / np.repeat([2 / 3, 1 / 4], [3, 5])
+    basis = np.stack(irradiance_basis(torch.tensor(toward)), -1) / np.repeat([2 / 3, 1 / 4], [3, 5])
     return (ambient * (even + light.sh2[0] * basis @ light.sh2_coefficients[0])).clip(0)

@@ -100,10 +100,14 @@ class MeshScene(Scene):
 
     def camera_from_print(self, conditions: Conditions) -> np.ndarray:
         """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as large as it was
-        printed: all about the piece's middle is scaled, which keeps a card in its plane.
+        printed.
         """
-        scales = [geometry.scaled_about(self.middle_mm, scale) for scale in conditions.pose.printed_scale]
-        return self.camera_from_world(conditions) @ np.stack(scales)
+        return self.camera_from_world(conditions) @ self.printed_from_sheet(conditions)
+
+    def printed_from_sheet(self, conditions: Conditions) -> np.ndarray:
+        """N×4×4: all about the piece's middle is scaled as it is printed, which keeps a card in its plane."""
+        middle_mm = self.middle_mm
+        return np.stack([geometry.scaled_about(middle_mm, scale) for scale in conditions.pose.printed_scale])
 
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
         """3×3 pinhole matrix of the scene's camera for a picture of this size."""
@@ -164,7 +168,7 @@ def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarr
 
 
 def _refuse_inside(mesh: Mesh, eyes: np.ndarray) -> None:
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    low, high = mesh.ends_mm
     near = CLEARANCE * float((high - low).max())
     inside = ((eyes > low - near) & (eyes < high + near)).all(1)
     if inside.any():

@@ -112,7 +112,7 @@ def view_frame(mesh: Mesh, settings: SceneSettings) -> Frame:
 
 def side_frame(mesh: Mesh, side: Side) -> Frame:
     """The frame in the middle of a side of the object's bounding box."""
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    low, high = mesh.ends_mm
     up, normal = (np.array(v, float) for v in _SIDES[side])
     middle = (low + high) / 2 + normal * (np.abs(normal) @ (high - low)) / 2
     return _frame(mesh, np.cross(up, normal), up, normal, middle)

@@ -10,7 +10,7 @@ that is to be measured only the window around the piece is rendered (see `window
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -95,7 +95,7 @@ def piece_at(world: World, point: Point, first_corner: int, gray: bool = False) 
         rows = slice(0, high) if at in (0, 1) else slice(height - high, height)
         columns = slice(0, wide) if at in (0, 3) else slice(width - wide, width)
         srgb[rows, columns] = _TAPE_SRGB
-    return replace(whole, srgb=srgb)
+    return PiecePicture.of(srgb)
 
 
 @lru_cache(maxsize=12)  # both pieces at a sweep's six points
