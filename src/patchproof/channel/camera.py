@@ -94,7 +94,9 @@ def encoded_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
     through.
     """
     index = (linear * _TABLE_STEPS).add_(0.5).clamp_(0, _TABLE_STEPS).int()
-    return _code_table(camera, linear.device).index_select(0, index.flatten()).view(linear.shape)
+    # pyright cannot know that frozen models have a hash
+    table = _code_table(camera, linear.device)  # pyright: ignore[reportArgumentType]
+    return table.index_select(0, index.flatten()).view(linear.shape)
 
 
 @lru_cache(maxsize=4)

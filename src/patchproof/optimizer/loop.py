@@ -127,7 +127,7 @@ def steps(problem: Problem, state: State | None = None) -> Iterator[Step]:
 
     with sharing(answer, problem.jobs, in_turn=True) as (workers, share):
 
-        def asked(printed: Tensor, tasks: list[tuple[int, Conditions | None, bool]]) -> list:
+        def asked(printed: Tensor, tasks: Sequence[tuple[int, Conditions | None, bool]]) -> list:
             sent = printed.cpu().numpy()
             return workers.map(share, [(sent, *task) for task in tasks])
 
