@@ -7,7 +7,7 @@ grows over ink, and at a blur of 0.3 modules it read 5 of 48 markers where linea
 below 1000 px and stops at the level where every expected id has been found; only if some are missing are code values
 tried, local contrast (CLAHE) where the photo is dark, and twice the size where there are less than 4 megapixels to
 look at. Corners of all levels are then fitted in the full photograph (`edges`). Where the page's millimeters are known
-`complete.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.10 to 5.x will do.
+`complete.find_sheet` needs fewer levels. Only OpenCV's class API is used, so 4.11 to 5.x will do.
 """
 
 from __future__ import annotations

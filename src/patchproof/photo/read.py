@@ -5,6 +5,7 @@ orientation is applied, an embedded color profile (phones write Display P3) is c
 white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, and what takes more
 than `limits` allow "too_costly", so that one bad file never stops a batch. Pixels are converted in strips, since whole
 copies took twice the memory, and of more than `WHOLE_PX` every four become one: to measure takes up to 30 bytes each.
+Whole JPEG files are decoded by OpenCV, which says on stderr what Pillow keeps to itself where their data are broken.
 Ignored on purpose: the DPI that a photograph claims, and sidecar files.
 """
 
@@ -163,10 +164,12 @@ def _allow_heic(path: Path) -> None:
 
 def _pixels(image, step: int) -> np.ndarray:
     """uint8 sRGB H×W×3 of an open picture, each the mean of `step` times `step`."""
+    into_srgb = _into_srgb(image)
+    if step == 1 and into_srgb is None and (whole := _whole_jpeg(image)) is not None:
+        return whole
     image.load()
     if image.mode.startswith("I") or image.mode == "F":
         return np.repeat(_fewer(_of_deep_gray(image), step)[..., None], 3, axis=2)
-    into_srgb = _into_srgb(image)
     pixels = np.empty((image.height // step, image.width // step, 3), np.uint8)
     rows = max(1, _STRIP_PX // image.width // step)
     for top in range(0, len(pixels), rows):
@@ -175,6 +178,22 @@ def _pixels(image, step: int) -> np.ndarray:
         strip = _opaque_rgb(strip if into_srgb is None else into_srgb(strip))
         pixels[top:below] = _fewer(np.asarray(strip), step)
     return pixels
+
+
+def _whole_jpeg(image) -> np.ndarray | None:
+    """uint8 H×W×3 of a JPEG in RGB, which OpenCV reads to the same bits in half the time; None of other files, and of
+    one without an end, which only Pillow refuses.
+    """
+    if image.format != "JPEG" or image.mode != "RGB":
+        return None
+    data = np.fromfile(image.filename, np.uint8)
+    if data[-2:].tobytes() != b"\xff\xd9":
+        return None
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+    return pixels if pixels is not None and pixels.shape == (image.height, image.width, 3) else None
 
 
 def _fewer(pixels: np.ndarray, step: int) -> np.ndarray:
