@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -166,6 +167,20 @@ def test_outlines_are_the_same_alone_and_in_any_company(monkeypatch):
     monkeypatch.setattr(module, "CHUNK", 1)
     for name, part_of in vars(drawn(torus())[2]).items():
         assert torch.equal(part_of, getattr(together, name))
+
+
+@pytest.mark.parametrize("by_code", [False, True])
+def test_gradients_pass_outlines_as_finite_differences_do(by_code):
+    """Along 20 random directions, in float64: where outlines mix, where they take from, and where there are none."""
+    shares, generator = drawn(torus(), eyes=EYES[:1])[2], torch.Generator().manual_seed(0)
+    wide = replace(shares, own=shares.own.double(), share=shares.share.double())
+    image, wanted = 0.1 + 0.9 * torch.rand(2, SIDE * SIDE, 3, generator=generator, dtype=torch.float64)
+    image.requires_grad_()
+    (gradient,) = torch.autograd.grad((wide.smooth(image, by_code) * wanted).sum(), image)
+    for _ in range(20):
+        step = 1e-5 * torch.randn(image.shape, generator=generator, dtype=torch.float64)
+        ahead, behind = ((wide.smooth(image.detach() + s, by_code) * wanted).sum() for s in (step, -step))
+        assert float(ahead - behind) / 2 == pytest.approx(float((gradient * step).sum()), rel=1e-4, abs=1e-7)
 
 
 def test_a_rod_is_right_down_to_a_pixel_s_width_and_wrong_below():
