@@ -164,7 +164,7 @@ def test_a_reduced_picture_seen_through_one_window_gives_the_markers_of_three(
 def test_a_first_round_that_only_nears_the_borders_leaves_them_where_they_were(piece, surface, monkeypatch):
     photo = photograph(piece, view(25, 10, 400, 8), blur_px=0.7, noise=0.01)
     nearing = find_sheet(photo, IDS, surface.corners_mm).corners_px
-    monkeypatch.setattr(edges, "_ROUNDS", ((24, 1e-3), (24, 1e-3)))
+    monkeypatch.setattr(edges, "_SETTLED_PX", (1e-3, 1e-3))
     settled = find_sheet(photo, IDS, surface.corners_mm).corners_px
     assert nearing.keys() == settled.keys() == IDS
     assert max(np.abs(nearing[i] - settled[i]).max() for i in IDS) < 2e-3

@@ -21,7 +21,7 @@ from scipy.special import ndtr
 
 # 49 points of a rectangle, its rim included, as shares of its width and height
 GRID = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7)), -1).reshape(-1, 2)
-ACROSS = 19  # samples of a stretch
+ALONG, ACROSS = 24, 19  # samples per border: 24 stretches of 19
 REACH = 0.87  # of a border's half-length: nearer to its ends the next border's blur mixes in
 # in modules: inwards the printed cells are known, outwards only one module of paper is
 INWARD, OUTWARD = 1.0, 0.6
@@ -29,8 +29,7 @@ INWARD, OUTWARD = 1.0, 0.6
 REACH_SIGMAS, LEAST_REACH_PX = 4.0, 2.5
 # what sampling adds to the blur: a pixel's own width (1/12 px²) and bilinear interpolation (mean over phases 1/6 px²)
 _SAMPLING_VARIANCE = 1 / 12 + 1 / 6
-_MOST_STEPS = 6, 5
-_ROUNDS = (12, 0.02), (24, 1e-3)  # stretches per border, and px; the first only says where the second one samples
+_MOST_STEPS, _SETTLED_PX = (6, 5), (0.02, 1e-3)  # the first round only says where the second one samples
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,8 @@ def fit_borders(luminance: np.ndarray, corners_px: np.ndarray, cells: np.ndarray
     behind = np.stack([cells[:, 1], cells[:, :, -2], cells[:, -2, ::-1], cells[:, ::-1, 1]], 1)
     corners, good = rough, np.zeros(len(rough), bool)
     sigma, reach_px = np.zeros((len(rough), 4)), np.full((len(rough), 4), np.inf)
-    for along, settled_px in _ROUNDS:  # the second samples across what the first one found, no farther than needed
-        met, good, sigma = _fit_round(luminance, corners, behind, reach_px, along, settled_px)
+    for settled_px in _SETTLED_PX:  # the second round samples across what the first one found, no farther than needed
+        met, good, sigma = _fit_round(luminance, corners, behind, reach_px, settled_px)
         moved = np.linalg.norm(met - rough, axis=2).max(1)
         good &= moved < 1.0 + OUTWARD * _module_px(rough, modules).max(1)
         corners = np.where(good[:, None, None], met, rough)
@@ -84,12 +83,12 @@ def _module_px(corners: np.ndarray, modules: int) -> np.ndarray:
     return np.maximum(depth, 1e-3) / modules
 
 
-def _fit_round(luminance, corners, behind, reach_px, along, settled_px):
+def _fit_round(luminance, corners, behind, reach_px, settled_px):
     middle, half, normal = border_frame(corners)
     module = _module_px(corners, behind.shape[2])
     inward = np.clip(INWARD * module, 1.2, np.minimum(reach_px, 12.0))
     outward = np.clip(OUTWARD * module, 1.0, np.minimum(reach_px, 10.0))
-    s = np.linspace(-REACH, REACH, along)
+    s = np.linspace(-REACH, REACH, ALONG)
     t = np.linspace(-inward, outward, ACROSS, axis=-1)  # M×4×ACROSS
     points = (
         middle[:, :, None, None]
@@ -100,7 +99,7 @@ def _fit_round(luminance, corners, behind, reach_px, along, settled_px):
     count = len(corners) * 4
     along_px = np.linalg.norm(half, axis=-1)
     model = _Model(s, t.reshape(count, ACROSS), module.ravel(), along_px.ravel(), behind.reshape(count, -1))
-    fit = _fit_steps(light.reshape(count, along, ACROSS), model, settled_px)
+    fit = _fit_steps(light.reshape(count, ALONG, ACROSS), model, settled_px)
     d, a, sigma, black, white = (fit[:, i].reshape(-1, 4) for i in range(5))
     ends = [middle + sign * half + (d + sign * a)[..., None] * normal for sign in (-1, 1)]
     fitted = (white - black > 0.01).all(1) & (np.abs(d) < outward).all(1) & np.isfinite(fit).reshape(-1, 20).all(1)
@@ -133,7 +132,7 @@ class _Model:
         return _Model(self.s, self.t[borders], self.module[borders], self.half_px[borders], self.cells[borders])
 
     def shares(self, theta):
-        """(paper's share of the light, its derivatives by u and by log σ), each K×N×ACROSS of N stretches."""
+        """(paper's share of the light, its derivatives by u and by log σ), each K×ALONG×ACROSS."""
         d, a, log_sigma = (theta[:, i, None, None] for i in range(3))
         sigma = np.exp(log_sigma)
         u = self.t[:, None, :] - d - a * self.s[:, None]
@@ -143,7 +142,7 @@ class _Model:
         return ndtr(outer) + row * ndtr(inner), (bell_out - bell_in) / sigma, -bell_out * outer - bell_in * inner
 
     def _blurred_row(self, sigma):
-        """q: the cells behind the rim as the blur leaves them, K×N."""
+        """q: the cells behind the rim as the blur leaves them, K×ALONG."""
         n = self.cells.shape[1]
         place = (self.s + 1) / 2 * n  # in modules from the border's start
         z = (place[None, :, None] - np.arange(n + 1)) * (2 * self.half_px / n / sigma[:, 0])[:, None, None]
@@ -156,7 +155,7 @@ def _bell(z):
 
 
 def _fit_steps(light, model, settled_px):
-    """Parameters K×5 (d, a, σ, black, white) of K borders from K×N×ACROSS samples."""
+    """Parameters K×5 (d, a, σ, black, white) of K borders from K×ALONG×ACROSS samples."""
     reach = model.t[:, -1]
     black, white = light[:, :, 4:9].min(2).mean(1), light[:, :, -4:].mean((1, 2))
     theta = np.stack([0 * reach, 0 * reach, np.log(np.maximum(0.25 * reach, 0.5)), black, white], 1)
