@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
 
+from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import PER_SESSION, _looks, make_promise
-from patchproof.sessions import spread_of
+from patchproof.optimizer.promise import CONTROL_VIEWS, PER_SESSION, SETTLED, _looks, make_promise
+from patchproof.optimizer.promise_later import promise_run
+from patchproof.sessions import difference_in_sessions, spread_of
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
 from test_optimize import scene_with
@@ -39,7 +43,33 @@ def test_it_stops_after_half_or_three_quarters_and_else_is_the_full_promise(prom
     narrower = np.ptp(half.interval) / 2 - 1e-6
     longer = promised(narrower)
     assert longer.n > 20 and np.ptp(longer.interval) <= 2 * narrower
-    assert promised(0.005) == full, "never narrow enough: all views"
+    never = promised(0.005)
+    assert (never.n, never.conditions, never.interval) == (40, full.conditions, full.interval)
+
+
+def test_a_control_is_left_out_once_it_is_known_to_differ(promised, monkeypatch):
+    full = promised()
+    assert full.controls["bare"].n == 20 and full.controls["bare"].difference > 0.5
+    early = promised(0.005)
+    assert early.controls["bare"].n == 10, "known after half of the views"
+    assert early.controls["bare"] == promised(0.3).controls["bare"]
+    assert early.headline.startswith("better than its best control (bare)")
+    monkeypatch.setattr(promise, "SETTLED", 1e9)
+    assert promised(0.005) == full, "never known well enough"
+
+
+def test_a_scene_asks_for_a_half_width_and_a_number_of_views_for_all_of_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 40)
+    scene = scene_with(tmp_path, optimize__steps=1, promise__half_width=0.3)
+    assert SceneSettings.model_fields["promise"].default.half_width == 0.04
+    whole = run.optimize_scene(scene, tmp_path / "run", controls=("bare",))
+    assert whole.promise.n == 20 and not whole.promise.draft
+    assert promise_run(tmp_path / "run", views=40).promise.n == 40
+    assert promise_run(tmp_path / "run").promise == whole.promise
+    details = json.loads((tmp_path / "run" / "run.json").read_text())
+    details["settings"]["promise"]["half_width"] = None
+    (tmp_path / "run" / "run.json").write_text(json.dumps(details))
+    assert promise_run(tmp_path / "run").promise.n == 40, "a run from before"
 
 
 def test_the_key_changes_no_sheet_and_has_a_least_value(tmp_path):
@@ -70,6 +100,34 @@ def test_stopping_leaves_the_interval_its_level():
     assert share >= 0.92 and views < 360
 
 
+def told_apart(runs, gain, correlation, looks, rate=0.8, seed=3):
+    """(share of simulated differences whose interval held, share that it told from none, sessions that they took) of
+    a control whose rate is `gain` less, where sessions differ so much for both.
+    """
+    rng, right, other, sessions = np.random.default_rng(seed), 0, 0, 0
+    for _ in range(runs):
+        own = rng.beta(rate * (1 / correlation - 1), (1 - rate) * (1 / correlation - 1), 100)
+        worse = own * (rate - gain) / rate
+        design, control = (rng.random((100, CONTROL_VIEWS)) < each[:, None] for each in (own, worse))
+        for last in looks:
+            so_far = design[:last].ravel(), control[:last].ravel()
+            difference, (low, high) = difference_in_sessions(*so_far, CONTROL_VIEWS)
+            if abs(difference) >= SETTLED * (high - low) / 2:
+                break
+        right, other, sessions = right + (low <= gain <= high), other + (low > 0 or high < 0), sessions + last
+    return right / runs, other / runs, sessions / runs
+
+
+LOOKS = [50, 75, 100]
+
+
+def test_leaving_controls_out_leaves_their_difference_its_level():
+    assert told_apart(300, 0, 0.2, LOOKS)[1] <= 0.08, "no difference is not told for one more often"
+    share, _, sessions = told_apart(300, 0.15, 0.2, LOOKS)
+    assert share >= 0.92 and sessions < 100
+    assert told_apart(100, 0.5, 0.2, LOOKS)[2] == 50
+
+
 @cache
 def interval(counts):
     return spread_of(counts, (PER_SESSION,) * len(counts)).rate
@@ -82,4 +140,10 @@ if __name__ == "__main__":  # the figures in `promise._looks`
         for looks in ([400], _looks(400, PER_SESSION)[1:], [100, 200, 300, 400]):
             share, views = held(1000, rate, correlation, looks, half_width)
             told.append(f"looks after {looks}: {share:.1%} held, {views:.0f} views;")
+        print(*told, flush=True)
+    for rate, gain in product((0.8, 0.95), (0, 0.05, 0.1, 0.15, 0.3)):  # those beside `promise.SETTLED`
+        told = [f"rate {rate}, gain {gain}:"]
+        for looks in ([100], LOOKS):
+            share, other, sessions = told_apart(1000 if gain else 3000, gain, 0.2, looks, rate)
+            told.append(f"looks after {looks}: {share:.1%} held, {other:.1%} told, {sessions:.0f} sessions;")
         print(*told, flush=True)

@@ -27,7 +27,7 @@ pp.sheet(run, folder + "/sheet.pdf")
 end = time.perf_counter()
 parts = {"steps_s": ends[-1] - begin, "promise_s": promised - ends[-1], "sheet_s": end - promised, "all_s": end - begin}
 low, high = run.promise.interval
-print(json.dumps(parts | {"rate": run.promise.rate, "low": low, "high": high}))
+print(json.dumps(parts | {"rate": run.promise.rate, "low": low, "high": high, "views": run.promise.n}))
 """
 
 

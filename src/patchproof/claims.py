@@ -4,7 +4,7 @@ In: counts and figures. Out: intervals and `Estimate`s for tables; all at 95 % u
 A rate from n images gets a Wilson interval; what photographs of new sessions may show is said by `sessions`.
 Differences on the same conditions are paired (Newcombe 1998b, method 10); on different ones Newcombe 1998a, method 10,
 applies.
-Left out on purpose: corrections for looking more than once. The promise set is looked at once.
+Left out on purpose: corrections for looking more than once. `optimizer.promise` looks so that none is needed.
 
 Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
 (paired); Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).

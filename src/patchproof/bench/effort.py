@@ -9,7 +9,7 @@ fresh conditions.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -20,7 +20,6 @@ from patchproof.claims import Estimate, rate
 from patchproof.journey.demo import SCENE
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import DRAFT, THOROUGH, Run, optimize_scene
 from patchproof.report.tables import Table
@@ -38,8 +37,8 @@ OBJECTS = {
     "table lamp": ("table_lamp", 450, 0, 90),
 }
 DEFAULT = "default"
-# By name the steps, and the views of the promise.
-EFFORTS = {"draft": DRAFT, DEFAULT: (OptimizeSettings().steps, PROMISE_VIEWS), "thorough": THOROUGH}
+# By name the steps, and the views of the promise (None: as many as the scene's half width needs).
+EFFORTS = {"draft": DRAFT, DEFAULT: (OptimizeSettings().steps, None), "thorough": THOROUGH}
 QUICK_EFFORTS = {"draft": DRAFT, DEFAULT: (2 * DRAFT[0], 2 * DRAFT[1])}
 
 
@@ -49,7 +48,9 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
     yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, on_stage)
 
 
-def effort_chart(labels: list[str], efforts: dict[str, tuple[int, int]], judged: int, on_stage: OnStage) -> Chart:
+def effort_chart(
+    labels: list[str], efforts: Mapping[str, tuple[int, int | None]], judged: int, on_stage: OnStage
+) -> Chart:
     """Each effort's seconds beside the default's against the share of `judged` views that its design misses."""
     series, rows = {}, []
     for label in labels:
@@ -88,7 +89,7 @@ def _scene(label: str, steps: int) -> Scene:
     return build_scene(validated(SceneSettings, settings, label), Path())
 
 
-def _timed_run(scene: Scene, views: int) -> tuple[Run, float]:
+def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
     with TemporaryDirectory() as folder, threads(1):
         begin = perf_counter()
         run = optimize_scene(scene, Path(folder) / "run", promise_views=views)

@@ -51,7 +51,7 @@ def optimize(
     draft: Annotated[bool, typer.Option("--draft", help="A first look: few steps, promised from few views.")] = False,
     thorough: Annotated[bool, typer.Option("--thorough", help="Three times the steps, four times the views.")] = False,
     steps: Annotated[int | None, typer.Option(min=1, help="In place of the scene's own.")] = None,
-    promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; of under 400: a draft.")] = None,
+    promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; under 400: a draft.")] = None,
     device: Device = "cpu",
     seed: Seed = None,
     jobs: Jobs = None,
@@ -98,7 +98,7 @@ def optimize(
 
 def promise(
     run: Annotated[Path, typer.Argument(help="A finished run, such as a draft's.")],
-    n: Annotated[int | None, typer.Option("--n", min=8, help="Views to promise from, by default 400.")] = None,
+    n: Annotated[int | None, typer.Option("--n", min=8, help="Views to promise from, by default up to 400.")] = None,
     device: Device = "cpu",
     jobs: Jobs = None,
 ) -> None:

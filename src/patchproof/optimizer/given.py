@@ -28,8 +28,8 @@ from patchproof.geometry import MM_PER_INCH
 from patchproof.input import is_file
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS
-from patchproof.optimizer.run import OWN, Run, finish_run, load_run, promised_views
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
+from patchproof.optimizer.run import OWN, Run, check_promise, finish_run, load_run
 from patchproof.output import check_folder, new_folder
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import find_markers
@@ -84,7 +84,8 @@ def import_patch(
     `out`; all else as in `optimize_scene`. Refused where the picture does not fit the piece, or its markers would not
     be read beside it.
     """
-    out, views = Path(out), promised_views(promise_views)
+    out = Path(out)
+    check_promise(promise_views)
     check_folder(out, OWN, overwrite)
     (file, sha256, pixels), scene = _read(picture), _with_piece(scene, seed)
     fitted, scene = fit(pixels, scene), scene.of_design(sha256)
@@ -94,7 +95,7 @@ def import_patch(
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = _looked_at(problem, file, sha256, pixels, fitted, design)
     with new_folder(out, OWN, overwrite) as folder:
-        run = finish_run(problem, design, folder, controls, views, on_promise, asdict(record))
+        run = finish_run(problem, design, folder, controls, promise_views, on_promise, asdict(record))
     return replace(run, folder=out)
 
 
@@ -115,7 +116,8 @@ def import_folder(
     """A run `out`/NAME of every picture NAME.png (or another kind) in a folder, as `import_patch` makes it. All
     pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
     """
-    scene, out, total = _with_piece(scene, seed), Path(out), promised_views(promise_views)
+    check_promise(promise_views)
+    scene, out, total = _with_piece(scene, seed), Path(out), promise_views or PROMISE_VIEWS
     on_scene(scene)
     runs = {path: out / printable(path.stem) for path in list_photos(folder)}
     if len(set(runs.values())) < len(runs):

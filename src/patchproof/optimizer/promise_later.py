@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.run import RUN_FILE, Run, load_run, promise_of, promised_views
+from patchproof.optimizer.run import RUN_FILE, Run, check_promise, load_run, promise_of
 from patchproof.output import write_whole
 
 
@@ -26,7 +26,8 @@ def promise_run(
     on_promise: Callable[[int, int], None] = lambda done, total: None,
 ) -> Run:
     """Promise a run's design anew, from so many views (by default as many as `optimize` takes), with its controls."""
-    views, run = promised_views(views), load_run(run_folder)
+    check_promise(views)
+    run = load_run(run_folder)
     problem = set_problem(run.scene, device, jobs=jobs)
     promise = promise_of(problem, run.design, tuple(run.promise.controls), views, on_promise)
     details = run.details | {"promise": promise.model_dump(mode="json")}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, zip_longest
 from typing import TypeVar
 
 import numpy as np
@@ -54,21 +55,29 @@ def responses(
     compared = np.ones(n, bool) if beside is None else beside
 
     @torch.no_grad()
-    def answers(rows: np.ndarray) -> dict[Thing, Answers]:
-        drawn, names = conditions[rows], list(shown) if compared[rows[0]] else [first]
-        views, boxes = problem.see(laid_out, drawn, side_px or problem.figure_px), problem.boxes(drawn)
-        return {name: ask(problem, expose(views, shown[name]), boxes) for name in names}
+    def answers(parts: Sequence[np.ndarray]) -> list[dict[Thing, Answers]]:
+        told = []
+        for rows in parts:
+            drawn, names = conditions[rows], list(shown) if compared[rows[0]] else [first]
+            views, boxes = problem.see(laid_out, drawn, side_px or problem.figure_px), problem.boxes(drawn)
+            told.append({name: ask(problem, expose(views, shown[name]), boxes) for name in names})
+        return told
 
-    order, both = np.argsort(~compared, kind="stable"), int(compared.sum())
-    parts = [
-        order[at : min(at + AT_A_TIME, end)]
-        for begin, end in ((0, both), (both, n))
-        for at in range(begin, end, AT_A_TIME)
-    ]
-    with sharing(answers, min(problem.jobs, len(parts))) as (workers, share):
-        whole = joined(workers.map(share, parts, lambda done, _: on_views(min(done * AT_A_TIME, n), n)))
-    whole[first] = whole[first].at(np.argsort(order))
+    of_all, of_first = (_few(np.flatnonzero(rows)) for rows in (compared, ~compared))
+    # those of the same session go to the same process, which draws the place behind them once
+    tasks = [[rows for rows in pair if rows is not None] for pair in zip_longest(of_all, of_first)]
+    seen = np.cumsum([sum(map(len, task)) for task in tasks])
+    with sharing(answers, min(problem.jobs, len(tasks))) as (workers, share):
+        told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), n))
+    parts = sorted(zip(chain(*tasks), chain(*told), strict=True), key=lambda part: not compared[part[0][0]])
+    whole = joined([answered for _, answered in parts])
+    whole[first] = whole[first].at(np.argsort(np.concatenate([rows for rows, _ in parts])))
     return whole
+
+
+def _few(rows: np.ndarray) -> list[np.ndarray]:
+    """Rows, as many at a time as are seen together."""
+    return [rows[at : at + AT_A_TIME] for at in range(0, len(rows), AT_A_TIME)]
 
 
 def in_parts(conditions: Conditions) -> Iterator[Conditions]:

@@ -89,11 +89,13 @@ def optimize_scene(
 
     `models` (names, or classifiers in memory) and `loss` replace the scene's networks and its goal's loss; `seed`
     replaces the file's; `resume` goes on from the checkpoint, at the place that was chosen. A page names the best of
-    `controls`, one at least. A promise of fewer `promise_views` than usual (two sessions at least) is a draft's.
+    `controls`, one at least. A promise is made of `promise_views`, two sessions at least and a draft's where they are
+    fewer than usual, or of as many as the scene's `promise.half_width` needs.
     `jobs` processes share the views (`workers.sharing`) and change no byte where this one works on one thread, too.
     `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
     """
-    out, views = Path(out), promised_views(promise_views)
+    out = Path(out)
+    check_promise(promise_views)
     if not resume:
         check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / RUN_FILE))
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
@@ -111,14 +113,13 @@ def optimize_scene(
         save_place(place, needs_patch(scene), out)
     state = resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
-    return finish_run(problem, design, out, controls, views, on_promise)
+    return finish_run(problem, design, out, controls, promise_views, on_promise)
 
 
-def promised_views(asked: int | None) -> int:
-    """How many views a promise is made of; refused where they are too few for one."""
-    if asked is not None and asked < 2 * PER_SESSION:
-        raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{asked}", "promise of more")
-    return PROMISE_VIEWS if asked is None else asked
+def check_promise(views: int | None) -> None:
+    """Refuse too few views for a promise."""
+    if views is not None and views < 2 * PER_SESSION:
+        raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{views}", "promise of more")
 
 
 def finish_run(
@@ -126,7 +127,7 @@ def finish_run(
     design: np.ndarray,
     out: Path,
     controls: Sequence[str],
-    views: int,
+    views: int | None,
     on_promise: Callable[[int, int], None],
     imported: Mapping[str, Any] | None = None,
 ) -> Run:
@@ -245,13 +246,19 @@ def _doubt(moved: float, gradient: float | None) -> None:
 
 
 def promise_of(
-    problem: Problem, design: np.ndarray, controls: Sequence[str], views: int, on_promise: Callable[[int, int], None]
+    problem: Problem,
+    design: np.ndarray,
+    controls: Sequence[str],
+    views: int | None,
+    on_promise: Callable[[int, int], None],
 ) -> Promise:
-    """The promise of a finished design; of fewer views than usual it is a draft's."""
-    conditions = problem.scene.draw("promise", views, per_session=PER_SESSION)
-    enough = problem.scene.settings.promise.half_width
+    """The promise of a finished design, of so many views (of fewer than usual it is a draft's) or, by default, of as
+    many as the scene's `promise.half_width` needs.
+    """
+    most, enough = views or PROMISE_VIEWS, None if views else problem.scene.settings.promise.half_width
+    conditions = problem.scene.draw("promise", most, per_session=PER_SESSION)
     promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION, enough)
-    return promise.changed(draft=views < PROMISE_VIEWS)
+    return promise.changed(draft=most < PROMISE_VIEWS)
 
 
 def _log_line(step: Step) -> dict[str, Any]:

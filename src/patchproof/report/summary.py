@@ -107,8 +107,9 @@ def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
     rows = []
     for kind, claim in controls.items():
         low, high = (100 * bound for bound in claim["difference_interval"])
+        seen = f" of {claim['n']}" if claim.get("n") else ""
         rows.append(
-            f"  {kind:>6}: {claim['rate']:6.1%}   "
+            f"  {kind:>6}: {claim['rate']:6.1%}{seen}   "
             f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
         )
     return rows

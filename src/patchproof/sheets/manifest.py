@@ -128,8 +128,11 @@ class ModelClaim(Strict):
 
 
 class ControlClaim(Strict):
-    """A control on the same conditions; `difference` is the design's rate minus the control's."""
+    """A control on `n` of the same conditions (None: an earlier version did not say); `difference` is the design's rate
+    there minus the control's.
+    """
 
+    n: Count | None = None
     rate: Share
     interval: Interval
     confidence: Share
