@@ -141,6 +141,8 @@ def set_problem(
     else:
         subject = Texture(needs_texture(scene), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
+    if jobs > 1 and stage.object is not None:
+        stage.object.texels(reduced=True)  # once, not by each process: a quarter of a second for textures of 1024 px
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 
 
