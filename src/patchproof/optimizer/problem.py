@@ -32,6 +32,7 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
 from patchproof.strict import Refused
+from patchproof.workers import threads
 
 # Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
 # no less than so many pixels, since each of them takes one sample. Averaging textures over nine tenths of a pixel
@@ -142,7 +143,8 @@ def set_problem(
         subject = Texture(needs_texture(scene), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1 and stage.object is not None:
-        stage.object.texels(reduced=True)  # once, not by each process: a quarter of a second for textures of 1024 px
+        with threads(1):  # as a process would; of 1024 px they take a quarter of a second
+            stage.object.texels(reduced=True)
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 
 

@@ -64,8 +64,10 @@ def responses(
         return told
 
     of_all, of_first = (_few(np.flatnonzero(rows)) for rows in (compared, ~compared))
-    # those of the same session go to the same process, which draws the place behind them once
+    # those of the same session go to the same process, which draws the place behind them once; the last ones go apart,
+    # so that no process waits long for another
     tasks = [[rows for rows in pair if rows is not None] for pair in zip_longest(of_all, of_first)]
+    tasks[-problem.jobs :] = [[rows] for task in tasks[-problem.jobs :] for rows in task]
     seen = np.cumsum([sum(map(len, task)) for task in tasks])
     with sharing(answers, min(problem.jobs, len(tasks))) as (workers, share):
         told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), n))
