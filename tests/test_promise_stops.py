@@ -133,12 +133,12 @@ def interval(counts):
     return spread_of(counts, (PER_SESSION,) * len(counts)).rate
 
 
-if __name__ == "__main__":  # the figures in `promise._looks`
-    cases = (0.5, 0.1, 0.08), (0.7, 0.3, 0.1), (0.9, 0.3, 0.06), (0.95, 0.1, 0.04), (0.97, 0.3, 0.04), (0.98, 0.1, 0.03)
-    for rate, correlation, half_width in cases:
-        told = [f"rate {rate}, correlation {correlation}, half_width {half_width}:"]
-        for looks in ([400], _looks(400, PER_SESSION)[1:], [100, 200, 300, 400]):
-            share, views = held(1000, rate, correlation, looks, half_width)
+if __name__ == "__main__":  # the figures beside `promise._looks`
+    cases = (0.85, 0.1), (0.9, 0.3), (0.92, 0.1), (0.95, 0.1), (0.95, 0.3), (0.97, 0.3), (0.98, 0.1), (0.99, 0.05)
+    for rate, correlation in cases:
+        told = [f"rate {rate}, correlation {correlation}:"]
+        for looks in ([400], _looks(400, PER_SESSION)[1:], [160, 240, 320, 400]):
+            share, views = held(1000, rate, correlation, looks, 0.04)
             told.append(f"looks after {looks}: {share:.1%} held, {views:.0f} views;")
         print(*told, flush=True)
     for rate, gain in product((0.8, 0.95), (0, 0.05, 0.1, 0.15, 0.3)):  # those beside `promise.SETTLED`

@@ -125,9 +125,10 @@ def _settled(claim: ControlClaim, half_width: float) -> bool:
 
 
 def _looks(total: int, per_session: int) -> list[int]:
-    """Where the parts of a promise begin and end that may stop between them. Its interval held in 94 to 98 % of 1,000
-    simulated promises with a first look after half of the sessions, in 94 to 96 % of full ones; one after a quarter,
-    which knows little of how sessions differ, saves 0 to 14 % more views (`python tests/test_promise_stops.py`).
+    """Where the parts of a promise begin and end that may stop between them. Of 1,000 simulated promises each, of rates
+    from 85 to 99 % to ± 4 points, the intervals of those that looked so held in 93.5 to 97.1 %, of full ones in 94.4 to
+    96.4 %; a first look after two fifths, then one every fifth, saved 1 to 20 % more views, but held in 91.9 % of one
+    kind (`python tests/test_promise_stops.py`).
     """
     sessions = math.ceil(total / per_session)
     return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
