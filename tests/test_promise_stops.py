@@ -39,7 +39,7 @@ def test_it_stops_after_half_or_three_quarters_and_else_is_the_full_promise(prom
     half = promised(0.2, told)
     assert half.n == 20 and half.conditions == full.conditions[:20]
     assert np.ptp(half.interval) <= 0.4
-    assert told[-1] == (20, 40)
+    assert told[-2:] == [(20, 40), (20, 20)]
     narrower = np.ptp(half.interval) / 2 - 1e-6
     longer = promised(narrower)
     assert longer.n > 20 and np.ptp(longer.interval) <= 2 * narrower
