@@ -11,6 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
+from PIL import Image
 
 from patchproof.claims import wilson
 from patchproof.classifier.network import Classifier
@@ -29,7 +31,7 @@ from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
-from patchproof.workers import can_fork, threads
+from patchproof.workers import Workers, can_fork, threads
 
 SCENE = {
     "object": {"mesh": "primitive:carton", "length_mm": 300, "up": "y"},
@@ -415,6 +417,41 @@ def test_controls_beside_some_views_are_those_of_these_views_and_the_design_keep
     np.testing.assert_allclose(part["design"].loss, whole["design"].loss, rtol=1e-4)
     np.testing.assert_allclose(part["bare"].loss, whole["bare"].loss[:, beside], rtol=1e-4)
     assert len(np.unique(whole["design"].loss)) == 7
+
+
+def test_a_session_is_seen_by_one_process_but_for_the_last_ones(tmp_path, monkeypatch):
+    """Whoever sees a session draws the place behind it."""
+    tasks, counts, work = [], [], Workers.map
+
+    def kept(workers, function, items, on_done):
+        tasks.extend(items)
+        return work(workers, function, items, on_done)
+
+    monkeypatch.setattr(Workers, "map", kept)
+    problem = set_problem(scene_with(tmp_path, camera__photo_px=[96, 96]))
+    drawn, beside = problem.scene.draw("promise", 32, per_session=4), np.arange(32) % 4 < 2
+    shown = {"design": problem.subject.shown(start(problem).design), "bare": None}
+    responses(problem, shown, drawn, beside=beside, on_views=lambda *count: counts.append(count))
+    rows = [np.concatenate(task) for task in tasks]
+    assert sorted(np.concatenate(rows)) == list(range(32)) and [len(each) for each in rows] == [8, 8, 8, 4, 4]
+    assert all(len({*each // 4}) == 2 for each in rows), "two sessions each"
+    assert counts == [(8, 32), (16, 32), (24, 32), (28, 32), (32, 32)]
+
+
+def test_texels_are_to_the_byte_those_of_one_thread_before_processes_share_views(tmp_path):
+    box = trimesh.creation.box((300, 200, 100))
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (150, 150, 3), dtype=np.uint8))
+    uv = np.random.default_rng(1).random((len(box.vertices), 2))
+    box.visual = trimesh.visual.TextureVisuals(uv, image=picture)
+    box.export(tmp_path / "box.glb")
+    scene = scene_with(tmp_path, object__mesh=str(tmp_path / "box.glb"), object__length_mm=300)
+    with threads(2):
+        shared = set_problem(scene, jobs=2).stage.object_surface.texels(reduced=True)
+        on_two = set_problem(scene).stage.object_surface.texels(reduced=True)
+    with threads(1):
+        alone = set_problem(scene).stage.object_surface.texels(reduced=True)
+    assert torch.equal(shared, alone) and len(alone) > 150**2
+    assert (on_two - alone).abs().max() < 1e-6, "two threads round otherwise, by no more"
 
 
 def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):

@@ -11,8 +11,9 @@ import pytest
 
 from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROL_VIEWS, PER_SESSION, SETTLED, _looks, make_promise
+from patchproof.optimizer.promise import CONTROL_VIEWS, PER_SESSION, SETTLED, _looks, control_claims, make_promise
 from patchproof.optimizer.promise_later import promise_run
+from patchproof.optimizer.responses import Answers
 from patchproof.sessions import difference_in_sessions, spread_of
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
@@ -56,6 +57,17 @@ def test_a_control_is_left_out_once_it_is_known_to_differ(promised, monkeypatch)
     assert early.headline.startswith("better than its best control (bare)")
     monkeypatch.setattr(promise, "SETTLED", 1e9)
     assert promised(0.005) == full, "never known well enough"
+    half = promised(0.2)
+    known = np.ptp(half.interval) / 2 + 1e-6
+    assert half.n == 20 and np.ptp(half.controls["bare"].difference_interval) / 2 > known
+    assert promised(known).n > 20, "the rate is known, but not the control"
+
+
+def test_a_control_that_was_left_out_is_compared_where_both_were_shown():
+    design, control = (np.array([hits], bool) for hits in ([1, 1, 0, 0], [0, 1]))
+    answers = {kind: Answers(hits, 1.0 * hits, 0.0 * hits) for kind, hits in (("design", design), ("bare", control))}
+    claim = control_claims(answers, 0)["bare"]
+    assert (claim.n, claim.rate, claim.difference) == (2, 0.5, 0.5)
 
 
 def test_a_scene_asks_for_a_half_width_and_a_number_of_views_for_all_of_them(tmp_path, monkeypatch):

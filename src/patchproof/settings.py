@@ -246,7 +246,7 @@ class PromiseSettings(Strict):
     """How well a promise has to be known; no part of what is printed."""
 
     # Of the rate's interval: half or three quarters of 400 views are taken where it is no wider after them and every
-    # control is told apart; all of them without one (runs of before), and all of a number that is asked for.
+    # control's difference is settled; all of them without one (earlier runs), and all of a number that is asked for.
     half_width: Annotated[Share, Field(ge=0.005)] | None = 0.04
 
 

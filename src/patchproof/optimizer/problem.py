@@ -143,7 +143,7 @@ def set_problem(
         subject = Texture(needs_texture(scene), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1 and stage.object is not None:
-        with threads(1):  # as a process would; of 1024 px they take a quarter of a second
+        with threads(1):  # here, for all processes to be forked, and as one of them would: two threads round otherwise
             stage.object.texels(reduced=True)
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 

@@ -53,8 +53,8 @@ def make_promise(
 ) -> Promise:
     """Show the design in all conditions, `per_session` in a row of one session, and the controls in the first
     `CONTROL_VIEWS` of each; rate, interval and controls are those of the primary (first) network. With a `half_width`
-    it stops after half or three quarters of the sessions, if the rate's interval is no wider there and every control's
-    difference is settled; else it goes on without those that are.
+    it stops after half or three quarters of the sessions, if the rate's interval is at most twice as wide there and
+    every control's difference is settled; else it goes on without those that are.
     """
     shown = shown_with_controls(problem, design, controls)
     compared = _until_known(problem, shown, conditions, per_session, half_width, on_views)
@@ -93,15 +93,16 @@ def _until_known(
         part, on_part = conditions[first:last], partial(_counted, on_views, first, len(conditions))
         answers = responses(problem, shown, part, beside=_with_controls(len(part), per_session), on_views=on_part)
         compared = joined([compared, answers]) if compared else answers
-        if half_width is not None:
-            claims = _beside_controls(compared, per_session).items()
-            unsettled = {"design", *(kind for kind, claim in claims if not _settled(claim, half_width))}
-            shown = {kind: each for kind, each in shown.items() if kind in unsettled}
-            places = _places(conditions[:last], per_session)
-            counts = in_sessions(compared["design"].recognized[0], per_session, places)
-            if len(shown) == 1 and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
-                on_views(last, last)  # a bar that stays at half would look broken
-                break
+        if half_width is None or last == len(conditions):
+            break
+        claims = _beside_controls(compared, per_session).items()
+        unsettled = {"design", *(kind for kind, claim in claims if not _settled(claim, half_width))}
+        shown = {kind: each for kind, each in shown.items() if kind in unsettled}
+        places = _places(conditions[:last], per_session)
+        counts = in_sessions(compared["design"].recognized[0], per_session, places)
+        if len(shown) == 1 and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
+            on_views(last, last)  # a bar that stays at half would look broken
+            break
     return compared
 
 
