@@ -152,3 +152,10 @@ def test_the_first_line_is_a_sentence_of_what_the_design_is_worth(scene_file, dr
     first = shot_sections(promise, load_scene_settings(scene_file))[0][1][0]
     assert first.startswith(start) and "better than its best control (bare): 90.0% beside 40.0% recognized" in first
     assert ". Promised before ONE PLAIN COLOR" in first and first.endswith(".") and ".." not in first
+
+
+def test_a_promise_that_stopped_early_says_that_a_full_one_may_save_photographs(scene_file):
+    promise, settings = promise_with(0.9, 0.4, 0.42, 0.57), load_scene_settings(scene_file)
+    stopped = promise.changed(n=200, conditions=promise.conditions[:200])
+    said = [" ".join(shot_sections(each, settings)[0][1]) for each in (promise, stopped, stopped.changed(draft=True))]
+    assert ["patchproof promise RUN --n 400, then this page again" in each for each in said] == [False, True, False]

@@ -9,6 +9,8 @@ from itertools import product
 import numpy as np
 import pytest
 
+from patchproof.claims import student_mean
+from patchproof.evidence.verdict import EACH, MOST_PHOTOS, sessions_needed
 from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROL_VIEWS, PER_SESSION, SETTLED, _looks, control_claims, make_promise
@@ -18,6 +20,7 @@ from patchproof.sessions import difference_in_sessions, spread_of
 from patchproof.settings import SceneSettings
 from patchproof.strict import Refused, validated
 from test_optimize import scene_with
+from test_verify_verdict import promise_of
 
 
 @pytest.fixture
@@ -130,6 +133,24 @@ def told_apart(runs, gain, correlation, looks, rate=0.8, seed=3):
     return right / runs, other / runs, sessions / runs
 
 
+def places_asked(rate, correlation, control, half_width=0.04, runs=30):
+    """(places that photographs need by stopped promises and by full ones of the same sessions) of each run."""
+    rng, asked = np.random.default_rng(1), []
+    like = promise_of(rate, control)
+    for _ in range(runs):
+        sessions = rng.beta(rate * (1 / correlation - 1), (1 - rate) * (1 / correlation - 1), 100)
+        counts = rng.binomial(PER_SESSION, sessions)
+        last = next(n for n in LOOKS if np.ptp(interval(tuple(np.sort(counts[:n])))) <= 2 * half_width or n == 100)
+        pair = []
+        for some in (counts[:last], counts):
+            hits = (np.arange(PER_SESSION) < some[:, None]).ravel()
+            rows = [like.conditions[0].changed(recognized=bool(hit)) for hit in hits]
+            made = like.changed(n=len(hits), rate=hits.mean(), per_session=PER_SESSION, conditions=rows)
+            pair.append(sessions_needed(made) or MOST_PHOTOS // EACH + 1)
+        asked.append(pair)
+    return np.array(asked)
+
+
 LOOKS = [50, 75, 100]
 
 
@@ -159,3 +180,10 @@ if __name__ == "__main__":  # the figures beside `promise._looks`
             share, other, sessions = told_apart(1000 if gain else 3000, gain, 0.2, looks, rate)
             told.append(f"looks after {looks}: {share:.1%} held, {other:.1%} told, {sessions:.0f} sessions;")
         print(*told, flush=True)
+    for rate, control in ((0.98, 0.45), (0.97, 0.87), (0.95, 0.5), (0.92, 0.6)):
+        stopped, full = places_asked(rate, 0.1, control).T
+        more = student_mean(stopped - full)
+        told = f"{stopped.mean():.1f} places in place of {full.mean():.1f}, more in {(stopped > full).sum()} of 30,"
+        print(
+            f"rate {rate}, control {control}: {told} by {more.value:.1f} [{more.low:.1f}, {more.high:.1f}]", flush=True
+        )

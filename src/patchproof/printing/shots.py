@@ -18,6 +18,7 @@ import numpy as np
 
 from patchproof.claims import CONFIDENCE, independent_difference
 from patchproof.evidence.verdict import EACH, MOST_PHOTOS, asked_rate, kept_chance, places, sessions_needed
+from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.sessions import evenly
 from patchproof.settings import SceneSettings, behind
 from patchproof.sheets.manifest import Promise
@@ -144,6 +145,11 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         + "."
     )
     lines.append(sessions_line(plan.sessions))
+    if promise.n < PROMISE_VIEWS and not promise.draft:
+        lines.append(
+            f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "
+            "knows better how much places differ, and often asks for fewer of them."
+        )
     if plan.paired is None and plan.unpaired is None:
         lines.append(
             f"No {MOST_PHOTOS} photographs would show that the patch beats {plan.control}: it is not promised to, or "
