@@ -15,7 +15,7 @@ from patchproof.classifier import load_classifier
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.onnx_file import read_onnx
-from patchproof.classifier.onnx_operators import OPERATORS
+from patchproof.classifier.onnx_operators import OPERATORS, Operator
 from patchproof.classifier.program import load_program
 from patchproof.strict import Refused
 from test_zoo import judged
@@ -152,7 +152,9 @@ BODIES = [
     "y = Pow(x, Two)",
     "a = Less(x, Zero) y = Where(a, C, x)",
     "y = Clip(x, Zero, Two)",
+    "y = Clip(x, Two, Zero)",
     "y = Clip(x, , Zero)",
+    "a = Neg(Two) y = Clip(x, a, Two)",
     "y = MatMul(x, M)",
     "a = Flatten<axis=3>(x) y = Gemm(a, M)",
     "a = ReduceMean<keepdims=0>(x, [0, 1]) y = Gemm<transA=1, alpha=0.5, beta=2.0>(a, M, Two)",
@@ -160,6 +162,11 @@ BODIES = [
     "y = Conv(x, W)",
     "y = Conv<strides=[2,1], dilations=[1,2], pads=[1,0,2,3], kernel_shape=[3,3]>(x, W, F)",
     "y = Conv<group=3, pads=[1,1,1,1]>(x, D)",
+    "y = Conv<group=3, strides=[2,2], pads=[0,0,1,1]>(x, D)",
+    "y = Conv<strides=[2,1], dilations=[1,2], pads=[1,0,2,3]>(x, W)",
+    "w = Mul(W, Two) y = Conv<pads=[1,0,2,3]>(x, w)",
+    "a = Reshape(x, [0, 0, 64]) w = Reshape(W, [4, 3, 9]) y = Conv(a, w)",
+    'y = Conv<auto_pad="VALID">(x, W)',
     "y = MaxPool<kernel_shape=[3,3], strides=[2,2], pads=[1,1,1,1]>(x)",
     "y = MaxPool<kernel_shape=[3,3], strides=[2,2], pads=[0,0,1,1]>(x)",
     "y = MaxPool<kernel_shape=[3,3], strides=[2,2], ceil_mode=1>(x)",
@@ -221,6 +228,22 @@ def test_an_operator_is_onnxs(opset, body):
     got = network(torch.from_numpy(pictures)).numpy()
     assert (got.dtype, got.shape) == (expected.dtype, expected.shape)
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+    elsewhere = network.to("meta")(torch.empty(2, 3, 8, 8, device="meta"))  # constants follow to any device
+    assert elsewhere.shape == got.shape
+
+
+def test_what_archives_save_is_saved_here_too():
+    body = """a = Conv<group=3, pads=[0,0,1,1]>(x, D) b = Clip(a, Zero, Two) c = Conv(b, W) d = Conv(b, W)
+        e = Add(c, d) y = Relu(e)"""
+    network, *_ = read_onnx(onnx_files.model(body).SerializeToString(), lambda: b"")
+    names = [getattr(step.compute, "__name__", "") for step in network.steps]
+    assert names == [
+        "constant_pad_nd.default", "convolution.default", "_hardtanh_", "convolution.default", "convolution.default",
+        "add.Tensor", "relu_.default",
+    ]  # fmt: skip
+    assert network.steps[0].arguments[0].number < len(list(network.buffers()))  # not the pictures
+    network, *_ = read_onnx(onnx_files.model("y = Conv(x, W, F)").SerializeToString(), lambda: b"")
+    assert isinstance(network.steps[0].compute, Operator)  # which sends a short bias to the pictures' device
 
 
 def test_every_operator_of_the_table_is_tried():

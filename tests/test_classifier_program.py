@@ -389,6 +389,29 @@ def test_activations_write_over_what_nobody_else_has(tmp_path, honest):
     assert torch.equal(photos, before)
 
 
+class Limited(torch.nn.Module):
+    """Activations with two limits, each of what was made for it alone."""
+
+    def __init__(self):
+        super().__init__()
+        self.convs = torch.nn.ModuleList(torch.nn.Conv2d(3, 4, 1) for _ in range(3))
+        self.limits = (torch.nn.functional.relu6, torch.nn.Hardtanh(), torch.nn.Hardtanh(-3, 2.0))
+
+    def forward(self, x):
+        seen = [conv(limit(x + 1)) for conv, limit in zip(self.convs, self.limits, strict=True)]
+        return torch.stack(seen).sum(0).mean((2, 3))
+
+
+def test_limits_in_place_have_the_gradients_of_limits_beside(tmp_path, honest):
+    module, photos = seeded(Limited()), torch.randint(-4, 7, (2, 3, 16, 16)).float()  # many lie at the limits
+    network = load_program(save(tmp_path, exported(module))).network.network
+    names = [getattr(step.compute, "__name__", "") for step in network.steps]
+    assert (names.count("_hardtanh_"), names.count("_relu6_")) == (2, 1)
+    for ours, theirs in zip(answered(network, photos), answered(module, photos), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    torch.testing.assert_close(network(photos), module(photos))
+
+
 class Padded(torch.nn.Module):
     """Zeros around, in every way that a convolution's own padding can or cannot say."""
 
@@ -405,6 +428,34 @@ class Padded(torch.nn.Module):
             mirrored(pad(x, (1, 1, 1, 1), mode="reflect")), shared(both), both,
         )  # fmt: skip
         return torch.stack([values.square().mean((2, 3)) for values in found]).sum(0)
+
+
+class PaddedAside(torch.nn.Module):
+    """More zeros on one side, before convolutions of a color each that can have them within, and others."""
+
+    def __init__(self):
+        super().__init__()
+        within = [{"stride": 2}, {"padding": (2, 1)}, {"stride": (1, 2), "kernel_size": (3, 5)}]
+        without = [{"groups": 1}, {"dilation": 2}, {}]
+        self.convs = torch.nn.ModuleList(
+            torch.nn.Conv2d(3, 6, **({"kernel_size": 3, "groups": 3} | changed)) for changed in within + without
+        )
+
+    def forward(self, x):
+        sides = ((0, 1, 0, 1), (2, 1, 0, 0), (1, 0, 3, 2), (0, 1, 0, 1), (0, 1, 0, 1), (0, 2, 0, 1))
+        found = [conv(torch.nn.functional.pad(x, side)) for conv, side in zip(self.convs, sides, strict=True)]
+        return torch.stack([values.square().mean((2, 3)) for values in found]).sum(0)[:, :4]
+
+
+def test_more_zeros_on_one_side_are_zeros_in_small_weights(tmp_path, honest):
+    module, photos = seeded(PaddedAside()), torch.randn(2, 3, 16, 16)
+    network = load_program(save(tmp_path, exported(module))).network.network
+    weights = len(list(network.buffers()))
+    padded = [step.arguments[0].number for step in network.steps if "pad" in str(step.compute)]
+    assert [number < weights for number in padded].count(True) == 3, padded
+    assert padded.count(weights) == 3
+    for ours, theirs in zip(answered(network, photos), answered(module, photos), strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
 @pytest.mark.parametrize("decomposed", [False, True])

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from patchproof.classifier.archive import DTYPES, STRIDED, Unwanted, quoted, whole
 from patchproof.classifier.batches import MAX_BATCH
-from patchproof.classifier.graph import Here, Program, Step, Value, mark_spent
+from patchproof.classifier.graph import Program
 from patchproof.classifier.operators import is_check, operator_named
+from patchproof.classifier.steps import Here, Step, Value, mark_spent
 
 MAX_STEPS = 1 << 15  # DenseNet-201 has 709
 MAX_LIST = 1 << 10  # in one argument

@@ -1,16 +1,14 @@
 """A program's graph, computed one operator after the other.
 
-In: weights, steps and the sizes of the input, as description.py read them. Out: a Program, N×3×S×S → N×K. Values have
-numbers and no names; the only functions called are the operators of the steps. Before pictures of a new shape are
-computed, the steps are tried on tensors without memory: there a value of absurd size, a wrong input and a change of the
-weights or of the input are refused.
+In: weights, steps and the sizes of the input, as description.py or onnx_file.py read them. Out: a Program, N×3×S×S →
+N×K. Values have numbers and no names; the only functions called are the operators of the steps. Before pictures of a
+new shape are computed, the steps are tried on tensors without memory: there a value of absurd size, a wrong input and a
+change of the weights or of the input are refused.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,96 +17,11 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from patchproof.classifier.archive import MAX_DIMENSIONS, quoted
+from patchproof.classifier.rewritten import rewritten
+from patchproof.classifier.steps import Here, Step, Value
 
 MAX_VALUE = 1 << 30  # numbers in one value, for each picture: VGG's at the largest input_px
 MAX_SPLIT = 1 << 16  # along a dimension of what is split into several tensors
-
-
-@dataclass(frozen=True)
-class Value:
-    """In an argument: the value with that number."""
-
-    number: int
-
-
-class Here:
-    """In an argument, the class itself: the device that the pictures are on."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """One operator, where its results go, and which values nobody needs afterwards."""
-
-    compute: Callable[..., Any]
-    arguments: list[Any]
-    keywords: dict[str, Any]
-    results: list[int]
-    several: bool  # the operator returns a sequence
-    spent: list[int]
-
-
-def mark_spent(steps: list[Step], kept: set[int]) -> None:
-    """Write into each step which values it is the last to need."""
-    needed = set(kept)
-    for step in reversed(steps):
-        used = {*step.results, *_numbers(step.arguments), *_numbers(step.keywords.values())}
-        step.spent.extend(used - needed)
-        needed |= used
-
-
-def written_over(steps: list[Step]) -> list[Step]:
-    """The same steps, where an activation writes over what was made for it alone. Numbers stay the same; fresh memory
-    took a tenth of the time of MobileNetV2's answers (75 and 67 ms for four pictures of 224 px on one core, torch 2.13,
-    November 2026), none of its gradients'.
-    """
-    used = Counter(number for step in steps for number in _numbers([*step.arguments, *step.keywords.values()]))
-    made = {number for step in steps if step.compute in _MADE_ANEW for number in step.results if used[number] == 1}
-    return [
-        replace(step, compute=_IN_PLACE[step.compute])
-        if step.compute in _IN_PLACE and made.issuperset(_numbers(step.arguments[:1])) and made & set(step.spent)
-        else step
-        for step in steps
-    ]
-
-
-def padded_within(steps: list[Step]) -> list[Step]:
-    """The same steps, where zeros on all sides that only a convolution reads are its own padding: with 13 copies less
-    MobileNetV2's answers take 0.92 and its gradients 0.93 of the time, to the bit (as above).
-    """
-    kept: list[Step] = []
-    for step in steps:
-        if kept and (padded := _with_padding(step, kept[-1])):
-            kept[-1] = padded
-        else:
-            kept.append(step)
-    return kept
-
-
-def _with_padding(step: Step, pad: Step) -> Step | None:
-    """`step` in place of itself and of the step before it; None where they are no convolution of what a pad made."""
-    if pad.compute not in _PADS or step.compute not in _CONVOLUTIONS or pad.keywords or step.keywords:
-        return None
-    (made,), (photos, sides, *filled) = pad.results, pad.arguments
-    arguments = [*step.arguments, *_CONVOLUTION_DEFAULTS[len(step.arguments) - 2 :]]
-    here, weight, bias, stride, own, *others = arguments
-    zeros = all(item in ("constant", None, 0) for item in filled)
-    even = all(type(side) is int and side >= 0 for side in [*sides, *own]) and sides[::2] == sides[1::2]
-    alone = here == Value(made) and made in step.spent and [*_numbers(arguments)].count(made) == 1
-    if not (zeros and even and alone and (len(sides), len(own)) == (4, 2)) or (
-        step.compute is _ATEN.convolution.default and others[1]
-    ):
-        return None
-    own = [own[0] + sides[2], own[1] + sides[0]]
-    spent = [*pad.spent, *(number for number in step.spent if number != made)]
-    return replace(step, arguments=[photos, weight, bias, stride, own, *others], spent=spent)
-
-
-def _numbers(arguments: Iterable[Any]) -> Iterator[int]:
-    for argument in arguments:
-        if type(argument) is Value:
-            yield argument.number
-        elif type(argument) is list:
-            yield from _numbers(argument)
 
 
 class Program(torch.nn.Module):
@@ -118,7 +31,7 @@ class Program(torch.nn.Module):
         super().__init__()
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
-        self.steps, self.output, self.sizes = written_over(padded_within(steps)), output, sizes
+        self.steps, self.output, self.sizes = rewritten(steps, weights), output, sizes
         self.weighed: set[torch.Size] = set()
 
     def forward(self, photos: Tensor) -> Tensor:
@@ -186,17 +99,11 @@ def _mean(values: Tensor, over: list[int] | None, keep: bool = False, **_: Any) 
 
 # On tensors without memory torch computes these in Python, for which it imports its compiler and SymPy: two seconds.
 _ATEN = torch.ops.aten
-# their gradients need what they made, not what they got; and those who make it do not need it
-_IN_PLACE = {getattr(_ATEN, name).default: getattr(_ATEN, f"{name}_").default for name in ("relu", "relu6", "hardtanh")}
-_MADE_ANEW = {_ATEN.conv2d.default, _ATEN.conv2d.padding, _ATEN.batch_norm.default, _ATEN.add.Tensor}
-_PADS = (_ATEN.pad.default, _ATEN.constant_pad_nd.default)
-_CONVOLUTIONS = (_ATEN.conv2d.default, _ATEN.convolution.default)
-_CONVOLUTION_DEFAULTS = [None, [1, 1], [0, 0]]  # bias, stride, padding
 _PLAIN = (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div), (_ATEN.relu, _ATEN.hardtanh, _ATEN.hardswish)
 _WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
     **{operator.Tensor: _like_first(operator.Tensor) for operator in _PLAIN[0]},
     **{operator.default: _like_first(operator.default) for operator in _PLAIN[1]},
-    **{changed: _like_first(changed) for changed in _IN_PLACE.values()},
+    **{changed: _like_first(changed) for changed in (_ATEN.relu_.default, _ATEN.hardtanh_.default)},
     _ATEN.convolution.default: _convolution,
     _ATEN.mean.dim: _mean,
 }

@@ -22,10 +22,12 @@ from torch import Tensor
 from patchproof.classifier.archive import MAX_DIMENSIONS, MAX_NUMBERS, Unwanted, quoted, whole
 from patchproof.classifier.batches import MAX_BATCH
 from patchproof.classifier.description import MAX_LIST
-from patchproof.classifier.graph import Here, Program, Step, Value, mark_spent
+from patchproof.classifier.graph import Program
 from patchproof.classifier.onnx_operators import DTYPES, OPERATORS
+from patchproof.classifier.onnx_plain import Way, way_through
 from patchproof.classifier.onnx_shapes import MAX_SIZES
 from patchproof.classifier.protobuf import BYTES, FLOAT, INT, NEVER, TEXT, Schema, read_message
+from patchproof.classifier.steps import Here, Step, Value, mark_spent
 
 OPSETS = (13, 28)
 MAX_SCALARS = 8  # fractions that stay on the CPU: a Resize has as many in its list of factors
@@ -151,6 +153,7 @@ class _Reader:
         self.graph, self.nodes = graph, graph.get("node", [])
         self.weights: list[Tensor] = []
         self.count = 0  # of values with a number
+        self.of_four = set[int]()  # numbers of those with four dimensions, as far as that is known
         self.values: dict[str, Value | Tensor | None] = {"": None}  # an input that is left out
         self.tensor = weights.tensor
 
@@ -166,6 +169,7 @@ class _Reader:
             raise Unwanted(f"{len(given)} inputs, not one of N×3×S×S")
         low, high, sizes = _shape(given[0]["type"]["tensor"])
         self.count = len(self.weights)
+        self.of_four = {number for number, weight in enumerate(self.weights) if weight.dim() == 4}
         self._new(given[0]["name"])
         steps = [step for node in self.nodes for step in self._steps(node)]
         outputs = [self._known(place["name"]) for place in self.graph["output"]]
@@ -216,7 +220,18 @@ class _Reader:
         if several and len(inputs) == 1:
             attributes.setdefault("num_outputs", len(outputs))
         operator.check(inputs, attributes)
+        if way := way_through(name, inputs, attributes, self.of_four):
+            return self._along(way, name, inputs[0], outputs[0])
         return [Step(operator, [Here, *inputs], attributes, [self._new(word) for word in outputs], several, [])]
+
+    def _along(self, way: Way, name: str, value: Any, output: str) -> list[Step]:
+        steps, known = [], name == "Conv" or value.number in self.of_four
+        for compute, others in way:
+            steps.append(Step(compute, [value, *others], {}, [self.count], False, []))
+            value, self.count = Value(self.count), self.count + 1
+        self._name(output, value)
+        self.of_four |= {value.number} if known else set()
+        return steps
 
     def _attributes(self, node: dict[str, Any]) -> dict[str, Any]:
         listed = [(attribute["name"], self._attribute(attribute)) for attribute in node.get("attribute", [])]

@@ -1,0 +1,48 @@
+"""A program as numbered steps: what description.py and onnx_file.py make of a file, and graph.py computes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Value:
+    """In an argument: the value with that number."""
+
+    number: int
+
+
+class Here:
+    """In an argument, the class itself: the device that the pictures are on."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operator, where its results go, and which values nobody needs afterwards."""
+
+    compute: Callable[..., Any]
+    arguments: list[Any]
+    keywords: dict[str, Any]
+    results: list[int]
+    several: bool  # the operator returns a sequence
+    spent: list[int]
+
+
+def mark_spent(steps: list[Step], kept: set[int]) -> None:
+    """Write into each step which values it is the last to need."""
+    needed = set(kept)
+    for step in reversed(steps):
+        used = {*step.results, *numbers_in(step.arguments), *numbers_in(step.keywords.values())}
+        step.spent.extend(used - needed)
+        needed |= used
+
+
+def numbers_in(arguments: Iterable[Any]) -> Iterator[int]:
+    """Of the values that arguments name."""
+    for argument in arguments:
+        if type(argument) is Value:
+            yield argument.number
+        elif type(argument) is list:
+            yield from numbers_in(argument)
