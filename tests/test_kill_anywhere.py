@@ -45,7 +45,7 @@ def test_killed_runs_leave_nothing_half_done_and_end_in_the_same_bytes():
 def optimize(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer import loop, run
 
-    run.PROMISE_VIEWS, loop.SELECT_VIEWS, loop.SELECT_AFTER = 4, 4, 8
+    run.PROMISE_VIEWS, loop.SELECT_VIEWS, loop.SELECT_AFTER, loop.SAVE_AFTER = 4, 4, 16, 8
     run.optimize_scene(base / "scene.toml", out, controls=("bare",), resume=again)
 
 

@@ -262,6 +262,7 @@ def few_views(monkeypatch):
     monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_AFTER", 40)
+    monkeypatch.setattr(loop, "SAVE_AFTER", 20)
 
 
 def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors", "views.png")):
@@ -337,11 +338,12 @@ class Killed(Exception):
     pass
 
 
-def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, few_views):
+@pytest.mark.parametrize("last", [12, 8])  # saved after 5 and 10, tried on the selection set after 10 alone
+def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, few_views, last):
     scene = toml(tmp_path / "scene.toml", optimize__steps=14)
 
     def kill(step, total):
-        if step.state.number == 12:  # tried on the selection set after 10
+        if step.state.number == last:
             raise Killed
 
     optimize_scene(scene, tmp_path / "whole")
@@ -349,7 +351,9 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
         optimize_scene(scene, tmp_path / "cut", on_step=kill)
     with pytest.raises(Refused, match="an unfinished one"):
         load_run(tmp_path / "cut")
-    resumed = optimize_scene(scene, tmp_path / "cut", resume=True)
+    made: list[int] = []
+    resumed = optimize_scene(scene, tmp_path / "cut", resume=True, on_step=lambda s, _: made.append(s.state.number))
+    assert made == [*range(11 if last == 12 else 6, 15)]
     assert same_files(tmp_path / "whole", tmp_path / "cut")
     assert len((tmp_path / "cut" / "steps.jsonl").read_text().splitlines()) == 14
     np.testing.assert_array_equal(load_run(tmp_path / "cut").design, resumed.design)
@@ -362,7 +366,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatc
     """
     monkeypatch.setattr(loop, "POSES", 5)
     monkeypatch.setattr(places, "PLACES", 3)
-    monkeypatch.setattr(places, "SHARE", 0)
+    monkeypatch.setattr(places, "PASSES", 0)
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with threads(1):

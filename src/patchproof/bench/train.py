@@ -76,7 +76,8 @@ def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], loss
 
 def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
     """Training views after which a run is charted: there the design was tried on the selection set."""
-    return [end for end in (effort.views // 2, effort.views) if selects(run, end // run.views)]
+    whole = run.changed(steps=effort.views // run.views)
+    return [end for end in (effort.views // 2, effort.views) if selects(whole, end // run.views)]
 
 
 def trained_losses(

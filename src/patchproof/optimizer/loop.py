@@ -2,7 +2,7 @@
 
 In: a `Problem` and, to go on, a `State`. Out: a generator of `Step`s; saving, progress and plots are its caller's
 business. The design starts at mid-gray. Adam on every level of the gradient's pyramid, or signed steps as in FGSM and
-PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every so many views the design is tried on a
+PGD (Goodfellow et al. 2015, Madry et al. 2018), always clipped to [0, 1]. Every 240 views the design is tried on a
 fixed selection set, and the best one is kept: a design that suited its last views only is not what gets printed. The
 promise set is never touched here.
 
@@ -34,7 +34,10 @@ from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
 from patchproof.workers import sharing
 
-SELECT_AFTER = 120  # training views
+# Training views. Tried twice as often, 28 of 30 runs kept their last design all the same, and two one that was better
+# by 0.00 and 0.02 of loss.
+SELECT_AFTER = 240
+SAVE_AFTER = 120  # training views that a kill may lose
 SELECT_VIEWS = 64
 SELECT_CHUNK = 4
 TOGETHER = 2  # views of a step that one process sees: one at a time, seeing took 1.4 times as long
@@ -99,7 +102,16 @@ def start(problem: Problem) -> State:
 
 def selects(settings: OptimizeSettings, number: int) -> bool:
     """Whether the design is tried on the selection set after step `number`, counted from 1."""
-    done, before = (n * settings.views // SELECT_AFTER for n in (number, number - 1))
+    return _ends(settings, number, SELECT_AFTER)
+
+
+def saves(settings: OptimizeSettings, number: int) -> bool:
+    """Whether the state after step `number` is worth keeping."""
+    return _ends(settings, number, SAVE_AFTER)
+
+
+def _ends(settings: OptimizeSettings, number: int, views: int) -> bool:
+    done, before = (n * settings.views // views for n in (number, number - 1))
     return done > before or number == settings.steps
 
 

@@ -1,4 +1,4 @@
-"""`place = "auto"`: where on the object a design reaches most, found with a quarter of what a run costs.
+"""`place = "auto"`: where on the object a design reaches most, found with less than a quarter of what a run costs.
 
 In: an `OpenScene` and its networks. Out: `Place`. Places all over the surface (see `scene.places`) are compared in the
 same views, those of `patch.side`, in three steps. Screening: what a gray design costs at each place, and what its
@@ -25,6 +25,7 @@ from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import draft, gradient_of, part_of, seen, start, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import CONTROL_VIEWS, CONTROLS, PER_SESSION, PROMISE_VIEWS
 from patchproof.optimizer.responses import responses
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
@@ -35,9 +36,8 @@ from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused, Side, Strict
 from patchproof.workers import sharing
 
-# Of a default run's passes: pictures that go through a network, and once more those that gradients come back through.
-SHARE = 0.25
-PLACES, SCREEN_VIEWS = 24, 4  # 192 of 608 passes, and 4 of the bare object
+PASSES = 608  # at most: pictures that go through a network, and once more those that gradients come back through
+PLACES, SCREEN_VIEWS = 24, 4  # 192 of them, and 4 of the bare object
 TURNED = 4  # of the best places, with at most three turns each: 96
 # What is left, 18 steps at least. Of as many views, 18 steps of 2 got 0.02 to 0.03 further than 9 of 4 (two places on
 # the demo's truck).
@@ -147,16 +147,19 @@ def place_lines(place: Place) -> list[str]:
 
 
 def default_passes() -> int:
-    """A network's passes in a run of default length: all its views, and those of training once more."""
+    """A network's passes in a run of default length: all its views, those of training once more, and the fewest that a
+    promise is made of.
+    """
     settings = OptimizeSettings()
-    return views_seen(settings) + settings.steps * settings.views
+    promise = PROMISE_VIEWS // 2 * (PER_SESSION + len(CONTROLS) * CONTROL_VIEWS) // PER_SESSION
+    return views_seen(settings) + settings.steps * settings.views + promise
 
 
 class _Search:
     """A search under way, which counts its networks' passes."""
 
     def __init__(self, scene: OpenScene, stated, on_pass: Callable[[int, int], None]):
-        self.passes, self._budget = 0, int(SHARE * default_passes())
+        self.passes, self._budget = 0, PASSES
         self._scene, self._on_pass = scene, on_pass
         self._first: Problem | None = None
         self._bare: float | None = None

@@ -27,7 +27,7 @@ from patchproof.classifier.network import Classifier
 from patchproof.input import is_file, read_json
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
 from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import SELECT_AFTER, State, Step, start, steps
+from patchproof.optimizer.loop import SELECT_AFTER, State, Step, saves, start, steps
 from patchproof.optimizer.patch import DESIGN_FILE
 from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.place_files import PLACE_FILES, read_place, save_place
@@ -217,7 +217,8 @@ def _clear(out: Path) -> None:
 
 def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, int], None]) -> np.ndarray:
     """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
-    total = problem.scene.settings.optimize.steps
+    settings = problem.scene.settings.optimize
+    total = settings.steps
     _cut_log(out / _LOG, state.number)
     largest = None
     with open(out / _LOG, "a", encoding="utf-8") as log:
@@ -227,7 +228,7 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             log.flush()
             if state.number == total and step.pictures is not None:
                 write_png(out / _VIEWS, side_by_side(step.pictures))
-            if step.select_loss is not None:  # after the views, which a run that goes on from the last step lacks
+            if saves(settings, state.number):  # after the views, which a run that goes on from the last step lacks
                 save_checkpoint(state, problem, out)
             largest = max(step.gradient, largest or 0.0)
             on_step(step, total)

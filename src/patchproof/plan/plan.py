@@ -11,14 +11,16 @@ Left out on purpose: deciding for the user. The plan says what can go; the scene
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
-from patchproof.optimizer.loop import SELECT_VIEWS, selects, steps
+from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.places import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
@@ -32,6 +34,7 @@ from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
 from patchproof.strict import Strict
 
 TERM_VIEWS = 16
+DRAFT_VIEWS = 120  # that the draft is trained on
 _VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
 
 
@@ -188,12 +191,13 @@ def _quantiles(values: np.ndarray) -> tuple[float, float]:
 
 
 def _draft(problem: Problem, on_stage: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
-    """The loop's design when it is first tried on the selection set, in 8-bit colors."""
-    settings = problem.scene.settings.optimize
-    total = next(number for number in range(1, settings.steps + 1) if selects(settings, number))
-    for step in steps(problem):
-        on_stage("draft", step.state.number, total)
-        if step.select_rate is not None:
-            design = from_pixels(as_pixels(step.state.design), problem.device)
-            return design, Draft(steps=step.state.number, rate=step.select_rate)
-    raise ValueError("the loop ended before it selected a design")
+    """The loop's design after a few steps, in 8-bit colors, tried on the selection set."""
+    settings = problem.scene.settings
+    count = min(settings.optimize.steps, math.ceil(DRAFT_VIEWS / settings.optimize.views))
+    few = settings.changed(optimize={"steps": count})
+    state, rate = start(problem), None
+    for step in steps(replace(problem, scene=replace(problem.scene, settings=few)), state):
+        state, rate = step.state, step.select_rate
+        on_stage("draft", state.number, count)
+    assert rate is not None  # the last step ends with a selection
+    return from_pixels(as_pixels(state.design), problem.device), Draft(steps=count, rate=rate)
