@@ -314,7 +314,23 @@ def test_figures_of_a_step_are_the_stored_ones():
     for alone, shared in zip(rows[::2], rows[1::2], strict=True):
         name = told.get(alone["network"], "ResNet-50 of random weights")
         name = "with every effect on" if alone["scene"] == "effects" else name
-        assert f"| {name} | {float(alone['ratio']):.2f} | {float(shared['ratio']):.2f} |" in words(NOTEBOOK)
+        parts = [
+            ", ".join(f"{float(row[part]) / float(row['pass_ms']):.2f}" for part in ("new_ms", "again_ms"))
+            for row in (alone, shared)
+        ]
+        ratios = [f"{float(row['ratio']):.2f}" for row in (alone, shared)]
+        assert f"| {name} | {' | '.join(ratios + parts)} |" in words(NOTEBOOK)
+
+
+def test_figures_of_selections_are_the_stored_ones():
+    rows = rows_of("speed/selections.csv")
+    kept = sum(row["all_best"] == row["half_best"] == "960" for row in rows)
+    assert f"{kept} of {len(rows)} runs of 960 views kept their last design" in words(NOTEBOOK)
+    others = [row for row in rows if row["all_best"] != row["half_best"]]
+    loss = [float(row["half_loss"]) - float(row["all_loss"]) for row in others]
+    points = [100 * (float(row["all_rate"]) - float(row["half_rate"])) for row in others]
+    said = "by {:.2f} and {:.2f} of loss and {:.1f} and {:.1f} points".format(*loss, *points)
+    assert kept + len(others) == len(rows) and said in words(NOTEBOOK)
 
 
 def test_figures_of_poses_that_come_round_are_the_stored_ones():

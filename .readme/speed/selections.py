@@ -1,9 +1,9 @@
 """What trying a design on the selection set twice as often as a run does would change.
 
-In: three objects of `bench effort`, to be recognized, two of them not to be, and by signed steps. Out: `selections.csv`:
-by run the loss on the selection set after every 120 of 960 views, the number of the best of these and of every second
-one, and, where they differ, both designs' mean loss and rate in the same 300 fresh views. Run in this folder:
-python selections.py
+In: three objects of `bench effort`, to be recognized, and two of them not to be, and by signed steps. Out:
+`selections.csv`: by run the loss on the selection set after every 120 of 960 views, after how many the best of these
+and of every second one stood, and, where they differ, both designs' mean loss and rate in the same 300 fresh views. Run
+in this folder: python selections.py
 """
 
 import csv
