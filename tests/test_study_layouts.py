@@ -44,7 +44,7 @@ def test_a_layout_reserves_what_it_says(scene):
 def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
     monkeypatch.setattr(places, "PLACES", 3)
-    monkeypatch.setattr(places, "SHARE", 0)  # the shortest drafts: which place is chosen is tested elsewhere
+    monkeypatch.setattr(places, "PASSES", 0)  # the shortest drafts: which place is chosen is tested elsewhere
     (tmp_path / "scene.toml").write_text(
         '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 120\nheight_mm = 120\n'
         '[target]\nlabel = "red"\nmodels = ["module:fake_networks.red_against_blue"]\n'
