@@ -10,7 +10,7 @@ import pytest
 from patchproof.bench import effort, evidence, train
 from patchproof.bench.chart import Chart, Point, all_checks
 from patchproof.bench.paper import PIECE_MM, corners_mm, drawn_sheet
-from patchproof.bench.world import demo_problem, with_optimize
+from patchproof.bench.world import demo_problem
 from patchproof.claims import Estimate
 from patchproof.optimizer import loop
 from patchproof.settings import OptimizeSettings
@@ -58,7 +58,7 @@ def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     monkeypatch.setattr(loop, "score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
-    train.trained(with_optimize(problem, OptimizeSettings(views=3, steps=2)), [2])
+    train.trained(problem.trained_by(OptimizeSettings(views=3, steps=2)), [2])
     assert sum(seen) == loop.views_seen(OptimizeSettings(views=3, steps=2))
 
 

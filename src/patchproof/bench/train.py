@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from patchproof.bench.chart import Chart, OnStage, Point
-from patchproof.bench.world import demo_problem, with_optimize
+from patchproof.bench.world import demo_problem
 from patchproof.claims import paired_means
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -89,7 +89,7 @@ def trained_losses(
         for i, run in enumerate(runs):
             ends = ends_of(run, effort)
             numbers = [end // run.views for end in ends]
-            designs = trained(with_optimize(problem, run.changed(steps=numbers[-1]), seed), numbers)
+            designs = trained(problem.trained_by(run.changed(steps=numbers[-1]), seed), numbers)
             shown |= {(run, end, seed): problem.subject.shown(d) for end, d in zip(ends, designs, strict=True)}
             on_stage("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)

@@ -6,7 +6,6 @@ optimization, since a real one has more contrast and finer detail than a picture
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,7 +22,7 @@ from patchproof.settings import OptimizeSettings
 
 def design_for_demo(count: int, on_stage: OnStage) -> tuple[Problem, Tensor]:
     """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
-    problem = with_optimize(demo_problem(), OptimizeSettings(steps=count))
+    problem = demo_problem().trained_by(OptimizeSettings(steps=count))
     state = start(problem)
     for step in steps(problem, state):
         state = step.state
@@ -35,10 +34,3 @@ def demo_problem() -> Problem:
     """The demo's problem."""
     with TemporaryDirectory() as folder:
         return set_problem(load_scene(demo_scene(Path(folder))))
-
-
-def with_optimize(problem: Problem, optimize: OptimizeSettings, seed: int | None = None) -> Problem:
-    """The problem with these settings of the loop, and another seed of its draws."""
-    scene = problem.scene
-    settings = scene.settings.changed(optimize=optimize)
-    return replace(problem, scene=replace(scene, settings=settings, seed=scene.seed if seed is None else seed))

@@ -1,4 +1,4 @@
-"""ONNX's operators that ATen has, too: as its steps they take part in what graph.py saves.
+"""ONNX's operators that ATen has, too: as its steps they take part in what rewritten.py saves.
 
 In: a node's name, its inputs and attributes, and the numbers of values that are known to have four dimensions. Out:
 operators of ATen that its first input goes through, one after the other; none where onnx_operators.py has to compute

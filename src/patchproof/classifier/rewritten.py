@@ -20,7 +20,7 @@ _ATEN = torch.ops.aten
 
 
 def rewritten(steps: list[Step], weights: Sequence[Tensor]) -> list[Step]:
-    """Steps with the same results in values of the same numbers; the first values are the weights."""
+    """Steps that make the same of the same pictures; the first values are the weights."""
     return _written_over(_padded_within(steps, weights))
 
 

@@ -25,7 +25,7 @@ from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import draft, gradient_of, part_of, seen, start, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROL_VIEWS, CONTROLS, PER_SESSION, PROMISE_VIEWS
+from patchproof.optimizer.promise import fewest_passes
 from patchproof.optimizer.responses import responses
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
@@ -147,12 +147,9 @@ def place_lines(place: Place) -> list[str]:
 
 
 def default_passes() -> int:
-    """A network's passes in a run of default length: all its views, those of training once more, and the fewest that a
-    promise is made of.
-    """
+    """A network's passes in a default run: all its views, those of training once more, and a short promise's."""
     settings = OptimizeSettings()
-    promise = PROMISE_VIEWS // 2 * (PER_SESSION + len(CONTROLS) * CONTROL_VIEWS) // PER_SESSION
-    return views_seen(settings) + settings.steps * settings.views + promise
+    return views_seen(settings) + settings.steps * settings.views + fewest_passes()
 
 
 class _Search:

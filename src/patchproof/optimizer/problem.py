@@ -31,6 +31,7 @@ from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
+from patchproof.settings import OptimizeSettings
 from patchproof.strict import Refused
 from patchproof.workers import threads
 
@@ -93,6 +94,12 @@ class Problem:
         """The same before some of its networks, by number."""
         classifiers, indices = (tuple(each[i] for i in chosen) for each in (self.classifiers, self.indices))
         return replace(self, classifiers=classifiers, indices=indices)
+
+    def trained_by(self, optimize: OptimizeSettings, seed: int | None = None) -> Problem:
+        """The same with these settings of the loop, and another seed of its draws."""
+        settings = self.scene.settings.changed(optimize=optimize)
+        scene = replace(self.scene, settings=settings, seed=self.scene.seed if seed is None else seed)
+        return replace(self, scene=scene)
 
     def hung(self, scene: PatchScene) -> Problem:
         """The same with the piece at another place, as `scene` has it; the object's tensors are shared."""

@@ -136,6 +136,12 @@ def _looks(total: int, per_session: int) -> list[int]:
     return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
 
 
+def fewest_passes() -> int:
+    """Pictures that a network sees in a promise that stops as early as it may."""
+    views = _looks(PROMISE_VIEWS, PER_SESSION)[1]
+    return views + len(CONTROLS) * int(_with_controls(views, PER_SESSION).sum())
+
+
 def _counted(on_views: Callable[[int, int], None], before: int, total: int, done: int, _: int) -> None:
     on_views(before + done, total)
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -192,11 +191,10 @@ def _quantiles(values: np.ndarray) -> tuple[float, float]:
 
 def _draft(problem: Problem, on_stage: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
     """The loop's design after a few steps, in 8-bit colors, tried on the selection set."""
-    settings = problem.scene.settings
-    count = min(settings.optimize.steps, math.ceil(DRAFT_VIEWS / settings.optimize.views))
-    few = settings.changed(optimize={"steps": count})
+    settings = problem.scene.settings.optimize
+    count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
     state, rate = start(problem), None
-    for step in steps(replace(problem, scene=replace(problem.scene, settings=few)), state):
+    for step in steps(problem.trained_by(settings.changed(steps=count)), state):
         state, rate = step.state, step.select_rate
         on_stage("draft", state.number, count)
     assert rate is not None  # the last step ends with a selection
