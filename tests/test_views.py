@@ -19,7 +19,7 @@ from patchproof.channel.lens import distort_points
 from patchproof.optimizer.problem import set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
-from patchproof.render.photograph import expose, photograph, shade
+from patchproof.render.photograph import expose, photograph, shade, windows_of
 from patchproof.render.pixels import Look, ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
@@ -202,6 +202,17 @@ def test_views_lit_anew_are_views_seen_anew(tmp_path, tables):
             assert torch.equal(pictures, expose(see(stage, laid_out, anew, (96, 96)), shown))
             assert not torch.equal(pictures, before)
         assert torch.equal(expose(seen, shown), before)
+
+
+def test_where_it_is_not_known_what_a_design_changes_there_are_no_windows(tmp_path):
+    lens = ("photo_px = [800, 600]", 'photo_px = [1600, 1200]\nfile = "phone"')
+    for scene, known in ((scene_of(tmp_path), True), (scene_of(tmp_path, lens), False)):
+        stage, drawn = set_stage(scene), posed(scene, 2, azimuth_deg=[0, 180])
+        assert windows_of(see(stage, None, drawn, (96, 96))) is None, "textures change the object"
+        windows = windows_of(see(stage, piece_of(scene), drawn, (96, 96)))
+        assert (windows is not None) == known
+        if known:
+            assert windows[1].tolist() == [0, 0, 1, 1], "from behind nothing is seen of it"
 
 
 def both_ways(monkeypatch, stage, shown, conditions, side):

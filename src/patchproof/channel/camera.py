@@ -62,10 +62,23 @@ def develop(
 
 def is_pointwise(sensor: Sensor, scale: float, jpeg: bool) -> bool:
     """Whether `develop` treats every pixel alone, so that a changed part can be developed without the rest."""
-    sharp = sensor.blur_px.max() * scale < SMALLEST_BLUR_PX
-    still = (sensor.motion_px * scale).max() < SMALLEST_MOTION_PX
-    clean = (sensor.noise * scale).max() < SMALLEST_NOISE
-    return bool(sharp and still and clean and not _is_stored(sensor, scale, jpeg))
+    return reach_px(sensor, scale, jpeg) == 0 and bool((sensor.noise * scale).max() < SMALLEST_NOISE)
+
+
+def reach_px(sensor: Sensor, scale: float, jpeg: bool = True) -> int | None:
+    """How many pixels far `develop` carries light; None where JPEG shares it out in blocks."""
+    if _is_stored(sensor, scale, jpeg):
+        return None
+    blur_px, motion_px = float(sensor.blur_px.max()) * scale, float(sensor.motion_px.max()) * scale
+    return _blur_reach(blur_px) + _motion_reach(motion_px)
+
+
+def _blur_reach(sigma_px: float) -> int:
+    return 0 if sigma_px < SMALLEST_BLUR_PX else int(3 * sigma_px + 0.5)
+
+
+def _motion_reach(length_px: float) -> int:
+    return 0 if length_px < SMALLEST_MOTION_PX else int(length_px / 2) + 1
 
 
 def _is_stored(sensor: Sensor, scale: float, jpeg: bool) -> bool:
@@ -130,10 +143,10 @@ def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:
     """Gaussian blur with one sigma per picture; nothing where all are too small to be seen."""
     from kornia.filters import get_gaussian_kernel1d
 
-    largest = float(sigma_px.max())
-    if largest < SMALLEST_BLUR_PX:
+    reach = _blur_reach(float(sigma_px.max()))
+    if reach == 0:
         return linear
-    taps = 2 * int(3 * largest + 0.5) + 1
+    taps = 2 * reach + 1
     kernels = get_gaussian_kernel1d(taps, sigma_px.clamp_min(0.05)[:, None])  # 0.05 px leaves a picture as it was
     kernels = torch.where(kernels > 1e-30, kernels, 0.0)  # numbers near the smallest took seven times as long
     return _filtered(linear, kernels[:, None], kernels[:, :, None])
@@ -144,7 +157,7 @@ def moved(linear: Tensor, length_px: Tensor, angle_deg) -> Tensor:
 
     Nothing where all are too short to be seen; length 0 leaves a picture as it was.
     """
-    if float(length_px.max()) < SMALLEST_MOTION_PX:
+    if _motion_reach(float(length_px.max())) == 0:
         return linear
     return _filtered(linear, _streaks(length_px, torch.as_tensor(angle_deg).to(linear)))
 
@@ -169,7 +182,7 @@ def _streaks(length_px: Tensor, angle_deg: Tensor) -> Tensor:
 
     kornia's own motion kernels have one odd length for the whole batch and, turned, jump from pixel to pixel.
     """
-    reach = int(length_px.max() / 2) + 1
+    reach = _motion_reach(float(length_px.max()))
     pixels = torch.arange(-reach, reach + 1).to(length_px)
     steps = 8 * reach  # four or more per pixel
     along = length_px[:, None] * ((torch.arange(steps).to(length_px) + 0.5) / steps - 0.5)

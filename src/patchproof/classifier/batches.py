@@ -11,9 +11,14 @@ are faster whole and stay so.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from patchproof.classifier.graph import Program
+from patchproof.classifier.windows import Cut, answers, cut_of
 
 MAX_BATCH = 4096  # where a program sets no limit of its own
 CPU_BATCH_PIXELS = 4 * 224**2  # 2 to 8 pictures of 224 px cost the same each, 12 a third more
@@ -25,19 +30,35 @@ class InBatches(torch.nn.Module):
     def __init__(self, network: Callable[[Tensor], Tensor], low: int = 1, high: int = MAX_BATCH):
         super().__init__()
         self.network, self.low, self.high, self.order = network, low, high, torch.contiguous_format
+        self.tried: Tensor | None = None  # pictures that the order was tried with on a CPU
 
     def train(self, mode: bool = True) -> InBatches:
         """Nothing to switch: networks come as they are to be used, and an exported program refuses `eval()`."""
         return self
 
-    def forward(self, photos: Tensor) -> Tensor:
-        """N×3×S×S → N×K logits."""
+    def forward(self, photos: Tensor, windows: np.ndarray | None = None) -> Tensor:
+        """N×3×S×S → N×K logits. The pictures' gradient need hold in `windows` only, N×4 pixels (left, top, right,
+        bottom).
+        """
         logits = []
-        for batch in photos.split(self.high):
+        for number, batch in enumerate(photos.split(self.high)):
             missing = self.low - len(batch)
             padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
-            logits.append(self.network(padded.contiguous(memory_format=self.order))[: len(batch)])
+            ordered = padded.contiguous(memory_format=self.order)
+            of_batch = None if windows is None or missing > 0 else windows[number * self.high :][: len(batch)]
+            logits.append(self._answers(ordered, of_batch)[: len(batch)])
         return torch.cat(logits)
+
+    def _answers(self, photos: Tensor, windows: np.ndarray | None) -> Tensor:
+        network, cut = self.network, None if windows is None else self._cut
+        if windows is None or cut is None or cut.saves(windows, photos.shape[-1]) <= 0:
+            return network(photos)
+        return answers(network, cut, photos, windows)
+
+    @cached_property
+    def _cut(self) -> Cut | None:
+        network, pictures = self.network, self.tried
+        return cut_of(network, pictures) if isinstance(network, Program) and pictures is not None else None
 
 
 def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:
@@ -48,6 +69,7 @@ def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:
     batches = network if isinstance(network, InBatches) else InBatches(network)
     if pictures.device.type == "cpu":
         batches.high = max(batches.low, min(batches.high, few_on_cpu(pictures.shape[-1])))
+        batches.tried = pictures
     batches.order = torch.channels_last
     try:
         tried = pictures.clone().requires_grad_()

@@ -50,9 +50,9 @@ class Detector(Classifier):
         """N bool: the object was found under one of these labels with a sufficient score."""
         return self.confidence(logits, indices) >= self.least_score
 
-    def answer(self, squares: Tensor, boxes: np.ndarray | None = None) -> Tensor:
+    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: np.ndarray | None = None) -> Tensor:
         """N×K logits of the best candidates on the object, whose box is known as shares of the square."""
-        candidates = self.network(squares)
+        candidates = self._asked(squares, windows)
         logits = candidates[..., 4:]
         if boxes is not None:
             overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(squares) * self.input_px)

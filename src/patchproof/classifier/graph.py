@@ -8,7 +8,7 @@ change of the weights or of the input are refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ class Program(torch.nn.Module):
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
         self.steps, self.output, self.sizes = rewritten(steps, weights), output, sizes
+        self.photos = len(weights)  # the number of the pictures, after those of the weights
         self.weighed: set[torch.Size] = set()
 
     def forward(self, photos: Tensor) -> Tensor:
@@ -40,18 +41,13 @@ class Program(torch.nn.Module):
             self._weigh(photos.shape)
         return self._computed(list(self.buffers()), photos)
 
+    def values(self, number: int, value: Tensor) -> dict[int, Any]:
+        """The weights, and what has been computed of pictures: the value with that number."""
+        return dict(enumerate(self.buffers())) | {number: value}
+
     def _computed(self, weights: list[Tensor], photos: Tensor) -> Tensor:
         values: dict[int, Any] = dict(enumerate([*weights, photos]))
-        for step in self.steps:
-            arguments = [_filled(argument, values, photos) for argument in step.arguments]
-            keywords = {name: _filled(argument, values, photos) for name, argument in step.keywords.items()}
-            if step.several and photos.is_meta:
-                _check_split(arguments)
-            results = step.compute(*arguments, **keywords)
-            for number, result in zip(step.results, results if step.several else [results], strict=True):
-                values[number] = result
-            for number in step.spent:  # memory is used again while it is in the cache
-                del values[number]
+        compute(self.steps, values, photos)
         return values[self.output]
 
     def _weigh(self, shape: torch.Size) -> None:
@@ -66,6 +62,20 @@ class Program(torch.nn.Module):
         if any(tensor._version for tensor in [*weights, photos]):
             raise ValueError("it changes its weights or its input")
         self.weighed.add(shape)
+
+
+def compute(steps: Sequence[Step], values: dict[int, Any], like: Tensor) -> None:
+    """Put the steps' results among the values that they name, on the device of `like`; drop what is spent."""
+    for step in steps:
+        arguments = [_filled(argument, values, like) for argument in step.arguments]
+        keywords = {name: _filled(argument, values, like) for name, argument in step.keywords.items()}
+        if step.several and like.is_meta:
+            _check_split(arguments)
+        results = step.compute(*arguments, **keywords)
+        for number, result in zip(step.results, results if step.several else [results], strict=True):
+            values[number] = result
+        for number in step.spent:  # memory is used again while it is in the cache
+            del values[number]
 
 
 def _like_first(compute: Callable[..., Any]) -> Callable[..., Any]:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.classifier.batches import InBatches
 from patchproof.strict import Refused
 
 
@@ -39,12 +40,14 @@ class Classifier:
 
     KIND: ClassVar[str] = "classifier"
 
-    def logits(self, photos_srgb: Tensor, boxes: np.ndarray | None = None) -> Tensor:
+    def logits(self, photos_srgb: Tensor, boxes: np.ndarray | None = None, windows: np.ndarray | None = None) -> Tensor:
         """N×K logits of the photographs' centered squares; refused where they are no numbers, which would pass for an
         answer: the largest of a row with NaN is the NaN. `boxes` N×4 tell where the object lies, as shares of the
-        square's side (left, top, right, bottom); only a detector looks at them.
+        square's side (left, top, right, bottom); only a detector looks at them. Outside of `windows`, N×4 pixels in
+        the same order, the photographs' gradient is not asked for, and may be 0.
         """
-        logits = self.answer(center_square(photos_srgb, self.input_px), boxes)
+        own_size = photos_srgb.shape[-2:] == (self.input_px, self.input_px)
+        logits = self.answer(center_square(photos_srgb, self.input_px), boxes, windows if own_size else None)
         if not bool(torch.isfinite(logits).all()):
             do = "check its weights and its number format"
             raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
@@ -69,9 +72,14 @@ class Classifier:
         """N bool: the largest logit is one of `indices`."""
         return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
 
-    def answer(self, squares: Tensor, boxes: np.ndarray | None = None) -> Tensor:
+    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: np.ndarray | None = None) -> Tensor:
         """N×K logits of squares of the network's own size, unchecked."""
-        return self.network(squares)
+        return self._asked(squares, windows)
+
+    def _asked(self, squares: Tensor, windows: np.ndarray | None) -> Tensor:
+        """What the network itself says."""
+        in_windows = windows is not None and isinstance(self.network, InBatches)
+        return self.network(squares, windows) if in_windows else self.network(squares)
 
 
 def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:

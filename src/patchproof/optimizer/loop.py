@@ -26,7 +26,7 @@ from torch import Tensor
 
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import expose, windows_of
 from patchproof.render.views import Views, apart, seen_again
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
@@ -241,7 +241,7 @@ def part_of(problem: Problem, printed: Tensor, views: Views, pictures: bool = Fa
     """Photograph what is printed in these views and ask which way it goes down."""
     printed = printed.detach().requires_grad_()
     photos = expose(views, problem.subject.showing(printed))
-    loss, confidence, rate = score(problem, photos, views.conditions)
+    loss, confidence, rate = score(problem, photos, views.conditions, windows_of(views))
     (gradient,) = torch.autograd.grad(loss, printed)
     kept = photos.detach().cpu().numpy() if pictures else None
     return _Part(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), kept)
@@ -303,11 +303,15 @@ def _descend(state: State, gradient: Tensor, problem: Problem) -> State:
     return replace(state, number=number, design=design, mean=mean, square=square)
 
 
-def score(problem: Problem, pictures: Tensor, conditions: Conditions) -> tuple[Tensor, float, float]:
-    """Mean loss over classifiers and pictures of these conditions; mean confidence and rate of the same."""
+def score(
+    problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
+) -> tuple[Tensor, float, float]:
+    """Mean loss over classifiers and pictures of these conditions; mean confidence and rate of the same. Outside of
+    `windows` N×4 the pictures' gradient is not asked for.
+    """
     losses, confidence, rate, boxes = [], 0.0, 0.0, problem.boxes(conditions)
     for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
-        logits = classifier.logits(pictures, boxes)
+        logits = classifier.logits(pictures, boxes, windows)
         losses.append(problem.losses(classifier, logits, indices).mean())
         confidence += float(classifier.confidence(logits.detach(), indices).mean())
         rate += float(classifier.recognized(logits.detach(), indices).double().mean())

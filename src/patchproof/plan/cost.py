@@ -17,7 +17,7 @@ from torch import Tensor
 
 from patchproof.optimizer.loop import new_share
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import expose
+from patchproof.render.photograph import expose, windows_of
 from patchproof.render.pixels import Shown
 from patchproof.render.raster import rasterize
 from patchproof.render.views import Views, cameras, near_mm
@@ -85,9 +85,9 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     parts[problem.subject.LOOK] = clock.lap()
     pictures = expose(views, shown)
     parts["light, piece and camera"] = clock.lap()
-    leaf, boxes = pictures.detach().requires_grad_(), problem.boxes(conditions)
+    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), windows_of(views)
     losses = [
-        problem.losses(classifier, classifier.logits(leaf, boxes), indices).mean()
+        problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
     ]
     loss = torch.stack(losses).mean()

@@ -20,6 +20,7 @@ from patchproof.channel.camera import (
     encoded,
     is_pointwise,
     noisy,
+    reach_px,
 )
 from patchproof.channel.lens import distorted
 from patchproof.channel.light import PAPER_REFLECTANCE
@@ -91,6 +92,22 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
         light = _piece_light(views, shown) * views.exposure(piece.pixel, piece.view)
         image = _blend(image, piece.pixel, piece.share, encoded(light, camera), False)
     return _smooth(views, image, by_code=False)
+
+
+def windows_of(views: Views) -> np.ndarray | None:
+    """N×4 pixels (left, top, right, bottom) outside of which `expose` makes the same of any design in these views; None
+    where that is not known: of textures, through a lens that bends, and where photographs have blur of their own.
+    """
+    camera, scale = views.stage.camera, _scale(views)
+    reach = reach_px(views.conditions.sensor, scale)
+    bends = views.frame_px != views.size_px or (camera is not None and camera.bends)
+    if views.piece is None or bends or reach is None or _own_blur_and_noise(views) is not None:
+        return None
+    width, height = views.size_px
+    return (views.piece.box_px + (reach + _SMOOTHED_PX) * np.array([-1, -1, 1, 1])).clip(0, [width, height] * 2)
+
+
+_SMOOTHED_PX = 1  # outlines mix neighbors
 
 
 def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: bool) -> Tensor:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,7 +104,7 @@ class ObjectPixels:
 @dataclass(frozen=True)
 class PiecePixels:
     """Pixels that the piece covers, each its `share`; `white` is the light P×3 of the base picture's paper where a
-    scene is made of pictures, else None.
+    scene is made of pictures, else None. `box_px` N×4 (left, top, right, bottom) holds each view's.
     """
 
     pixel: Tensor
@@ -115,6 +116,7 @@ class PiecePixels:
     white: Tensor | None
     back_pixel: Tensor  # where its back is seen
     back_share: Tensor
+    box_px: np.ndarray
 
     def part(self, views: range, pixels: int) -> PiecePixels:
         """Those of some views, of so many pixels each, as if no others had been seen."""
@@ -129,6 +131,7 @@ class PiecePixels:
             None if self.white is None else self.white[rows],
             self.back_pixel[back] - views.start * pixels,
             self.back_share[back],
+            self.box_px[views.start : views.stop],
         )
 
 
@@ -170,7 +173,17 @@ def piece_pixels(
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
         fragments.pixel.index_select(0, back),
         share.index_select(0, back)[:, None],
+        _boxes(kept),
     )
+
+
+def _boxes(fragments: Fragments) -> np.ndarray:
+    """N×4 pixels (left, top, right, bottom) that hold each view's fragments; of a view without any, of no size."""
+    views, height, width = fragments.shape
+    place = torch.stack([fragments.pixel % width, fragments.pixel // width % height], 1)
+    row, whole = fragments.view[:, None].expand(-1, 2), place.new_tensor([width, height]).repeat(views, 1)
+    low, high = whole.scatter_reduce(0, row, place, "amin"), (whole * 0).scatter_reduce(0, row, place + 1, "amax")
+    return torch.cat([torch.minimum(low, high), high], 1).cpu().numpy()
 
 
 def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor) -> Footprint:

@@ -1,0 +1,269 @@
+"""Gradients in windows: the whole program's, for any place of the windows; and programs that cannot be cut."""
+
+import numpy as np
+import pytest
+import torch
+
+from patchproof.classifier import batches, windows
+from patchproof.classifier.batches import fastest
+from patchproof.classifier.graph import Program
+from patchproof.classifier.network import Classifier
+from patchproof.classifier.steps import Step, Value, mark_spent
+
+ATEN = torch.ops.aten
+SIZE = 128
+
+
+def program(*lines, sizes=(None, 3, None, None)) -> Program:
+    """Lines (operator, arguments) as steps; in arguments, "x" is the pictures, an int in a tuple a line's result, from
+    0, and a tensor a weight.
+    """
+    weights = [argument for _, arguments in lines for argument in arguments if isinstance(argument, torch.Tensor)]
+
+    def value(argument):
+        if isinstance(argument, torch.Tensor):
+            return Value(next(number for number, weight in enumerate(weights) if weight is argument))
+        if isinstance(argument, tuple):
+            return Value(len(weights) + 1 + argument[0])
+        if isinstance(argument, list):
+            return [value(item) for item in argument]
+        return Value(len(weights)) if argument == "x" else argument
+
+    steps = [
+        Step(compute, [value(argument) for argument in arguments], {}, [len(weights) + 1 + number], False, [])
+        for number, (compute, arguments) in enumerate(lines)
+    ]
+    output = len(weights) + len(steps)
+    mark_spent(steps, {*range(len(weights) + 1), output})
+    return Program(weights, steps, output, list(sizes))
+
+
+def kernel(before: int, after: int, side: int = 3) -> torch.Tensor:
+    return torch.randn(after, before, side, side) / (before * side**2) ** 0.5
+
+
+def convolution(of, before: int, after: int, stride: int = 1, side: int = 3, padding: int | None = None):
+    padding = side // 2 if padding is None else padding
+    return ATEN.conv2d.default, [of, kernel(before, after, side), torch.randn(after), [stride] * 2, [padding] * 2]
+
+
+def head(of, features: int):
+    """The lines that end a program of as many features; `of` is the number of the line before."""
+    return (
+        (ATEN.mean.dim, [(of,), [2, 3]]),
+        (ATEN.linear.default, [(of + 1,), torch.randn(5, features), torch.randn(5)]),
+    )
+
+
+def plain() -> Program:
+    return program(
+        convolution("x", 3, 16, 2),
+        (ATEN.relu.default, [(0,)]),
+        convolution((1,), 16, 16),
+        (ATEN.relu6.default, [(2,)]),
+        convolution((3,), 16, 24, 2),
+        (ATEN.hardswish.default, [(4,)]),
+        *head(5, 24),
+    )
+
+
+def residual() -> Program:
+    return program(
+        (ATEN.sub.Tensor, ["x", torch.full((3, 1, 1), 0.5)]),
+        (ATEN.pad.default, [(0,), [0, 1, 0, 1]]),
+        convolution((1,), 3, 12, 2, padding=0),
+        (ATEN.relu.default, [(2,)]),
+        convolution((3,), 12, 12),
+        (ATEN.relu.default, [(4,)]),
+        (ATEN.add.Tensor, [(5,), (3,)]),
+        (ATEN.max_pool2d.default, [(6,), [3, 3], [2, 2], [1, 1]]),
+        convolution((7,), 12, 12),
+        *head(8, 12),
+    )
+
+
+def joined() -> Program:
+    """As in SqueezeNet: no zeros at the rim of its first layers, so that their sides are odd, and two paths."""
+    return program(
+        convolution("x", 3, 12, 2, padding=0),
+        (ATEN.relu.default, [(0,)]),
+        (ATEN.max_pool2d.default, [(1,), [3, 3], [2, 2], [0, 0], [1, 1], True]),
+        convolution((2,), 12, 6, side=1),
+        (ATEN.relu.default, [(3,)]),
+        convolution((4,), 6, 8, side=1),
+        convolution((4,), 6, 8),
+        (ATEN.cat.default, [[(5,), (6,)], 1]),
+        (ATEN.relu.default, [(7,)]),
+        *head(8, 16),
+    )
+
+
+def gradient(answers, photos: torch.Tensor) -> torch.Tensor:
+    photos = photos.clone(memory_format=torch.preserve_format).requires_grad_()
+    found = answers(photos)
+    return torch.autograd.grad((found * torch.linspace(-1, 2, found.numel()).view(found.shape)).sum(), photos)[0]
+
+
+def pictures(count: int = 3) -> torch.Tensor:
+    return torch.rand(count, 3, SIZE, SIZE).contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize("made", [plain, residual, joined])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_gradient_in_windows_is_the_whole_programs(made, seed):
+    torch.manual_seed(seed)
+    network, photos, rng = made(), pictures(2), np.random.default_rng(seed)
+    starts, sides = rng.integers(0, SIZE - 40, (2, 2)), rng.integers(1, 40, (2, 2))
+    starts[0] = [(0, 0), (SIZE - 40, 0), (0, SIZE - 40), (SIZE - 40, SIZE - 40)][seed]
+    sides[0] = 40  # up to the rim
+    asked = np.hstack([starts, starts + sides])
+    cuts = windows._cuts(network, photos)
+    assert len(cuts) >= 2
+    whole = gradient(network, photos)
+    for cut in cuts:
+        parts = gradient(lambda x, cut=cut: windows.answers(network, cut, x, asked), photos)
+        for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
+            here = slice(None), slice(top, bottom), slice(left, right)
+            torch.testing.assert_close(one[here], same[here], rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
+    outside = parts.clone()
+    for one, (left, top, right, bottom) in zip(outside, cut.rectangles(asked, SIZE).tolist(), strict=True):
+        one[:, top:bottom, left:right] = 0
+    assert not outside.any(), "what was not computed is 0, not what lay in memory"
+
+
+def test_how_far_a_pixel_reaches_is_what_kernels_and_strides_say():
+    cuts = {cut.steps: cut for cut in windows._cuts(plain(), pictures())}
+    # by hand: 3 at stride 2; 2 more steps of 2 px; 2 more of 2 px at stride 4
+    assert [(c.steps, c.stride, c.low, c.high) for c in cuts.values()] == [
+        (2, 2, -1, 1),
+        (4, 2, -3, 3),
+        (5, 4, -5, 5),
+        (6, 4, -5, 5),
+    ]
+    assert cuts[4].made == 4 * 16 * (SIZE // 2) ** 2
+
+
+def test_cuts_lie_where_one_value_is_left():
+    assert [cut.steps for cut in windows._cuts(residual(), pictures())] == [4, 7, 8, 9]
+    assert [cut.steps for cut in windows._cuts(joined(), pictures())] == [2, 3, 5, 8, 9]
+
+
+@pytest.mark.parametrize("less", [1, 2])
+def test_a_cut_that_reaches_less_far_than_it_should_is_not_taken(monkeypatch, less):
+    network, photos = plain(), pictures()
+    cut = windows.cut_of(network, photos)
+    assert cut is not None and windows._holds(network, cut, photos)
+    narrow = windows.Cut(cut.steps, cut.value, cut.stride, cut.low + 2 * less, cut.high - 2 * less, cut.made)
+    monkeypatch.setattr(windows, "STEP_PX", 4)  # rounding up hides a pixel or two
+    assert windows._holds(network, cut, photos) and not windows._holds(network, narrow, photos)
+    monkeypatch.setattr(windows, "_cuts", lambda *_: [narrow])
+    assert windows.cut_of(network, photos) is None
+
+
+def squeezes() -> Program:
+    """Each picture's mean scales what follows, as in a squeeze-and-excitation block: every pixel reaches everything."""
+    return program(
+        (ATEN.mean.dim, ["x", [2, 3], True]),
+        (ATEN.mul.Tensor, ["x", (0,)]),
+        convolution((1,), 3, 8, 2),
+        convolution((2,), 8, 8, 2),
+        *head(3, 8),
+    )
+
+
+def of_one_size() -> Program:
+    side = SIZE // 2
+    return program(
+        convolution("x", 3, 8, 2),
+        (ATEN.view.default, [(0,), [-1, 4, 2, side, side]]),
+        (ATEN.permute.default, [(1,), [0, 2, 1, 3, 4]]),
+        (ATEN.reshape.default, [(2,), [-1, 8, side, side]]),
+        convolution((3,), 8, 8, 2),
+        *head(4, 8),
+    )
+
+
+def with_places() -> Program:
+    return program(
+        convolution("x", 3, 8, 2),
+        (ATEN.add.Tensor, [(0,), torch.randn(1, 8, SIZE // 2, SIZE // 2)]),
+        convolution((1,), 8, 8, 2),
+        *head(2, 8),
+    )
+
+
+def pictures_again() -> Program:
+    return program(
+        convolution("x", 3, 3, 2),
+        (ATEN.relu.default, [(0,)]),
+        (ATEN.upsample_nearest2d.default, [(1,), [SIZE, SIZE]]),
+        (ATEN.add.Tensor, [(2,), "x"]),
+        *head(3, 3),
+    )
+
+
+def swallows_nan() -> Program:
+    """A network whose own cleaning of numbers hides how far a pixel reaches."""
+    return program(
+        convolution("x", 3, 8, 2), (ATEN.nan_to_num.default, [(0,)]), convolution((1,), 8, 8, 2), *head(2, 8)
+    )
+
+
+@pytest.mark.parametrize("made", [squeezes, of_one_size, with_places, pictures_again, swallows_nan])
+def test_programs_that_cannot_be_cut_give_their_whole_gradient(made):
+    torch.manual_seed(0)
+    network, photos, asked = made(), pictures(), np.array([[60, 50, 70, 60]] * 3)
+    laid, plainly = fastest(network, photos), gradient(network, photos)
+    assert torch.equal(gradient(lambda x: laid(x, asked), photos), gradient(laid, photos))
+    torch.testing.assert_close(gradient(laid, photos), plainly)
+
+
+@pytest.mark.parametrize(("side", "cuts"), [(96, True), (120, False), (100, False)])
+def test_sides_that_strides_do_not_divide_are_left_whole(side, cuts):
+    photos = torch.rand(3, 3, side, side)
+    assert (windows.cut_of(plain(), photos) is not None) == cuts
+
+
+@pytest.mark.parametrize(("side", "used"), [(20, True), (72, True), (73, False), (SIZE, False)])
+def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side, used):
+    laid, photos, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
+    found, calls = batches.answers, []
+    monkeypatch.setattr(batches, "answers", lambda *given: calls.append(1) or found(*given))
+    torch.testing.assert_close(
+        gradient(lambda x: laid(x, asked), photos)[..., :side, :side], gradient(laid, photos)[..., :side, :side]
+    )
+    assert bool(calls) == used
+
+
+def test_batches_take_their_own_windows(monkeypatch):
+    laid, photos = fastest(plain(), pictures()), pictures(7)
+    monkeypatch.setattr(laid, "high", 3)
+    asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
+    torch.manual_seed(0)
+    whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, asked), photos)
+    for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
+        torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
+    assert not torch.equal(parts, whole)
+    monkeypatch.setattr(laid, "low", 2)  # the seventh picture goes twice, as ever
+    filled = gradient(lambda x: laid(x, asked), photos)
+    torch.testing.assert_close(filled[6], whole[6])
+
+
+def test_only_pictures_of_the_networks_own_size_have_windows():
+    laid = fastest(plain(), pictures())
+    classifier, asked = Classifier("plain", None, SIZE, tuple("abcde"), laid), np.array([[40, 40, 60, 60]] * 2)
+
+    for side in (SIZE, SIZE + 32):
+        corner = gradient(lambda x: classifier.logits(x, None, asked), torch.rand(2, 3, side, side))[..., 0, 0]
+        assert bool((corner == 0).all()) == (side == SIZE)
+
+
+def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
+    asked = []
+    monkeypatch.setattr(batches, "cut_of", lambda *_: asked.append(1))
+    laid = fastest(plain(), pictures())
+    laid(pictures())
+    assert not asked
+    for _ in range(2):
+        laid(pictures(), np.array([[0, 0, 9, 9]] * 3))
+    assert asked == [1]
