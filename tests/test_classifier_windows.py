@@ -1,14 +1,21 @@
 """Gradients in windows: the whole program's, for any place of the windows; and programs that cannot be cut."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from patchproof.classifier import batches, windows
 from patchproof.classifier.batches import fastest
+from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.graph import Program
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.steps import Step, Value, mark_spent
+from patchproof.optimizer import loop
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.problem import set_problem
+from test_optimize import scene_with
 
 ATEN = torch.ops.aten
 SIZE = 128
@@ -267,3 +274,19 @@ def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
     for _ in range(2):
         laid(pictures(), np.array([[0, 0, 9, 9]] * 3))
     assert asked == [1]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatch, jobs):
+    torch.manual_seed(0)
+    network = classifier_of(plain(), 192, ["red", *"bcde"])
+    camera = {"camera__noise": [0.0, 0.0], "camera__blur_px": [0.0, 2.0], "view__distance_mm": [700, 900]}
+    scene = scene_with(tmp_path, optimize__steps=3, target__models=["python:network"], **camera)
+    problem = replace(set_problem(scene, models=[network]), jobs=jobs)
+    asked, found = [], batches.answers
+    monkeypatch.setattr(batches, "answers", lambda *given: asked.append(1) or found(*given))
+    designs = [best_design(problem)]
+    assert asked or jobs > 1  # other processes count for themselves
+    monkeypatch.setattr(loop, "windows_of", lambda views: None)
+    designs.append(best_design(problem))
+    assert len(np.unique(designs[0])) > 10 and np.abs(designs[0].astype(int) - designs[1]).max() <= 1
