@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+import archives
 from patchproof.classifier import batches, windows
 from patchproof.classifier.batches import fastest
+from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.graph import Program
 from patchproof.classifier.network import Classifier
@@ -128,7 +130,7 @@ def test_the_gradient_in_windows_is_the_whole_programs(made, seed):
     assert len(cuts) >= 2
     whole = gradient(network, photos)
     for cut in cuts:
-        parts = gradient(lambda x, cut=cut: windows.answers(network, cut, x, asked), photos)
+        parts = gradient(lambda x, cut=cut: windows.answers(cut, x, asked), photos)
         for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
             here = slice(None), slice(top, bottom), slice(left, right)
             torch.testing.assert_close(one[here], same[here], rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
@@ -142,7 +144,9 @@ def test_how_far_a_pixel_reaches_is_what_kernels_and_strides_say():
     cuts = {cut.steps: cut for cut in windows._cuts(plain(), pictures())}
     # by hand: 3 at stride 2; 2 more steps of 2 px; 2 more of 2 px at stride 4
     assert [(c.steps, c.stride, c.low, c.high) for c in cuts.values()] == [
+        (1, 2, -1, 1),
         (2, 2, -1, 1),
+        (3, 2, -3, 3),
         (4, 2, -3, 3),
         (5, 4, -5, 5),
         (6, 4, -5, 5),
@@ -151,8 +155,8 @@ def test_how_far_a_pixel_reaches_is_what_kernels_and_strides_say():
 
 
 def test_cuts_lie_where_one_value_is_left():
-    assert [cut.steps for cut in windows._cuts(residual(), pictures())] == [4, 7, 8, 9]
-    assert [cut.steps for cut in windows._cuts(joined(), pictures())] == [2, 3, 5, 8, 9]
+    assert [cut.steps for cut in windows._cuts(residual(), pictures())] == [3, 4, 7, 8, 9]
+    assert [cut.steps for cut in windows._cuts(joined(), pictures())] == [1, 2, 3, 4, 5, 8, 9]
 
 
 @pytest.mark.parametrize("less", [1, 2])
@@ -160,7 +164,7 @@ def test_a_cut_that_reaches_less_far_than_it_should_is_not_taken(monkeypatch, le
     network, photos = plain(), pictures()
     cut = windows.cut_of(network, photos)
     assert cut is not None and windows._holds(network, cut, photos)
-    narrow = windows.Cut(cut.steps, cut.value, cut.stride, cut.low + 2 * less, cut.high - 2 * less, cut.made)
+    narrow = replace(cut, low=cut.low + 2 * less, high=cut.high - 2 * less)
     monkeypatch.setattr(windows, "STEP_PX", 4)  # rounding up hides a pixel or two
     assert windows._holds(network, cut, photos) and not windows._holds(network, narrow, photos)
     monkeypatch.setattr(windows, "_cuts", lambda *_: [narrow])
@@ -223,6 +227,48 @@ def test_programs_that_cannot_be_cut_give_their_whole_gradient(made):
     laid, plainly = fastest(network, photos), gradient(network, photos)
     assert torch.equal(gradient(lambda x: laid(x, asked), photos), gradient(laid, photos))
     torch.testing.assert_close(gradient(laid, photos), plainly)
+
+
+class Written(torch.nn.Module):
+    """Functions, methods, places and a weight of its own in place of modules; activations in place."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.second = torch.nn.Conv2d(3, 8, 3, 2, 1), torch.nn.Conv2d(8, 8, 3, 2, 1)
+        self.scale = torch.nn.Parameter(torch.rand(8, 1, 1))
+
+    def forward(self, photos):
+        halves = self.first(photos).relu_().chunk(2, 1)
+        features = torch.cat((halves[1], halves[0]), 1) * self.scale
+        features = torch.nn.functional.silu(self.second(features), inplace=True)
+        return features[:, :, 1:, 1:].reshape(features.shape[0], 8, -1).mean(-1)
+
+
+class Turns(Written):
+    def forward(self, photos):
+        return super().forward(photos if photos.mean() > 0 else -photos)
+
+
+class Counts(Written):
+    """What it does depends on how often it was called."""
+
+    calls = 0
+
+    def forward(self, photos):
+        self.calls += 1
+        return super().forward(photos * self.calls)
+
+
+class Masked(Written):
+    def forward(self, photos, mask=None):
+        return super().forward(photos)
+
+
+class Slices(Written):
+    """Steps hold no places that depend on the pictures' size."""
+
+    def forward(self, photos):
+        return super().forward(photos[:, :, : photos.shape[2] // 2])
 
 
 @pytest.mark.parametrize(("side", "cuts"), [(96, True), (120, False), (100, False)])
@@ -290,3 +336,25 @@ def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatc
     monkeypatch.setattr(loop, "windows_of", lambda views: None)
     designs.append(best_design(problem))
     assert len(np.unique(designs[0])) > 10 and np.abs(designs[0].astype(int) - designs[1]).max() <= 1
+
+
+@pytest.mark.parametrize("made", [archives.ResNet, archives.ConvNeXt, lambda: load_builtin().network, Written])
+def test_modules_in_memory_are_cut_where_torch_can_follow_them(made):
+    network = archives.seeded(made()).eval().requires_grad_(False)
+    side = 96
+    photos, asked = torch.rand(3, 3, side, side), np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
+    laid = fastest(network, photos)
+    assert laid._cut is not None
+    whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, asked), photos)
+    for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
+        torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
+    assert not torch.equal(parts, whole)
+
+
+@pytest.mark.parametrize("made", [archives.ViT, Turns, Counts, Masked, Slices])
+def test_modules_that_torch_cannot_follow_are_computed_whole(made):
+    network = made().eval().requires_grad_(False)
+    photos, asked = torch.rand(3, 3, 16, 16), np.array([[4, 4, 6, 6]] * 3)
+    laid = fastest(network, photos)
+    assert laid._cut is None
+    assert torch.isfinite(gradient(lambda x: laid(x, asked), photos)).all()

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.graph import Program
 from patchproof.classifier.windows import Cut, answers, cut_of
 
 MAX_BATCH = 4096  # where a program sets no limit of its own
@@ -50,15 +49,14 @@ class InBatches(torch.nn.Module):
         return torch.cat(logits)
 
     def _answers(self, photos: Tensor, windows: np.ndarray | None) -> Tensor:
-        network, cut = self.network, None if windows is None else self._cut
+        cut = None if windows is None else self._cut
         if windows is None or cut is None or cut.saves(windows, photos.shape[-1]) <= 0:
-            return network(photos)
-        return answers(network, cut, photos, windows)
+            return self.network(photos)
+        return answers(cut, photos, windows)
 
     @cached_property
     def _cut(self) -> Cut | None:
-        network, pictures = self.network, self.tried
-        return cut_of(network, pictures) if isinstance(network, Program) and pictures is not None else None
+        return None if self.tried is None else cut_of(self.network, self.tried)
 
 
 def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:

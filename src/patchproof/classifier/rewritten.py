@@ -31,8 +31,8 @@ def _written_over(steps: list[Step]) -> list[Step]:
     used = Counter(number for step in steps for number in numbers_in([*step.arguments, *step.keywords.values()]))
     made = {number for step in steps if step.compute in _MADE_ANEW for number in step.results if used[number] == 1}
     return [
-        replace(step, compute=_WRITING_OVER[step.compute])
-        if step.compute in _WRITING_OVER and made.issuperset(numbers_in(step.arguments[:1])) and made & set(step.spent)
+        replace(step, compute=_IN_PLACE[step.compute])
+        if step.compute in _IN_PLACE and made.issuperset(numbers_in(step.arguments[:1])) and made & set(step.spent)
         else step
         for step in steps
     ]
@@ -109,12 +109,11 @@ def _relu6_(values: Tensor) -> Tensor:
 
 
 # their gradients need what they made, not what they got; and those who make it do not need it
-_WRITING_OVER: dict[Callable[..., Any], Callable[..., Any]] = {
+_IN_PLACE: dict[Callable[..., Any], Callable[..., Any]] = {
     _ATEN.relu.default: _ATEN.relu_.default,
     _ATEN.relu6.default: _relu6_,
     _ATEN.hardtanh.default: _hardtanh_,
 }
-IN_PLACE = frozenset(_WRITING_OVER.values())
 _CONVOLUTIONS = (_ATEN.conv2d.default, _ATEN.convolution.default)
 _MADE_ANEW = {*_CONVOLUTIONS, _ATEN.conv2d.padding, _ATEN.batch_norm.default, _ATEN.add.Tensor}
 _PADS = (_ATEN.pad.default, _ATEN.constant_pad_nd.default)

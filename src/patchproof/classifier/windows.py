@@ -1,13 +1,13 @@
 """Gradients only where pictures may change: a piece covers a tenth of a picture, and the first, largest layers of a
 network see little more than what lies around it.
 
-In: a program, pictures, and the window of each outside of which its pixels' gradient is not asked for. Out: the same
-answers, and in the windows the same gradient. The program's first steps are computed without a graph and, on the way
-back, once more with one, on rectangles so large that nothing a window reaches sees their edges. Where steps can be cut
-is found by trying: NaN in a pixel shows how far it reaches, whatever the steps are, and a cut counts if it gives the
-gradient of the whole program.
+In: a network's steps, pictures, and the window of each outside of which its pixels' gradient is not asked for. Out: the
+same answers, and in the windows the same gradient. The first steps are computed without a graph and, on the way back,
+once more with one, on rectangles so large that nothing a window reaches sees their edges. Where steps can be cut is
+found by trying: NaN in a pixel shows how far it reaches, whatever the steps are, and a cut counts if it gives the
+gradient of the whole network.
 Left out on purpose: further cuts, each computed again by itself, which won nothing more; GPUs, where small pictures
-take as long as large ones; networks that are not read as programs.
+take as long as large ones; networks that torch.fx cannot follow.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.graph import Program, compute
-from patchproof.classifier.rewritten import IN_PLACE
+from patchproof.classifier.traced import traced
 
 STRIDES = (2, 4, 8)  # of deeper values a pixel reaches most
 STEP_PX = 16  # rectangles' sides are multiples of it: a new size costs 3 ms once
@@ -38,6 +38,7 @@ class Cut:
     from j·`stride` + `low` to j·`stride` + `high`. Until there, `made` numbers are made for each picture.
     """
 
+    program: Program
     steps: int
     value: int
     stride: int
@@ -59,45 +60,45 @@ class Cut:
         return self.made * (LARGEST - (right - left) * (bottom - top) / size_px**2)
 
 
-def answers(program: Program, cut: Cut, photos: Tensor, windows: np.ndarray) -> Tensor:
-    """The program's answers to N×3×S×S, whose gradient at the pictures holds in `windows` only, N×4 pixels (left, top,
+def answers(cut: Cut, photos: Tensor, windows: np.ndarray) -> Tensor:
+    """The network's answers to N×3×S×S, whose gradient at the pictures holds in `windows` only, N×4 pixels (left, top,
     right, bottom).
     """
-    value = _InRectangles.apply(photos, program, cut, cut.rectangles(windows, photos.shape[-1]))
-    values = program.values(cut.value, value)
-    compute(program.steps[cut.steps :], values, photos)
-    return values[program.output]
+    value = _InRectangles.apply(photos, cut, cut.rectangles(windows, photos.shape[-1]))
+    values = cut.program.values(cut.value, value)
+    compute(cut.program.steps[cut.steps :], values, photos)
+    return values[cut.program.output]
 
 
 class _InRectangles(torch.autograd.Function):
     """The steps up to a cut, whose gradient is computed in rectangles only."""
 
     @staticmethod
-    def forward(ctx: Any, photos: Tensor, program: Program, cut: Cut, rectangles: np.ndarray) -> Tensor:
+    def forward(ctx: Any, photos: Tensor, cut: Cut, rectangles: np.ndarray) -> Tensor:
         """The cut's value."""
         ctx.save_for_backward(photos)
-        ctx.given = program, cut, rectangles
-        return _until(program, cut, photos)
+        ctx.given = cut, rectangles
+        return _until(cut, photos)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         """The gradient there, elsewhere 0."""
-        (photos,), (program, cut, rectangles) = ctx.saved_tensors, ctx.given
+        (photos,), (cut, rectangles) = ctx.saved_tensors, ctx.given
         cropped = _joined(_parts(photos, rectangles)).requires_grad_()
         with torch.enable_grad():
-            again = _until(program, cut, cropped)
+            again = _until(cut, cropped)
         height, width = again.shape[2:]
         wanted = [part[:, :height, :width] for part in _parts(gradient, rectangles // cut.stride)]
         (found,) = torch.autograd.grad(again, cropped, _joined(wanted))
         whole = torch.zeros_like(photos)
         for part, values in zip(_parts(whole, rectangles), found, strict=True):
             part.copy_(values)
-        return whole, None, None, None
+        return whole, None, None
 
 
-def _until(program: Program, cut: Cut, photos: Tensor) -> Tensor:
-    values = program.values(program.photos, photos)
-    compute(program.steps[: cut.steps], values, photos)
+def _until(cut: Cut, photos: Tensor) -> Tensor:
+    values = cut.program.values(cut.program.photos, photos)
+    compute(cut.program.steps[: cut.steps], values, photos)
     return values[cut.value]
 
 
@@ -112,15 +113,18 @@ def _joined(parts: list[Tensor]) -> Tensor:
     return torch.stack(parts).contiguous(memory_format=torch.channels_last)
 
 
-def cut_of(program: Program, pictures: Tensor) -> Cut | None:
-    """Where cutting a program saves most with typical windows, proved with three pictures 3×3×S×S; None where that
+def cut_of(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
+    """Where cutting a network saves most with typical windows, proved with three pictures 3×3×S×S; None where that
     fails, or saves nothing.
     """
+    program = traced(network) if isinstance(network, torch.nn.Module) and type(network) is not Program else network
+    if not isinstance(program, Program):
+        return None
     size_px = pictures.shape[-1]
     window = np.array([[0, 0, *2 * [round(TYPICAL * size_px)]]])
     try:
         best = max(_cuts(program, pictures), key=lambda cut: cut.saves(window, size_px), default=None)
-        return best if best and best.saves(window, size_px) > 0 and _holds(program, best, pictures) else None
+        return best if best and best.saves(window, size_px) > 0 and _holds(network, best, pictures) else None
     except (RuntimeError, ValueError, LookupError):  # steps that take one size only, or the pictures once more
         return None
 
@@ -136,25 +140,27 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
     for picture, (y, x) in zip(marked, pixels, strict=True):
         picture[:, y, x] = torch.nan
     values = program.values(program.photos, marked)
-    for count, (step, following) in enumerate(zip(program.steps, program.steps[1:], strict=False), 1):
+    for count, step in enumerate(program.steps, 1):
         compute([step], values, marked)
-        made += sum(values[number].numel() for number in step.results if number in values) // len(marked)
-        (number, *others) = [number for number in values if number > program.photos]
-        value = values[number]
-        if others or number not in step.results or value.dim() != 4:
+        left = {number: value for number, value in values.items() if number > program.photos}
+        value = left.get(step.results[0])
+        if not isinstance(value, Tensor):
+            continue
+        made += value.numel() // len(marked)
+        if len(left) > 1 or value.dim() != 4:
             continue
         stride = size_px // value.shape[-1]
         if stride > most:
             break
-        if stride in STRIDES and following.compute not in IN_PLACE:  # which would change what is computed again
+        if stride in STRIDES:
             marks = zip(pixels, value.isnan().any(1), strict=True)
             away = torch.cat([pixel - stride * picture.nonzero() for pixel, picture in marks])
-            cuts.append(Cut(count, number, stride, int(away.min()), int(away.max()), made))
+            cuts.append(Cut(program, count, step.results[0], stride, int(away.min()), int(away.max()), made))
     return cuts
 
 
-def _holds(program: Program, cut: Cut, pictures: Tensor) -> bool:
-    """Whether the gradient is that of the whole program, in windows in the middle and at the rim."""
+def _holds(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> bool:
+    """Whether the gradient is that of the whole network, in windows in the middle and at the rim."""
     size_px, side = pictures.shape[-1], pictures.shape[-1] // 8
     middle, end = (size_px - side) // 2, size_px - side
     starts = np.array([[middle, middle + 1], [0, end], [end - 1, 1]])
@@ -166,5 +172,5 @@ def _holds(program: Program, cut: Cut, pictures: Tensor) -> bool:
         weights = torch.linspace(-1, 1, found.numel()).view(found.shape)
         return _joined(_parts(torch.autograd.grad((found * weights).sum(), photos)[0], windows))
 
-    whole, cut_off = gradients(program), gradients(lambda photos: answers(program, cut, photos, windows))
+    whole, cut_off = gradients(network), gradients(lambda photos: answers(cut, photos, windows))
     return float((whole - cut_off).abs().max()) <= SAME * float(whole.abs().max())
