@@ -358,3 +358,23 @@ def test_modules_that_torch_cannot_follow_are_computed_whole(made):
     laid = fastest(network, photos)
     assert laid._cut is None
     assert torch.isfinite(gradient(lambda x: laid(x, asked), photos)).all()
+
+
+def test_a_file_s_steps_are_weighed_on_rectangles_too():
+    """A program whose values are small for whole pictures, and absurd for those of other sizes."""
+    places = program(
+        (ATEN.sym_size.int, ["x", 3]),
+        (lambda size: (SIZE - size) * 10**9 + 1, [(0,)]),
+        (ATEN.new_zeros.default, ["x", [(1,)]]),
+        (ATEN.sum.default, [(2,)]),
+        convolution("x", 3, 8, 2),
+        (ATEN.add.Tensor, [(4,), (3,)]),
+        convolution((5,), 8, 8, 2),
+        *head(6, 8),
+    )
+    photos = pictures()
+    assert places(photos).shape == (3, 5)
+    with pytest.raises(ValueError, match="absurd size"):
+        places.first(6, photos[..., :64, :64])
+    laid, asked = fastest(places, photos), np.array([[50, 50, 60, 60]] * 3)
+    torch.testing.assert_close(gradient(lambda x: laid(x, asked), photos), gradient(places, photos))

@@ -2,8 +2,8 @@
 
 In: weights, steps and the sizes of the input, as description.py or onnx_file.py read them. Out: a Program, N×3×S×S →
 N×K. Values have numbers and no names; the only functions called are the operators of the steps. Before pictures of a
-new shape are computed, the steps are tried on tensors without memory: there a value of absurd size, a wrong input and a
-change of the weights or of the input are refused.
+new shape are computed, the steps of a file are tried on tensors without memory: there a value of absurd size, a wrong
+input and a change of the weights or of the input are refused.
 """
 
 from __future__ import annotations
@@ -25,43 +25,48 @@ MAX_SPLIT = 1 << 16  # along a dimension of what is split into several tensors
 
 
 class Program(torch.nn.Module):
-    """The graph as a function of pictures; weights are buffers, so that they move with the module."""
+    """The graph as a function of pictures; weights are buffers, so that they move with the module. One without `sizes`
+    is of the user's own code, of which nothing is tried.
+    """
 
-    def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None]):
+    def __init__(self, weights: list[Tensor], steps: list[Step], output: int, sizes: list[int | None] | None):
         super().__init__()
         for number, weight in enumerate(weights):
             self.register_buffer(f"w{number}", weight)
         self.steps, self.output, self.sizes = rewritten(steps, weights), output, sizes
         self.photos = len(weights)  # the number of the pictures, after those of the weights
-        self.weighed: set[torch.Size] = set()
+        self.weighed: set[tuple[torch.Size, int]] = set()
 
     def forward(self, photos: Tensor) -> Tensor:
         """N×3×S×S → N×K."""
-        if photos.shape not in self.weighed:
-            self._weigh(photos.shape)
-        return self._computed(list(self.buffers()), photos)
+        return self.first(len(self.steps), photos)[self.output]
+
+    def first(self, count: int, photos: Tensor) -> dict[int, Any]:
+        """The values that so many steps leave of pictures; of a part of them, pictures may be of another size."""
+        self.weigh(count, photos.shape)
+        values = self.values(self.photos, photos)
+        compute(self.steps[:count], values, photos)
+        return values
 
     def values(self, number: int, value: Tensor) -> dict[int, Any]:
         """The weights, and what has been computed of pictures: the value with that number."""
         return dict(enumerate(self.buffers())) | {number: value}
 
-    def _computed(self, weights: list[Tensor], photos: Tensor) -> Tensor:
-        values: dict[int, Any] = dict(enumerate([*weights, photos]))
-        compute(self.steps, values, photos)
-        return values[self.output]
-
-    def _weigh(self, shape: torch.Size) -> None:
-        """Refuse, before memory is taken, pictures of other sizes and values of absurd ones."""
-        if any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True)):
+    def weigh(self, count: int, shape: torch.Size) -> None:
+        """Refuse, before memory is taken, pictures of other sizes and values of absurd ones in so many steps."""
+        if self.sizes is None or (shape, count) in self.weighed:
+            return
+        other = any(size not in (None, got) for size, got in zip(self.sizes, shape, strict=True))
+        if other and count == len(self.steps):
             raise ValueError(f"it takes {'×'.join(str(size or 'N') for size in self.sizes)}")
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
             photos = torch.empty(shape, device="meta")
             with _Watched(MAX_VALUE * len(photos)):
-                self._computed(weights, photos)
+                compute(self.steps[:count], dict(enumerate([*weights, photos])), photos)
         if any(tensor._version for tensor in [*weights, photos]):
             raise ValueError("it changes its weights or its input")
-        self.weighed.add(shape)
+        self.weighed.add((shape, count))
 
 
 def compute(steps: Sequence[Step], values: dict[int, Any], like: Tensor) -> None:

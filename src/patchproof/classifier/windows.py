@@ -64,10 +64,11 @@ def answers(cut: Cut, photos: Tensor, windows: np.ndarray) -> Tensor:
     """The network's answers to N×3×S×S, whose gradient at the pictures holds in `windows` only, N×4 pixels (left, top,
     right, bottom).
     """
-    value = _InRectangles.apply(photos, cut, cut.rectangles(windows, photos.shape[-1]))
-    values = cut.program.values(cut.value, value)
-    compute(cut.program.steps[cut.steps :], values, photos)
-    return values[cut.program.output]
+    program, rectangles = cut.program, cut.rectangles(windows, photos.shape[-1])
+    program.weigh(len(program.steps), photos.shape)
+    values = program.values(cut.value, _InRectangles.apply(photos, cut, rectangles))
+    compute(program.steps[cut.steps :], values, photos)
+    return values[program.output]
 
 
 class _InRectangles(torch.autograd.Function):
@@ -78,7 +79,7 @@ class _InRectangles(torch.autograd.Function):
         """The cut's value."""
         ctx.save_for_backward(photos)
         ctx.given = cut, rectangles
-        return _until(cut, photos)
+        return cut.program.first(cut.steps, photos)[cut.value]
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
@@ -86,7 +87,7 @@ class _InRectangles(torch.autograd.Function):
         (photos,), (cut, rectangles) = ctx.saved_tensors, ctx.given
         cropped = _joined(_parts(photos, rectangles)).requires_grad_()
         with torch.enable_grad():
-            again = _until(cut, cropped)
+            again = cut.program.first(cut.steps, cropped)[cut.value]
         height, width = again.shape[2:]
         wanted = [part[:, :height, :width] for part in _parts(gradient, rectangles // cut.stride)]
         (found,) = torch.autograd.grad(again, cropped, _joined(wanted))
@@ -94,12 +95,6 @@ class _InRectangles(torch.autograd.Function):
         for part, values in zip(_parts(whole, rectangles), found, strict=True):
             part.copy_(values)
         return whole, None, None
-
-
-def _until(cut: Cut, photos: Tensor) -> Tensor:
-    values = cut.program.values(cut.program.photos, photos)
-    compute(cut.program.steps[: cut.steps], values, photos)
-    return values[cut.value]
 
 
 def _parts(values: Tensor, rectangles: np.ndarray) -> list[Tensor]:
@@ -139,6 +134,7 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
     marked = pictures[:1].repeat(len(pixels), 1, 1, 1).contiguous(memory_format=torch.channels_last)
     for picture, (y, x) in zip(marked, pixels, strict=True):
         picture[:, y, x] = torch.nan
+    program.weigh(len(program.steps), marked.shape)
     values = program.values(program.photos, marked)
     for count, step in enumerate(program.steps, 1):
         compute([step], values, marked)
