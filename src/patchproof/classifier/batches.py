@@ -5,7 +5,7 @@ In: a network for N×3×S×S. Out: the same logits for any N, on a CPU in about 
 32 MiB is memory that the system hands out and clears anew each time, which MobileNetV2 paid with a third of its time;
 and convolutions want the colors of a pixel side by side ("channels last"), another third. Of the plain call's time
 remain 0.45 with MobileNetV2 at 224 px, 0.60 with SqueezeNet 1.1, 0.72 with MobileNetV1 0.75 at 192 px; small inputs
-are faster whole and stay so.
+are faster whole and stay so. A gradient that is asked for in windows only takes less (windows.py).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class InBatches(torch.nn.Module):
     def __init__(self, network: Callable[[Tensor], Tensor], low: int = 1, high: int = MAX_BATCH):
         super().__init__()
         self.network, self.low, self.high, self.order = network, low, high, torch.contiguous_format
-        self.tried: Tensor | None = None  # pictures that the order was tried with on a CPU
+        self.tried: Tensor | None = None  # on a CPU, two of the pictures that the order was tried with
 
     def train(self, mode: bool = True) -> InBatches:
         """Nothing to switch: networks come as they are to be used, and an exported program refuses `eval()`."""
@@ -49,7 +49,7 @@ class InBatches(torch.nn.Module):
         return torch.cat(logits)
 
     def _answers(self, photos: Tensor, windows: np.ndarray | None) -> Tensor:
-        cut = None if windows is None else self._cut
+        cut = None if windows is None or self.tried is None else self._cut
         if windows is None or cut is None or cut.saves(windows, photos.shape[-1]) <= 0:
             return self.network(photos)
         return answers(cut, photos, windows)
@@ -67,7 +67,7 @@ def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:
     batches = network if isinstance(network, InBatches) else InBatches(network)
     if pictures.device.type == "cpu":
         batches.high = max(batches.low, min(batches.high, few_on_cpu(pictures.shape[-1])))
-        batches.tried = pictures
+    batches.tried = pictures[:2] if pictures.device.type == "cpu" else None
     batches.order = torch.channels_last
     try:
         tried = pictures.clone().requires_grad_()

@@ -88,9 +88,10 @@ class _InRectangles(torch.autograd.Function):
         cropped = _joined(_parts(photos, rectangles)).requires_grad_()
         with torch.enable_grad():
             again = cut.program.first(cut.steps, cropped)[cut.value]
-        height, width = again.shape[2:]
-        wanted = [part[:, :height, :width] for part in _parts(gradient, rectangles // cut.stride)]
-        (found,) = torch.autograd.grad(again, cropped, _joined(wanted))
+            height, width = again.shape[2:]
+            wanted = [part[:, :height, :width] for part in _parts(gradient, rectangles // cut.stride)]
+            told = (again * _joined(wanted)).sum()  # given a gradient, torch would import SymPy, in half a second
+        (found,) = torch.autograd.grad(told, cropped)
         whole = torch.zeros_like(photos)
         for part, values in zip(_parts(whole, rectangles), found, strict=True):
             part.copy_(values)
@@ -109,8 +110,8 @@ def _joined(parts: list[Tensor]) -> Tensor:
 
 
 def cut_of(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
-    """Where cutting a network saves most with typical windows, proved with three pictures 3×3×S×S; None where that
-    fails, or saves nothing.
+    """Where cutting a network saves most with typical windows, proved with two pictures 2×3×S×S; None where that fails,
+    or saves nothing.
     """
     program = traced(network) if isinstance(network, torch.nn.Module) and type(network) is not Program else network
     if not isinstance(program, Program):
@@ -156,10 +157,11 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
 
 
 def _holds(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> bool:
-    """Whether the gradient is that of the whole network, in windows in the middle and at the rim."""
+    """Whether the gradient is that of the whole network in windows near two corners, so that rectangles have two edges
+    of the picture and two of their own, each on either side.
+    """
     size_px, side = pictures.shape[-1], pictures.shape[-1] // 8
-    middle, end = (size_px - side) // 2, size_px - side
-    starts = np.array([[middle, middle + 1], [0, end], [end - 1, 1]])
+    starts = np.array([[0, 1], [size_px - side - 1, size_px - side]])
     windows = np.hstack([starts, starts + side])
 
     def gradients(compute: Callable[[Tensor], Tensor]) -> Tensor:

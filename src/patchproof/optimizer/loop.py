@@ -256,7 +256,8 @@ def gradient_of(problem: Problem, design: Tensor, asked: Asked) -> tuple[Tensor,
     parts = asked(printed.detach())
     share = [part.views / sum(p.views for p in parts) for part in parts]
     gradient = sum(weight * part.gradient for weight, part in zip(share, parts, strict=True))
-    (gradient,) = torch.autograd.grad(printed, design, torch.as_tensor(gradient, device=problem.device))
+    told = (printed * torch.as_tensor(gradient, device=problem.device)).sum()  # see classifier/windows.py
+    (gradient,) = torch.autograd.grad(told, design)
     return gradient, parts, share
 
 
