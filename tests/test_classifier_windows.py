@@ -25,6 +25,11 @@ ATEN = torch.ops.aten
 SIZE = 128
 
 
+@pytest.fixture(autouse=True)
+def small_networks_save_too(monkeypatch):
+    monkeypatch.setattr(windows, "FIXED", 0)
+
+
 def program(*lines, sizes=(None, 3, None, None)) -> Program:
     """Lines (operator, arguments) as steps; in arguments, "x" is the pictures, an int in a tuple a line's result, from
     0, and a tensor a weight.
@@ -279,7 +284,7 @@ def test_sides_that_strides_do_not_divide_are_left_whole(side, cuts):
     assert (windows.cut_of(plain(), photos) is not None) == cuts
 
 
-@pytest.mark.parametrize(("side", "used"), [(20, True), (72, True), (73, False), (SIZE, False)])
+@pytest.mark.parametrize(("side", "used"), [(20, True), (56, True), (57, False), (SIZE, False)])
 def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side, used):
     laid, photos, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
     found, calls = batches.answers, []
@@ -288,6 +293,15 @@ def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side,
         gradient(lambda x: laid(x, asked), photos)[..., :side, :side], gradient(laid, photos)[..., :side, :side]
     )
     assert bool(calls) == used
+
+
+def test_a_network_too_small_to_save_anything_is_not_cut(monkeypatch):
+    photos = pictures(2)
+    assert windows.cut_of(plain(), photos)
+    monkeypatch.undo()
+    assert windows.cut_of(plain(), photos) is None
+    larger = torch.rand(2, 3, 4 * SIZE, 4 * SIZE)
+    assert windows.cut_of(plain(), larger)
 
 
 def test_batches_take_their_own_windows(monkeypatch):
@@ -389,9 +403,11 @@ def test_gradients_need_no_compiler_of_torch_s(tmp_path):
 import sys
 import numpy as np, torch
 import patchproof as pp
+from patchproof.classifier import windows
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 problem = set_problem(pp.load_scene({str(scene)!r}))
+windows.FIXED = 0  # the network is small
 network, photos = problem.classifiers[0].network, torch.rand(2, 3, 96, 96).requires_grad_()
 network(photos, np.array([[40, 40, 50, 50]] * 2)).sum().backward()
 assert network._cut and not photos.grad[..., 0].any()
