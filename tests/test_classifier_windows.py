@@ -295,6 +295,14 @@ def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side,
     assert bool(calls) == used
 
 
+def test_a_gradient_of_zero_proves_nothing():
+    mean, (linear, [of, weight, bias]) = head(1, 8)
+    layers = convolution("x", 3, 8, 2), convolution((0,), 8, 8, 2)
+    for scale in (1, 0):
+        network = program(*layers, mean, (linear, [of, scale * weight, bias]))
+        assert (windows.cut_of(network, pictures(2)) is not None) == bool(scale)
+
+
 def test_a_network_too_small_to_save_anything_is_not_cut(monkeypatch):
     photos = pictures(2)
     assert windows.cut_of(plain(), photos)
