@@ -78,8 +78,9 @@ class Classifier:
 
     def _asked(self, squares: Tensor, windows: np.ndarray | None) -> Tensor:
         """What the network itself says."""
-        in_windows = windows is not None and isinstance(self.network, InBatches)
-        return self.network(squares, windows) if in_windows else self.network(squares)
+        if windows is not None and isinstance(self.network, InBatches):
+            return self.network(squares, windows)
+        return self.network(squares)
 
 
 def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:

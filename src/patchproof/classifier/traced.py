@@ -43,7 +43,7 @@ def _program(network: torch.nn.Module, nodes: list[Node]) -> Program:
 
     steps, made = [step(node) for node in computed], _argument(output.args[0], numbers).number
     mark_spent(steps, {*range(len(weights) + 1), made})
-    tensors = [reduce(getattr, str(node.target).split("."), network) for node in weights]
+    tensors: list[Any] = [reduce(getattr, str(node.target).split("."), network) for node in weights]
     return Program([tensor.detach() for tensor in tensors], steps, made, None)
 
 
