@@ -114,8 +114,10 @@ def cut_of(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
     """Where cutting a network saves most with typical windows, proved with two pictures 2×3×S×S; None where that fails,
     or saves nothing.
     """
-    program = traced(network) if isinstance(network, torch.nn.Module) and type(network) is not Program else network
-    if not isinstance(program, Program):
+    if not isinstance(network, torch.nn.Module):
+        return None
+    program = network if isinstance(network, Program) else traced(network)
+    if program is None:
         return None
     size_px = pictures.shape[-1]
     window = np.array([[0, 0, *2 * [round(TYPICAL * size_px)]]])
