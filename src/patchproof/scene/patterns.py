@@ -9,19 +9,31 @@ Source of the spectrum: Field, JOSA A 4 (1987) 2379.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from patchproof.color import codes_of
 
+Picture = Callable[[], np.ndarray]  # drawn, but not made yet: of what nobody sees, nothing else is needed
+
 
 def texture(rng: np.random.Generator, px: int = 64) -> np.ndarray:
     """P×P×3 in [0, 1]: one of the patterns in drawn colors, with some natural unevenness."""
-    make = _PATTERNS[int(rng.choice(len(_PATTERNS), p=_SHARES))]
-    blend = make(rng, px)
-    picture = _mixed(color(rng), color(rng), blend)
-    if rng.random() < 0.5:
-        picture = picture + rng.uniform(0, 0.25) * (natural(rng, px)[..., None] - 0.5)
-    return np.clip(picture, 0, 1)
+    return drawn_texture(rng, px)()
+
+
+def drawn_texture(rng: np.random.Generator, px: int) -> Picture:
+    """The same when it is called; all that is random in it is drawn now."""
+    blend = _PATTERNS[int(rng.choice(len(_PATTERNS), p=_SHARES))](rng, px)
+    first, second, uneven = color(rng), color(rng), rng.random() < 0.5
+    strength, field = (rng.uniform(0, 0.25), natural(rng, px)) if uneven else (0, None)
+
+    def made() -> np.ndarray:
+        picture = _mixed(first, second, blend())
+        return np.clip(picture if field is None else picture + strength * (field()[..., None] - 0.5), 0, 1)
+
+    return made
 
 
 def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
@@ -70,64 +82,91 @@ def color(rng: np.random.Generator) -> np.ndarray:
     return strong.mean() + (strong - strong.mean()) * rng.uniform(0, 1) ** 1.5
 
 
-def natural(rng: np.random.Generator, px: int) -> np.ndarray:
+def natural(rng: np.random.Generator, px: int) -> Picture:
     """P×P in [0, 1]: noise with amplitude 1/f^a, the mean and spread of a photograph."""
-    fy, fx = np.fft.fftfreq(px)[:, None], np.fft.rfftfreq(px)[None]
     squeeze = np.exp(rng.normal(0, 0.4))  # grass and water have a direction
-    frequency = np.hypot(fy * squeeze, fx / squeeze)
-    frequency[0, 0] = np.inf
-    noise = np.fft.rfft2(rng.normal(size=(px, px))) / frequency ** rng.uniform(0.5, 1.6)
-    field = np.fft.irfft2(noise, (px, px))
-    return np.clip(0.5 + 0.25 * field / field.std(), 0, 1)
+    noise, steepness = rng.normal(size=(px, px)), rng.uniform(0.5, 1.6)
+
+    def made() -> np.ndarray:
+        fy, fx = np.fft.fftfreq(px)[:, None], np.fft.rfftfreq(px)[None]
+        frequency = np.hypot(fy * squeeze, fx / squeeze)
+        frequency[0, 0] = np.inf
+        field = np.fft.irfft2(np.fft.rfft2(noise) / frequency**steepness, (px, px))
+        return np.clip(0.5 + 0.25 * field / field.std(), 0, 1)
+
+    return made
 
 
-def _clouds(rng: np.random.Generator, px: int) -> np.ndarray:
+def _clouds(rng: np.random.Generator, px: int) -> Picture:
     import cv2
 
-    steepness, total = rng.uniform(0.4, 0.9), np.zeros((px, px))
-    for octave in range(5):
-        coarse = rng.random((2 ** (octave + 1) + 1,) * 2)
-        total += steepness**octave * cv2.resize(coarse, (px, px), interpolation=cv2.INTER_CUBIC)
-    return (total - total.min()) / max(np.ptp(total), 1e-9)
+    steepness, octaves = rng.uniform(0.4, 0.9), [rng.random((2 ** (octave + 1) + 1,) * 2) for octave in range(5)]
+
+    def made() -> np.ndarray:
+        total = np.zeros((px, px))
+        for octave, coarse in enumerate(octaves):
+            total += steepness**octave * cv2.resize(coarse, (px, px), interpolation=cv2.INTER_CUBIC)
+        return (total - total.min()) / max(np.ptp(total), 1e-9)
+
+    return made
 
 
-def _cells(rng: np.random.Generator, px: int) -> np.ndarray:
+def _cells(rng: np.random.Generator, px: int) -> Picture:
     """Gravel, leaves, a crowd: each pixel has the shade of its nearest of some points."""
-    from scipy.spatial import KDTree
-
     points = rng.random((int(np.exp(rng.uniform(np.log(8), np.log(800)))), 2)) * px
-    away, index = KDTree(points).query(np.moveaxis(np.mgrid[:px, :px], 0, 2))
-    return rng.random(len(points))[index] * np.clip(1.2 - away / max(away.max(), 1e-9) * rng.uniform(0, 1), 0, 1)
+    shades, darker = rng.random(len(points)), rng.uniform(0, 1)
+
+    def made() -> np.ndarray:
+        from scipy.spatial import KDTree
+
+        away, index = KDTree(points).query(np.moveaxis(np.mgrid[:px, :px], 0, 2))
+        return shades[index] * np.clip(1.2 - away / max(away.max(), 1e-9) * darker, 0, 1)
+
+    return made
 
 
-def _bricks(rng: np.random.Generator, px: int) -> np.ndarray:
+def _bricks(rng: np.random.Generator, px: int) -> Picture:
     """Rows of bricks or slabs, each of its own shade, with joints."""
-    y, x = np.mgrid[:px, :px].astype(float)
-    high, wide = rng.uniform(4, 18), rng.uniform(6, 40)
-    row = np.floor(y / high)
-    x = x + row * wide * rng.choice([0.5, 0.0, 0.33])
-    shade = rng.random((px, px)) * rng.uniform(0.1, 0.8)
-    joint = ((y % high) < rng.uniform(0.5, 2)) | ((x % wide) < rng.uniform(0.5, 2))
-    return np.where(joint, 1.0, shade[row.astype(int), (x // wide).astype(int) % px])
+    high, wide, shift = rng.uniform(4, 18), rng.uniform(6, 40), rng.choice([0.5, 0.0, 0.33])
+    shade, strength, joints = rng.random((px, px)), rng.uniform(0.1, 0.8), rng.uniform(0.5, 2, 2)
+
+    def made() -> np.ndarray:
+        y, x = np.mgrid[:px, :px].astype(float)
+        row = np.floor(y / high)
+        x = x + row * wide * shift
+        joint = ((y % high) < joints[0]) | ((x % wide) < joints[1])
+        return np.where(joint, 1.0, (shade * strength)[row.astype(int), (x // wide).astype(int) % px])
+
+    return made
 
 
-def _stripes(rng: np.random.Generator, px: int) -> np.ndarray:
-    y, x = np.mgrid[:px, :px] / px
-    turn, waves = rng.uniform(0, np.pi), rng.uniform(1.5, 14)
-    return (np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > rng.uniform(-0.8, 0.8)).astype(float)
+def _stripes(rng: np.random.Generator, px: int) -> Picture:
+    turn, waves, least = rng.uniform(0, np.pi), rng.uniform(1.5, 14), rng.uniform(-0.8, 0.8)
+
+    def made() -> np.ndarray:
+        y, x = np.mgrid[:px, :px] / px
+        return (np.sin(2 * np.pi * waves * (x * np.cos(turn) + y * np.sin(turn))) > least).astype(float)
+
+    return made
 
 
-def _checks(rng: np.random.Generator, px: int) -> np.ndarray:
-    y, x = np.mgrid[:px, :px] / px * rng.uniform(1.5, 14)
-    return (np.floor(x) + np.floor(y)) % 2
+def _checks(rng: np.random.Generator, px: int) -> Picture:
+    waves = rng.uniform(1.5, 14)
+
+    def made() -> np.ndarray:
+        y, x = np.mgrid[:px, :px] / px * waves
+        return (np.floor(x) + np.floor(y)) % 2
+
+    return made
 
 
-def _grain(rng: np.random.Generator, px: int) -> np.ndarray:
-    return rng.random((px, px))
+def _grain(rng: np.random.Generator, px: int) -> Picture:
+    grain = rng.random((px, px))
+    return lambda: grain
 
 
-def _plain(rng: np.random.Generator, px: int) -> np.ndarray:
-    return np.zeros((px, px))
+def _plain(rng: np.random.Generator, px: int) -> Picture:
+    return lambda: np.zeros((px, px))
 
 
 _PATTERNS = (natural, _clouds, _cells, _bricks, _stripes, _checks, _grain, _plain)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from patchproof.color import codes_of
-from patchproof.scene.patterns import background, color, texture
+from patchproof.scene.patterns import background, color, drawn_texture
 
 PLACE_PX = 256
 _SEED = 20
@@ -65,14 +65,16 @@ def _rays(rng: np.random.Generator, px: int) -> np.ndarray:
 
 def _put(rng, picture, depth, ray, where, far, axis) -> None:
     """A surface square to an axis, so far along the rays at the indices `where`, in front of what is farther."""
+    paint, textured = _paint(rng), rng.random() < 0.7
+    made = drawn_texture(rng, _TEXTURE_PX) if textured else lambda: np.ones((1, 1, 3))
+    finer = np.exp(rng.uniform(-1.5, 0.7))
     shown = (far > 0) & (far < depth[where])
-    where, far = where[shown], far[shown]
-    stuff, paint = np.ones((1, 1, 3)), _paint(rng)
-    if rng.random() < 0.7:
-        stuff = texture(rng, _TEXTURE_PX)
+    if not shown.any():
+        return
+    where, far, stuff = where[shown], far[shown], made()
+    if textured:
         stuff = stuff.mean(2, keepdims=True) * (1 - _STRONG) + stuff * _STRONG
     texels = ((0.3 + 0.7 * stuff) * paint).astype(np.float32).reshape(-1, 3)
-    finer = np.exp(rng.uniform(-1.5, 0.7))
     sides = (np.abs(ray[side, where] * far) for side in range(3) if side != axis)
     row, column = ((across * len(stuff) * finer).astype(np.int64) % len(stuff) for across in sides)
     picture[where] = texels[row * len(stuff) + column]
