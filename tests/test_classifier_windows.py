@@ -16,9 +16,12 @@ from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.graph import Program
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.steps import Step, Value, mark_spent
+from patchproof.classifier.windows import Windows
 from patchproof.optimizer import loop
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.responses import responses
 from test_optimize import scene_with, toml
 
 ATEN = torch.ops.aten
@@ -137,7 +140,7 @@ def test_the_gradient_in_windows_is_the_whole_programs(made, seed):
     assert len(cuts) >= 2
     whole = gradient(network, photos)
     for cut in cuts:
-        parts = gradient(lambda x, cut=cut: windows.answers(cut, x, asked), photos)
+        parts = gradient(lambda x, cut=cut: windows.answers(cut, x, Windows(asked)), photos)
         for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
             here = slice(None), slice(top, bottom), slice(left, right)
             torch.testing.assert_close(one[here], same[here], rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
@@ -232,7 +235,7 @@ def test_programs_that_cannot_be_cut_give_their_whole_gradient(made):
     torch.manual_seed(0)
     network, photos, asked = made(), pictures(), np.array([[60, 50, 70, 60]] * 3)
     laid, plainly = fastest(network, photos), gradient(network, photos)
-    assert torch.equal(gradient(lambda x: laid(x, asked), photos), gradient(laid, photos))
+    assert torch.equal(gradient(lambda x: laid(x, Windows(asked)), photos), gradient(laid, photos))
     torch.testing.assert_close(gradient(laid, photos), plainly)
 
 
@@ -290,7 +293,8 @@ def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side,
     found, calls = batches.answers, []
     monkeypatch.setattr(batches, "answers", lambda *given: calls.append(1) or found(*given))
     torch.testing.assert_close(
-        gradient(lambda x: laid(x, asked), photos)[..., :side, :side], gradient(laid, photos)[..., :side, :side]
+        gradient(lambda x: laid(x, Windows(asked)), photos)[..., :side, :side],
+        gradient(laid, photos)[..., :side, :side],
     )
     assert bool(calls) == used
 
@@ -317,22 +321,70 @@ def test_batches_take_their_own_windows(monkeypatch):
     monkeypatch.setattr(laid, "high", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     torch.manual_seed(0)
-    whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, asked), photos)
+    whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, Windows(asked)), photos)
     for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
         torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
     assert not torch.equal(parts, whole)
     monkeypatch.setattr(laid, "low", 2)  # the seventh picture goes twice, as ever
-    filled = gradient(lambda x: laid(x, asked), photos)
+    filled = gradient(lambda x: laid(x, Windows(asked)), photos)
     torch.testing.assert_close(filled[6], whole[6])
 
 
-def test_only_pictures_of_the_networks_own_size_have_windows():
-    laid = fastest(plain(), pictures())
-    classifier, asked = Classifier("plain", None, SIZE, tuple("abcde"), laid), np.array([[40, 40, 60, 60]] * 2)
+@pytest.mark.parametrize("photo_px", [(SIZE, SIZE), (SIZE, SIZE + 33), (210, 170), (96, 100)])
+def test_photographs_of_any_size_have_windows(photo_px):
+    """What is reduced to the square, or enlarged, has its gradient where the photographs' windows lie; one window
+    reaches out of the square, one lies outside.
+    """
+    torch.manual_seed(0)
+    laid, (height, width) = fastest(plain(), pictures()), photo_px
+    classifier = Classifier("plain", None, SIZE, tuple("abcde"), laid)
+    asked = np.array([[40, 30, 61, 48], [width - 20, 50, width, 70], [0, 0, 3, height]])
+    photos = torch.rand(3, 3, height, width)
+    whole = gradient(classifier.logits, photos)
+    parts = gradient(lambda x: classifier.logits(x, None, asked), photos)
+    for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
+        torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
+    assert not torch.equal(parts, whole)
 
-    for side in (SIZE, SIZE + 32):
-        corner = gradient(lambda x: classifier.logits(x, None, asked), torch.rand(2, 3, side, side))[..., 0, 0]
-        assert bool((corner == 0).all()) == (side == SIZE)
+
+@pytest.mark.parametrize("made", [plain, residual, joined])
+@pytest.mark.parametrize("seed", range(4))
+def test_pictures_that_differ_in_windows_share_the_rest(made, seed):
+    """Wherever cut, for windows of any place and size; in batches, each of its own first pictures."""
+    torch.manual_seed(seed)
+    network, rng = made(), np.random.default_rng(seed)
+    starts, sides = rng.integers(0, SIZE - 40, (4, 2)), rng.integers(0, 40, (4, 2))
+    starts[0] = [(0, 0), (SIZE - 40, 0), (0, SIZE - 40), (SIZE - 40, SIZE - 40)][seed]
+    sides[0] = 40  # up to the rim
+    asked, first = np.hstack([starts, starts + sides]), pictures(4)
+    others = [first.clone(memory_format=torch.channels_last) for _ in range(2)]
+    for other in others:
+        for picture, (left, top, right, bottom) in zip(other, asked.tolist(), strict=True):
+            picture[:, top:bottom, left:right] = torch.rand(3, bottom - top, right - left)
+    with torch.no_grad():
+        for cut in windows._cuts(network, first[:2]):
+            kept = {}
+            for photos in (first, *others):
+                told = windows.answers(cut, photos, Windows(asked, kept))
+                torch.testing.assert_close(told, network(photos), rtol=1e-4, atol=1e-5)
+            known = kept[cut].clone()
+            windows.answers(cut, others[0], Windows(asked, kept))
+            assert torch.equal(kept[cut], known), "later steps write over their own copies"
+
+
+def test_batches_keep_their_own_first_pictures(monkeypatch):
+    laid, first = fastest(plain(), pictures()), pictures(7)
+    monkeypatch.setattr(laid, "high", 3)
+    asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
+    other = first.clone()
+    for picture, (left, top, right, bottom) in zip(other, asked.tolist(), strict=True):
+        picture[:, top:bottom, left:right] = 0
+    elsewhere = torch.rand_like(first)
+    with torch.no_grad():
+        kept = {}
+        for photos in (first, other):
+            torch.testing.assert_close(laid(photos, Windows(asked, kept)), laid(photos), rtol=1e-4, atol=1e-5)
+        assert not torch.allclose(laid(elsewhere, Windows(asked, kept)), laid(elsewhere)), "what is kept is used"
 
 
 def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
@@ -342,7 +394,7 @@ def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
     laid(pictures())
     assert not asked
     for _ in range(2):
-        laid(pictures(), np.array([[0, 0, 9, 9]] * 3))
+        laid(pictures(), Windows(np.array([[0, 0, 9, 9]] * 3)))
     assert asked == [1]
 
 
@@ -362,14 +414,34 @@ def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatc
     assert len(np.unique(designs[0])) > 10 and np.abs(designs[0].astype(int) - designs[1]).max() <= 1
 
 
+def test_a_promise_shares_what_its_views_have_in_common(tmp_path, monkeypatch):
+    """The design and its controls are told apart as well as if each had been seen wholly, the bare object among them,
+    also where some views show the back of an overhanging piece.
+    """
+    torch.manual_seed(0)
+    network = classifier_of(plain(), SIZE, ["red", *"bcde"])
+    scene = scene_with(tmp_path, target__models=["python:network"], view__azimuth_deg=[-170, 170])
+    problem = set_problem(scene, models=[network])
+    shown = shown_with_controls(problem, np.full((*problem.patch.design_px[::-1], 3), 200, np.uint8), CONTROLS)
+    conditions, found, calls = scene.draw("promise", 8), batches.answers, []
+    monkeypatch.setattr(batches, "answers", lambda *given: calls.append(given) or found(*given))
+    shared = responses(problem, shown, conditions)
+    assert len(calls) == 2 * len(shown) and all(windows.kept for _, _, windows in calls)
+    monkeypatch.setattr("patchproof.optimizer.responses.windows_of", lambda views: None)
+    whole = responses(problem, shown, conditions)
+    for kind in shown:
+        np.testing.assert_allclose(shared[kind].confidence, whole[kind].confidence, atol=1e-6)
+        assert (shared[kind].confidence != shared["bare"].confidence).any() or kind == "bare"
+
+
 @pytest.mark.parametrize("made", [archives.ResNet, archives.ConvNeXt, lambda: load_builtin().network, Written])
 def test_modules_in_memory_are_cut_where_torch_can_follow_them(made):
     network = archives.seeded(made()).eval().requires_grad_(False)
     side = 96
     photos, asked = torch.rand(3, 3, side, side), np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
     laid = fastest(network, photos)
-    assert laid._cut is not None
-    whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, asked), photos)
+    assert laid.cut is not None
+    whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, Windows(asked)), photos)
     for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
         torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
     assert not torch.equal(parts, whole)
@@ -380,8 +452,8 @@ def test_modules_that_torch_cannot_follow_are_computed_whole(made):
     network = made().eval().requires_grad_(False)
     photos, asked = torch.rand(3, 3, 16, 16), np.array([[4, 4, 6, 6]] * 3)
     laid = fastest(network, photos)
-    assert laid._cut is None
-    assert torch.isfinite(gradient(lambda x: laid(x, asked), photos)).all()
+    assert laid.cut is None
+    assert torch.isfinite(gradient(lambda x: laid(x, Windows(asked)), photos)).all()
 
 
 def test_a_file_s_steps_are_weighed_on_rectangles_too():
@@ -401,7 +473,7 @@ def test_a_file_s_steps_are_weighed_on_rectangles_too():
     with pytest.raises(ValueError, match="absurd size"):
         places.first(6, photos[..., :64, :64])
     laid, asked = fastest(places, photos), np.array([[50, 50, 60, 60]] * 3)
-    torch.testing.assert_close(gradient(lambda x: laid(x, asked), photos), gradient(places, photos))
+    torch.testing.assert_close(gradient(lambda x: laid(x, Windows(asked)), photos), gradient(places, photos))
 
 
 def test_gradients_need_no_compiler_of_torch_s(tmp_path):
@@ -414,11 +486,13 @@ import patchproof as pp
 from patchproof.classifier import windows
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.responses import responses
 problem = set_problem(pp.load_scene({str(scene)!r}))
 windows.FIXED = 0  # the network is small
 network, photos = problem.classifiers[0].network, torch.rand(2, 3, 96, 96).requires_grad_()
-network(photos, np.array([[40, 40, 50, 50]] * 2)).sum().backward()
-assert network._cut and not photos.grad[..., 0].any()
+network(photos, windows.Windows(np.array([[40, 40, 50, 50]] * 2))).sum().backward()
+assert network.cut and not photos.grad[..., 0].any()
 next(loop.steps(problem))
 assert not {{"torch._dynamo", "sympy"}} & sys.modules.keys(), "imported"
 """

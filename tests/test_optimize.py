@@ -436,7 +436,7 @@ def test_a_session_is_seen_by_one_process_but_for_the_last_ones(tmp_path, monkey
     drawn, beside = problem.scene.draw("promise", 32, per_session=4), np.arange(32) % 4 < 2
     shown = {"design": problem.subject.shown(start(problem).design), "bare": None}
     responses(problem, shown, drawn, beside=beside, on_views=lambda *count: counts.append(count))
-    rows = [np.concatenate(task) for task in tasks]
+    rows = [np.concatenate([part.rows for part in task]) for task in tasks]
     assert sorted(np.concatenate(rows)) == list(range(32)) and [len(each) for each in rows] == [8, 8, 8, 4, 4]
     assert all(len({*each // 4}) == 2 for each in rows), "two sessions each"
     assert counts == [(8, 32), (16, 32), (24, 32), (28, 32), (32, 32)]
@@ -450,10 +450,10 @@ def test_texels_are_to_the_byte_those_of_one_thread_before_processes_share_views
     box.export(tmp_path / "box.glb")
     scene = scene_with(tmp_path, object__mesh=str(tmp_path / "box.glb"), object__length_mm=300)
     with threads(2):
-        shared = set_problem(scene, jobs=2).stage.object_surface.texels(reduced=True)
-        on_two = set_problem(scene).stage.object_surface.texels(reduced=True)
+        shared = set_problem(scene, jobs=2).stage.object_surface.fixed(reduced=True)
+        on_two = set_problem(scene).stage.object_surface.fixed(reduced=True)
     with threads(1):
-        alone = set_problem(scene).stage.object_surface.texels(reduced=True)
+        alone = set_problem(scene).stage.object_surface.fixed(reduced=True)
     assert torch.equal(shared, alone) and len(alone) > 150**2
     assert (on_two - alone).abs().max() < 1e-6, "two threads round otherwise, by no more"
 

@@ -178,9 +178,9 @@ def test_views_seen_together_come_apart_as_if_each_had_been_seen_alone(tmp_path,
     stage, look = set_stage(scene), Look(taps, 1.0)
     together = see(stage, WHITE, conditions, (64, 64), look)
     assert len(together.on_piece.back_pixel)
-    for size in (1, 2):
-        for number, part in enumerate(apart(together, size)):
-            alone = see(stage, WHITE, conditions[size * number : size * (number + 1)], (64, 64), look)
+    for sizes in ([1] * 5, [2, 2, 1], [1, 4]):
+        for part, last in zip(apart(together, sizes), np.cumsum(sizes), strict=True):
+            alone = see(stage, WHITE, conditions[last - len(part.conditions) : last], (64, 64), look)
             for name in ("background", "light", "eye_mm", "object", "piece", "outlines"):
                 assert the_same(getattr(part, name), getattr(alone, name)), name
 

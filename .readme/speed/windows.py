@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from patchproof.classifier import load_classifier
+from patchproof.classifier.windows import Windows
 from patchproof.workers import keep_freed_memory
 
 NETWORKS = ("mobilenet_v2_1.0_224", "squeezenet1.1_224", "mobilenet_v1_0.75_192", "mobilenet_v1_0.25_128")
@@ -40,7 +41,10 @@ def measured(name: str, share: float) -> dict:
     windows = np.hstack([starts, starts + side])
     times, difference = {"whole": [], "windows": []}, 0.0
     for _ in range(ROUNDS + 2):
-        (whole, whole_ms), (parts, windows_ms) = gradient(network, photos, None), gradient(network, photos, windows)
+        (whole, whole_ms), (parts, windows_ms) = (
+            gradient(network, photos, None),
+            gradient(network, photos, Windows(windows)),
+        )
         times["whole"].append(whole_ms)
         times["windows"].append(windows_ms)
     for one, same, (left, top, right, bottom) in zip(parts, whole, windows.tolist(), strict=True):

@@ -13,11 +13,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.windows import Cut, answers, cut_of
+from patchproof.classifier.windows import Cut, Windows, answers, cut_of
 
 MAX_BATCH = 4096  # where a program sets no limit of its own
 CPU_BATCH_PIXELS = 4 * 224**2  # 2 to 8 pictures of 224 px cost the same each, 12 a third more
@@ -35,27 +34,28 @@ class InBatches(torch.nn.Module):
         """Nothing to switch: networks come as they are to be used, and an exported program refuses `eval()`."""
         return self
 
-    def forward(self, photos: Tensor, windows: np.ndarray | None = None) -> Tensor:
-        """N×3×S×S → N×K logits. The pictures' gradient need hold in `windows` only, N×4 pixels (left, top, right,
-        bottom).
-        """
+    def forward(self, photos: Tensor, windows: Windows | None = None) -> Tensor:
+        """N×3×S×S → N×K logits. The pictures' gradient need hold in `windows` only."""
         logits = []
         for number, batch in enumerate(photos.split(self.high)):
             missing = self.low - len(batch)
             padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
             ordered = padded.contiguous(memory_format=self.order)
-            of_batch = None if windows is None or missing > 0 else windows[number * self.high :][: len(batch)]
-            logits.append(self._answers(ordered, of_batch)[: len(batch)])
+            first, own = number * self.high, None
+            if windows is not None and missing <= 0:
+                own = windows.part(first, first + len(batch))
+            logits.append(self._answers(ordered, own)[: len(batch)])
         return torch.cat(logits)
 
-    def _answers(self, photos: Tensor, windows: np.ndarray | None) -> Tensor:
-        cut = None if windows is None or self.tried is None else self._cut
-        if windows is None or cut is None or cut.saves(windows, photos.shape[-1]) <= 0:
+    def _answers(self, photos: Tensor, windows: Windows | None) -> Tensor:
+        cut = None if windows is None or self.tried is None else self.cut
+        if windows is None or cut is None or cut.saves(windows.px, photos.shape[-1]) <= 0:
             return self.network(photos)
         return answers(cut, photos, windows)
 
     @cached_property
-    def _cut(self) -> Cut | None:
+    def cut(self) -> Cut | None:
+        """Where its first layers can be told from the others, found when it is first asked for."""
         return None if self.tried is None else cut_of(self.network, self.tried)
 
 

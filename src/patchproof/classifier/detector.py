@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.network import Classifier, Odds
+from patchproof.classifier.windows import Windows
 
 LEAST_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
 NOTHING = -20.0  # the logit where no candidate lies on the object: a score of 2e-9
@@ -50,7 +51,7 @@ class Detector(Classifier):
         """N bool: the object was found under one of these labels with a sufficient score."""
         return self.confidence(logits, indices) >= self.least_score
 
-    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: np.ndarray | None = None) -> Tensor:
+    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
         """N×K logits of the best candidates on the object, whose box is known as shares of the square."""
         candidates = self._asked(squares, windows)
         logits = candidates[..., 4:]

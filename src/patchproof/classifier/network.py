@@ -11,13 +11,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from patchproof.classifier.batches import InBatches
+from patchproof.classifier.windows import Windows
 from patchproof.strict import Refused
 
 
@@ -40,14 +41,23 @@ class Classifier:
 
     KIND: ClassVar[str] = "classifier"
 
-    def logits(self, photos_srgb: Tensor, boxes: np.ndarray | None = None, windows: np.ndarray | None = None) -> Tensor:
+    def logits(
+        self,
+        photos_srgb: Tensor,
+        boxes: np.ndarray | None = None,
+        windows: np.ndarray | None = None,
+        kept: dict[Any, Any] | None = None,
+    ) -> Tensor:
         """N×K logits of the photographs' centered squares; refused where they are no numbers, which would pass for an
         answer: the largest of a row with NaN is the NaN. `boxes` N×4 tell where the object lies, as shares of the
         square's side (left, top, right, bottom); only a detector looks at them. Outside of `windows`, N×4 pixels in
-        the same order, the photographs' gradient is not asked for, and may be 0.
+        the same order, the photographs' gradient is not asked for, and may be 0; or, with `kept`, they show what the
+        first did that it went with, and no gradient is asked for.
         """
-        own_size = photos_srgb.shape[-2:] == (self.input_px, self.input_px)
-        logits = self.answer(center_square(photos_srgb, self.input_px), boxes, windows if own_size else None)
+        squares, asked = center_square(photos_srgb, self.input_px), None
+        if windows is not None:
+            asked = Windows(_in_square(windows, photos_srgb.shape[-2:], self.input_px), kept)
+        logits = self.answer(squares, boxes, asked)
         if not bool(torch.isfinite(logits).all()):
             do = "check its weights and its number format"
             raise Refused("finite logits", f"NaN or infinity from the network {self.name}", do)
@@ -72,11 +82,11 @@ class Classifier:
         """N bool: the largest logit is one of `indices`."""
         return torch.isin(logits.argmax(1), torch.tensor(list(indices), device=logits.device))
 
-    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: np.ndarray | None = None) -> Tensor:
+    def answer(self, squares: Tensor, boxes: np.ndarray | None = None, windows: Windows | None = None) -> Tensor:
         """N×K logits of squares of the network's own size, unchecked."""
         return self._asked(squares, windows)
 
-    def _asked(self, squares: Tensor, windows: np.ndarray | None) -> Tensor:
+    def _asked(self, squares: Tensor, windows: Windows | None) -> Tensor:
         """What the network itself says."""
         if windows is not None and isinstance(self.network, InBatches):
             return self.network(squares, windows)
@@ -97,6 +107,16 @@ def center_square(photos_srgb: Tensor, size_px: int) -> Tensor:
         return square
     size = (size_px, size_px)
     return torch.nn.functional.interpolate(square, size, mode="bilinear", align_corners=False, antialias=True)
+
+
+def _in_square(windows: np.ndarray, photo_px: Sequence[int], size_px: int) -> np.ndarray:
+    """The pixels of centered squares that depend on those in windows of photographs, both N×4."""
+    side = min(photo_px)
+    corner, ratio = (np.array(photo_px[::-1]) - side) // 2, side / size_px
+    reach = 0 if side == size_px else max(ratio, 1)
+    first = np.floor((windows[:, :2] - corner - reach) / ratio)
+    last = np.ceil((windows[:, 2:] - corner + reach) / ratio)
+    return np.hstack([first, last]).clip(0, size_px).astype(int)
 
 
 def weights_sha256(network: torch.nn.Module) -> str | None:

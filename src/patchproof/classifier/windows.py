@@ -1,11 +1,12 @@
-"""Gradients only where pictures may change: a piece covers a tenth of a picture, and the first, largest layers of a
-network see little more than what lies around it.
+"""Only where pictures may change: a piece covers a tenth of a picture, and the first, largest layers of a network see
+little more than what lies around it.
 
-In: a network's steps, pictures, and the window of each outside of which its pixels' gradient is not asked for. Out: the
-same answers, and in the windows the same gradient. The first steps are computed without a graph and, on the way back,
-once more with one, on rectangles so large that nothing a window reaches sees their edges. Where steps can be cut is
-found by trying: NaN in a pixel shows how far it reaches, whatever the steps are, and a cut counts if it gives the
-gradient of the whole network.
+In: a network's steps, pictures, and the window of each outside of which its pixels' gradient is not asked for, or it
+shows what another did before. Out: the same answers, and in the windows the same gradient. For gradients, the first
+steps are computed without a graph and, on the way back, once more with one, on rectangles so large that nothing a
+window reaches sees their edges; for answers alone, on rectangles of all pictures of some views but the first. Where
+steps can be cut is found by trying: NaN in a pixel shows how far it reaches, whatever the steps are, and a cut counts
+if it gives the gradient of the whole network.
 Left out on purpose: further cuts, each computed again by itself, which won nothing more; GPUs, where small pictures
 take as long as large ones; networks that torch.fx cannot follow.
 """
@@ -31,6 +32,20 @@ STEP_PX = 16  # rectangles' sides are multiples of it: a new size costs 3 ms onc
 LARGEST, FIXED = 0.54, 270_000
 TYPICAL = 0.3  # a window's side, of the picture's, that a cut is chosen for
 SAME = 1e-3  # of the largest gradient
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Where pictures of some views may differ: N×4 pixels (left, top, right, bottom). With `kept`, no gradient is asked
+    for: what a network makes of the first pictures that it goes with is left there for all others.
+    """
+
+    px: np.ndarray
+    kept: dict[Any, Any] | None = None
+
+    def part(self, first: int, last: int) -> Windows:
+        """Those of some views."""
+        return Windows(self.px[first:last], None if self.kept is None else self.kept.setdefault(first, {}))
 
 
 @dataclass(frozen=True)
@@ -61,15 +76,33 @@ class Cut:
         return self.made * (LARGEST - (right - left) * (bottom - top) / size_px**2) - FIXED
 
 
-def answers(cut: Cut, photos: Tensor, windows: np.ndarray) -> Tensor:
-    """The network's answers to N×3×S×S, whose gradient at the pictures holds in `windows` only, N×4 pixels (left, top,
-    right, bottom).
-    """
-    program, rectangles = cut.program, cut.rectangles(windows, photos.shape[-1])
+def answers(cut: Cut, photos: Tensor, windows: Windows) -> Tensor:
+    """The network's answers to N×3×S×S, whose gradient at the pictures holds in `windows` only."""
+    program, rectangles = cut.program, cut.rectangles(windows.px, photos.shape[-1])
     program.weigh(len(program.steps), photos.shape)
-    values = program.values(cut.value, _InRectangles.apply(photos, cut, rectangles))
+    if windows.kept is None:
+        value = _InRectangles.apply(photos, cut, rectangles)
+    elif cut in windows.kept:
+        value = _beside(windows.kept[cut], photos, cut, windows.px, rectangles)
+    else:
+        value = cut.program.first(cut.steps, photos)[cut.value]
+        windows.kept[cut] = value.clone()  # what is left may be written over
+    values = program.values(cut.value, value)
     compute(program.steps[cut.steps :], values, photos)
     return values[program.output]
+
+
+def _beside(known: Tensor, photos: Tensor, cut: Cut, windows: np.ndarray, rectangles: np.ndarray) -> Tensor:
+    """The cut's value of pictures that differ in windows from those whose value is known."""
+    value = known.clone()
+    again = cut.program.first(cut.steps, _joined(_parts(photos, rectangles)))[cut.value]
+    # the rows and columns that see a window
+    first = (-((cut.high - windows[:, :2]) // cut.stride)).clip(0)
+    last = (windows[:, 2:] - 1 - cut.low) // cut.stride + 1
+    seen, corner = np.hstack([first, last]), rectangles[:, :2] // cut.stride
+    for part, own in zip(_parts(value, seen), _parts(again, seen - np.hstack([corner, corner])), strict=True):
+        part.copy_(own)
+    return value
 
 
 class _InRectangles(torch.autograd.Function):
@@ -167,12 +200,13 @@ def _holds(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> b
     starts = np.array([[0, 1], [size_px - side - 1, size_px - side]])
     windows = np.hstack([starts, starts + side])
 
+    @torch.enable_grad()
     def gradients(compute: Callable[[Tensor], Tensor]) -> Tensor:
         photos = pictures.clone(memory_format=torch.channels_last).requires_grad_()
         found = compute(photos)
         weights = torch.linspace(-1, 1, found.numel()).view(found.shape)
         return _joined(_parts(torch.autograd.grad((found * weights).sum(), photos)[0], windows))
 
-    whole, cut_off = gradients(network), gradients(lambda photos: answers(cut, photos, windows))
+    whole, cut_off = gradients(network), gradients(lambda photos: answers(cut, photos, Windows(windows)))
     largest = float(whole.abs().max())  # 0 proves nothing
     return 0 < largest and float((whole - cut_off).abs().max()) <= SAME * largest

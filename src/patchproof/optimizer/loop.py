@@ -234,7 +234,7 @@ class _Kept:
         poses = range(pose, self._poses, views)[:AHEAD]
         rows = np.concatenate([np.arange(first, first + count) for first in poses])
         together = seen(self._problem, self._conditions[rows])
-        self._ahead |= zip(poses, apart(together, count), strict=True)
+        self._ahead |= zip(poses, apart(together, [count] * len(poses)), strict=True)
 
 
 def part_of(problem: Problem, printed: Tensor, views: Views, pictures: bool = False) -> _Part:

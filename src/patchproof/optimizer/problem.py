@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from patchproof.channel.printer import Printer, load_printer
+from patchproof.classifier.batches import InBatches
 from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
@@ -149,9 +150,12 @@ def set_problem(
     else:
         subject = Texture(needs_texture(scene), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
-    if jobs > 1 and stage.object is not None:
+    if jobs > 1:
         with threads(1):  # here, for all processes to be forked, and as one of them would: two threads round otherwise
-            stage.object.texels(reduced=True)
+            if stage.object is not None:
+                (stage.object.fixed if scene.HAS_PIECE else stage.object.texels)(reduced=True)
+            for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
+                _ = network.cut if isinstance(network, InBatches) else None
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 
 

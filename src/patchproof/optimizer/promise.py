@@ -24,7 +24,7 @@ from patchproof.classifier.detector import Detector
 from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
-from patchproof.optimizer.responses import Answers, joined, responses
+from patchproof.optimizer.responses import Answers, asking, joined
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
@@ -89,20 +89,22 @@ def _until_known(
     `half_width`.
     """
     compared: dict[str, Answers] = {}
-    for first, last in pairwise([0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)):
-        part, on_part = conditions[first:last], partial(_counted, on_views, first, len(conditions))
-        answers = responses(problem, shown, part, beside=_with_controls(len(part), per_session), on_views=on_part)
-        compared = joined([compared, answers]) if compared else answers
-        if half_width is None or last == len(conditions):
-            break
-        claims = _beside_controls(compared, per_session).items()
-        unsettled = {"design", *(kind for kind, claim in claims if not _settled(claim, half_width))}
-        shown = {kind: each for kind, each in shown.items() if kind in unsettled}
-        places = _places(conditions[:last], per_session)
-        counts = in_sessions(compared["design"].recognized[0], per_session, places)
-        if len(shown) == 1 and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
-            on_views(last, last)  # a bar that stays at half would look broken
-            break
+    unsettled, looks = list(shown), [0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)
+    with asking(problem, shown, conditions) as asked:
+        for first, last in pairwise(looks):
+            on_part = partial(_counted, on_views, first, len(conditions))
+            answers = asked(unsettled, np.arange(first, last), _with_controls(last - first, per_session), on_part)
+            compared = joined([compared, answers]) if compared else answers
+            if half_width is None or last == len(conditions):
+                break
+            claims = _beside_controls(compared, per_session)
+            settled = {kind for kind, claim in claims.items() if _settled(claim, half_width)}
+            unsettled = [kind for kind in unsettled if kind not in settled]
+            places = _places(conditions[:last], per_session)
+            counts = in_sessions(compared["design"].recognized[0], per_session, places)
+            if unsettled == ["design"] and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
+                on_views(last, last)  # a bar that stays at half would look broken
+                break
     return compared
 
 

@@ -7,17 +7,20 @@ many processes as the problem has; the answers do not depend on how many.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, zip_longest
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from patchproof.optimizer.problem import Problem
-from patchproof.render.photograph import Shown, expose
+from patchproof.render.photograph import Shown, expose, windows_of
+from patchproof.render.views import apart
 from patchproof.scene.conditions import Conditions
 from patchproof.workers import sharing
 
@@ -51,31 +54,60 @@ def responses(
     figures that people will read); all but the first only under those that the mask `beside` names. `on_views` gets how
     many views are done, and how many there are.
     """
+    with asking(problem, shown, conditions, side_px) as asked:
+        return asked(list(shown), np.arange(len(conditions)), beside, on_views)
+
+
+@contextmanager
+def asking(
+    problem: Problem, shown: Mapping[Thing, Shown], conditions: Conditions, side_px: int | None = None
+) -> Iterator[Callable[..., dict[Thing, Answers]]]:
+    """`responses` of some of the things under some of the conditions, by index array, as often as wanted by the same
+    processes.
+    """
     laid_out = next((thing for thing in shown.values() if thing is not None), None)
-    first, n = next(iter(shown)), len(conditions)
-    compared = np.ones(n, bool) if beside is None else beside
+    of_number = list(shown)
 
     @torch.no_grad()
-    def answers(parts: Sequence[np.ndarray]) -> list[dict[Thing, Answers]]:
-        told = []
-        for rows in parts:
-            drawn, names = conditions[rows], list(shown) if compared[rows[0]] else [first]
-            views, boxes = problem.see(laid_out, drawn, side_px or problem.figure_px), problem.boxes(drawn)
-            told.append({name: ask(problem, expose(views, shown[name]), boxes) for name in names})
+    def answers(task: Sequence[_Part]) -> list[list[Answers]]:
+        told, drawn = [], conditions[np.concatenate([part.rows for part in task])]
+        together = problem.see(laid_out, drawn, side_px or problem.figure_px)
+        for part, views in zip(task, apart(together, [len(part.rows) for part in task]), strict=True):
+            windows, kept = windows_of(views) if len(part.things) > 1 else None, {}
+            boxes, things = problem.boxes(views.conditions), [shown[of_number[number]] for number in part.things]
+            told.append([ask(problem, expose(views, thing), boxes, windows, kept) for thing in things])
         return told
 
-    of_all, of_first = (in_parts(np.flatnonzero(rows)) for rows in (compared, ~compared))
-    # those of the same session go to the same process, which draws the place behind them once; the last ones go apart,
-    # so that no process waits long for another
-    tasks = [[rows for rows in pair if rows is not None] for pair in zip_longest(of_all, of_first)]
-    tasks[-problem.jobs :] = [[rows] for task in tasks[-problem.jobs :] for rows in task]
-    seen = np.cumsum([sum(map(len, task)) for task in tasks])
-    with sharing(answers, min(problem.jobs, len(tasks))) as (workers, share):
-        told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), n))
-    parts = sorted(zip(chain(*tasks), chain(*told), strict=True), key=lambda part: not compared[part[0][0]])
-    whole = joined([answered for _, answered in parts])
-    whole[first] = whole[first].at(np.argsort(np.concatenate([rows for rows, _ in parts])))
-    return whole
+    def asked(
+        things: Sequence[Thing],
+        rows: np.ndarray,
+        beside: np.ndarray | None = None,
+        on_views: Callable[[int, int], None] = lambda done, total: None,
+    ) -> dict[Thing, Answers]:
+        compared, numbers = np.ones(len(rows), bool) if beside is None else beside, [*map(of_number.index, things)]
+        of_all = [_Part(part, numbers) for part in in_parts(rows[compared])]
+        of_first = [_Part(part, numbers[:1]) for part in in_parts(rows[~compared])]
+        # those of the same session go to the same process, which draws the place behind them once; the last ones go
+        # apart, so that no process waits long for another
+        tasks = [[part for part in pair if part is not None] for pair in zip_longest(of_all, of_first)]
+        tasks[-problem.jobs :] = [[part] for task in tasks[-problem.jobs :] for part in task]
+        seen = np.cumsum([sum(len(part.rows) for part in task) for task in tasks])
+        told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), len(rows)))
+        told = {id(part): answer for part, answer in zip(chain(*tasks), chain(*told), strict=True)}
+        parts = [*of_all, *of_first]
+        whole = joined([dict(zip(things, told[id(part)], strict=False)) for part in parts])
+        whole[things[0]] = whole[things[0]].at(np.argsort(np.concatenate([part.rows for part in parts])))
+        return whole
+
+    with sharing(answers, min(problem.jobs, math.ceil(len(conditions) / AT_A_TIME))) as (workers, share):
+        yield asked
+
+
+class _Part(NamedTuple):
+    """Some conditions, by row, and what is shown under them, by number."""
+
+    rows: np.ndarray
+    things: list[int]
 
 
 def in_parts(conditions: Some) -> Iterator[Some]:
@@ -84,13 +116,20 @@ def in_parts(conditions: Some) -> Iterator[Some]:
         yield conditions[first : first + AT_A_TIME]
 
 
-def ask(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) -> Answers:
+def ask(
+    problem: Problem,
+    pictures: Tensor,
+    boxes: np.ndarray | None,
+    windows: np.ndarray | None = None,
+    kept: dict[Any, Any] | None = None,
+) -> Answers:
     """Every network's answers to pictures N×3×H×W with the object in `boxes` (`Problem.boxes`). One that stands in the
-    problem twice, with other labels, is asked once.
+    problem twice, with other labels, is asked once. Pictures that differ only in `windows` share what is `kept`.
     """
     rows = []
     with torch.no_grad():
-        logits = {classifier: classifier.logits(pictures, boxes) for classifier in dict.fromkeys(problem.classifiers)}
+        networks = dict.fromkeys(problem.classifiers)
+        logits = {network: network.logits(pictures, boxes, windows, kept) for network in networks}
         for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
             own = logits[classifier]
             recognized, confidence = classifier.recognized(own, indices), classifier.confidence(own, indices)

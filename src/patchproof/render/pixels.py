@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from patchproof.color import linear_from_srgb
+from patchproof.render.atlas import sampled
 from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface
 from patchproof.render.texture import Footprint, footprint, layout, texel_table
@@ -83,7 +84,7 @@ class ObjectPixels:
 
     pixel: Tensor
     view: Tensor
-    texels: Footprint | None  # None where the object's own texture, which nothing replaces, is in `color`
+    texels: Footprint | None  # None where textures are fixed, and in `color`
     color: Tensor  # P×3: what the texture is multiplied by
     normal: Tensor
     position_mm: Tensor | None  # where light needs it
@@ -104,7 +105,7 @@ class ObjectPixels:
 @dataclass(frozen=True)
 class PiecePixels:
     """Pixels that the piece covers, each its `share`; `white` is the light P×3 of the base picture's paper where a
-    scene is made of pictures, else None. `box_px` N×4 (left, top, right, bottom) holds each view's.
+    scene is made of pictures, else None. `box_px` N×4 (left, top, right, bottom) holds each view's, of either side.
     """
 
     pixel: Tensor
@@ -162,6 +163,7 @@ def piece_pixels(
     kept = fragments.where(shown & fragments.front)
     front, back = ((shown & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
     mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
+    back_pixel = fragments.pixel.index_select(0, back)
     position = _weighted(surface.vertices.float()[surface.faces], kept) if needs_position else None
     return PiecePixels(
         kept.pixel,
@@ -171,17 +173,19 @@ def piece_pixels(
         torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
         position,
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
-        fragments.pixel.index_select(0, back),
+        back_pixel,
         share.index_select(0, back)[:, None],
-        _boxes(kept),
+        _boxes(torch.cat([kept.pixel, back_pixel]), fragments.shape),
     )
 
 
-def _boxes(fragments: Fragments) -> np.ndarray:
-    """N×4 pixels (left, top, right, bottom) that hold each view's fragments; of a view without any, of no size."""
-    views, height, width = fragments.shape
-    place = torch.stack([fragments.pixel % width, fragments.pixel // width % height], 1)
-    row, whole = fragments.view[:, None].expand(-1, 2), place.new_tensor([width, height]).repeat(views, 1)
+def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
+    """N×4 pixels (left, top, right, bottom) that hold each view's, of (views, height, width); of a view without any, of
+    no size.
+    """
+    views, height, width = shape
+    place, view = torch.stack([pixel % width, pixel // width % height], 1), pixel // (width * height)
+    row, whole = view[:, None].expand(-1, 2), place.new_tensor([width, height]).repeat(views, 1)
     low, high = whole.scatter_reduce(0, row, place, "amin"), (whole * 0).scatter_reduce(0, row, place + 1, "amax")
     return torch.cat([torch.minimum(low, high), high], 1).cpu().numpy()
 
@@ -192,16 +196,25 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
 
 
-def object_pixels(surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look) -> ObjectPixels:
-    """The object's fragments; faces seen from behind turn their normal round."""
+def object_pixels(
+    surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look, fixed: Tensor | None
+) -> ObjectPixels:
+    """The object's fragments, with its textures in their color where they are `fixed` (`ObjectSurface.fixed`); faces
+    seen from behind turn their normal round.
+    """
     at, (uv_dx, uv_dy) = _weighted(surface.corners, fragments), _slopes(surface.corner_uv, fragments)
     material = surface.material.index_select(0, fragments.face)
     turned = torch.nn.functional.normalize(at[:, 5:8], dim=-1) * torch.where(fragments.front, 1.0, -1.0)[:, None]
+    where, color, texels = (material, at[:, :2], uv_dx * look.side, uv_dy * look.side, look.taps), at[:, 2:5], None
+    if fixed is None:
+        texels = footprint(surface.layout, *where)
+    else:
+        color = sampled(surface.atlas, fixed, *where) * color
     return ObjectPixels(
         fragments.pixel,
         fragments.view,
-        footprint(surface.layout, material, at[:, :2], uv_dx * look.side, uv_dy * look.side, look.taps),
-        at[:, 2:5],
+        texels,
+        color,
         turned,
         _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,
     )

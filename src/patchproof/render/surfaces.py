@@ -6,8 +6,9 @@ pixels cut by its edge are found and can show their share of it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from patchproof.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
+from patchproof.render.atlas import atlas_layout, atlas_table
 from patchproof.render.edges import Edges, edges_of
 from patchproof.render.texture import Layout, layout, texel_table
 from patchproof.scene.interface import PieceScene
@@ -45,7 +47,6 @@ class ObjectSurface:
     corners: Tensor
     material: Tensor
     textures_srgb: tuple[Tensor, ...]  # H×W×3 in [0, 1], one per material
-    layout: Layout
     edges: Edges
 
     @cached_property
@@ -53,26 +54,47 @@ class ObjectSurface:
         """Texture coordinates alone, F×3×2."""
         return self.corners[..., :2].contiguous()
 
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the texels of textures lie that may change."""
+        return layout(self._sizes_px, wrap=True, device=self.material.device)
+
+    @cached_property
+    def atlas(self) -> Layout:
+        """Where those of `fixed` lie."""
+        return atlas_layout(self._sizes_px, self.material.device)
+
+    @property
+    def _sizes_px(self) -> list[tuple[int, int]]:
+        return [(texture.shape[1], texture.shape[0]) for texture in self.textures_srgb]
+
     def texels(self, reduced: bool) -> Tensor:
-        """The linear light of all textures' mip levels, averaged as light or, `reduced`, as code values."""
-        return self._reduced_texels if reduced else self._texels
+        """The `light_texels` of its own textures, where others may take their place."""
+        return self._kept(False, reduced)
+
+    def fixed(self, reduced: bool) -> Tensor:
+        """The same in an atlas, where they may not."""
+        return self._kept(True, reduced)
+
+    def _kept(self, fixed: bool, reduced: bool) -> Tensor:
+        if (fixed, reduced) not in self._tables:
+            atlas = self.atlas if fixed else None
+            self._tables[fixed, reduced] = light_texels(self.textures_srgb, reduced, atlas)
+        return self._tables[fixed, reduced]
 
     @cached_property
-    def _texels(self) -> Tensor:
-        return light_texels(self.textures_srgb, reduced=False)
-
-    @cached_property
-    def _reduced_texels(self) -> Tensor:
-        return light_texels(self.textures_srgb, reduced=True)
+    def _tables(self) -> dict[tuple[bool, bool], Tensor]:
+        return {}
 
 
-def light_texels(textures_srgb: tuple[Tensor, ...], reduced: bool) -> Tensor:
+def light_texels(textures_srgb: Sequence[Tensor], reduced: bool, atlas: Layout | None = None) -> Tensor:
     """The T×3 linear light of textures that repeat, their mip levels averaged as light or, `reduced`, as code values;
-    differentiable.
+    differentiable, but in an `atlas`.
     """
+    table = partial(texel_table, wrap=True) if atlas is None else partial(atlas_table, where=atlas)
     if reduced:
-        return linear_from_srgb(texel_table(list(textures_srgb), wrap=True))
-    return texel_table([linear_from_srgb(texture) for texture in textures_srgb], wrap=True)
+        return linear_from_srgb(table(list(textures_srgb)))
+    return table([linear_from_srgb(texture) for texture in textures_srgb])
 
 
 def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
@@ -93,7 +115,6 @@ def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
         ),
         on(mesh.face_material),
         textures,
-        layout([(t.shape[1], t.shape[0]) for t in textures], wrap=True, device=device),
         edges_of(mesh, device),
     )
 

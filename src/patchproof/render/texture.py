@@ -13,7 +13,10 @@ out on purpose: weights other than the pixel's own square.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -27,12 +30,14 @@ class Layout:
     `places` (K·L)×3 has each level's width, height and first texel, `levels` K how many of the L a texture has.
 
     Each level has one more row and column than its size, for bilinear taps to read beyond the last texel: the first
-    ones again where textures repeat (`wrap`), else the last ones.
+    ones again where textures repeat (`wrap`), else the last ones. Its rows follow each other, or lie `pitch` texels
+    apart where the table is one picture (atlas.py).
     """
 
     places: Tensor
     levels: Tensor
     wrap: bool
+    pitch: int | None = None
 
     def place(self, texture: Tensor, level: Tensor | int) -> tuple[Tensor, Tensor]:
         """(width and height P×2 float, first texel P) of levels of textures."""
@@ -87,15 +92,19 @@ def layout(sizes: list[tuple[int, int]], wrap: bool, device: torch.device | str 
 
 def texel_table(textures: list[Tensor], wrap: bool) -> Tensor:
     """The T×3 texels of all mip levels of H×W×3 textures, in the order of `layout`; differentiable."""
-    parts = []
-    for level in textures:
-        for k in range(max(level.shape[:2]).bit_length()):
-            if k:
-                level = _smaller(level)
-            edge = 0 if wrap else -1
-            padded = torch.cat([level, level[:, edge, None]], 1)
-            parts.append(torch.cat([padded, padded[edge, None]]).flatten(0, 1))
+    parts, edge = [], 0 if wrap else -1
+    for level in chain.from_iterable(map(mip_levels, textures)):
+        padded = torch.cat([level, level[:, edge, None]], 1)
+        parts.append(torch.cat([padded, padded[edge, None]]).flatten(0, 1))
     return torch.cat(parts)
+
+
+def mip_levels(texture: Tensor) -> Iterator[Tensor]:
+    """A texture H×W×3, its half, and so on to one texel."""
+    yield texture
+    for _ in range(max(texture.shape[:2]).bit_length() - 1):
+        texture = _smaller(texture)
+        yield texture
 
 
 def _smaller(level: Tensor) -> Tensor:
@@ -136,26 +145,47 @@ def footprint(
     all, for up to two texels, which is how far it reaches. Texels are points to interpolate between, or `blocks` of one
     color, as printed pixels are.
     """
-    most = 2 * taps if taps > 1 else 1
     size, _ = where.place(texture, 0)
-    across, down = _length(uv_dx * size), _length(uv_dy * size)  # level-0 texels
-    level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, most)
-    level = level.minimum(where.levels.index_select(0, texture) - 1)
+    spans = _length(uv_dx * size), _length(uv_dy * size)
+    level, counts = tap_grids(*spans, where.levels.index_select(0, texture), taps)
     size, offset = where.place(texture, level)
     at = (uv * size - 0.5, uv_dx * size, uv_dy * size, size, offset)
-    if most == 1:
-        return Footprint((Group(None, *_taps(*at, 1, 1, where.wrap, blocks)),), len(uv))
-    texel_span = torch.exp2(-level.float())
-    across, down = ((side * texel_span).ceil().clamp(1, most).long() for side in (across, down))
-    count = across * (most + 1) + down
+    if counts is None:
+        return Footprint((Group(None, *_taps(*at, 1, 1, where, blocks)),), len(uv))
+    order, grids = in_order(*counts)
     groups = []
-    for key in count.bincount().nonzero()[:, 0].tolist():
-        fragment = (count == key).nonzero()[:, 0]
-        center, dx, dy, level_size, first = (values.index_select(0, fragment) for values in at)
-        columns, rows = divmod(key, most + 1)
-        texel, weight = _taps(center, dx, dy, level_size, first, columns, rows, where.wrap, blocks)
-        groups.append(Group(fragment, texel, weight))
+    for columns, rows, first, last in grids:
+        fragment = order[first:last]
+        center, dx, dy, level_size, corner = (values.index_select(0, fragment) for values in at)
+        groups.append(Group(fragment, *_taps(center, dx, dy, level_size, corner, columns, rows, where, blocks)))
     return Footprint(tuple(groups), len(uv))
+
+
+def tap_grids(across: Tensor, down: Tensor, levels: Tensor, taps: int) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
+    """The mip level that each of P footprints is seen on, and how many taps it takes across and down; None: one in all.
+    Footprints are so many texels of the finest of their texture's `levels` wide and high.
+    """
+    most = 2 * taps if taps > 1 else 1
+    level = _levels(torch.minimum(across, down), torch.maximum(across, down), taps, most).minimum(levels - 1)
+    if most == 1:
+        return level, None
+    texel_span = torch.exp2(-level.float())
+    across, down = ((side * texel_span).ceil().clamp(1, most).short() for side in (across, down))
+    return level, (across, down)
+
+
+def in_order(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int, int, int]]]:
+    """Footprints in the order of their grids, those of one grid as they came, and of each grid columns, rows, and where
+    in that order its first and the one after its last are.
+    """
+    many = 1 << 7
+    found, order = (across * many + down).sort(stable=True)
+    keys, sizes = found.unique_consecutive(return_counts=True)
+    grids, first = [], 0
+    for key, size in torch.stack([keys, sizes]).T.tolist():
+        grids.append((*divmod(key, many), first, first + size))
+        first += size
+    return order, grids
 
 
 def on_copies(footprint: Footprint, offset: Tensor) -> Footprint:
@@ -187,7 +217,7 @@ def _taps(
     offset: Tensor,
     columns: int,
     rows: int,
-    wrap: bool,
+    where: Layout,
     blocks: bool,
 ) -> tuple[Tensor, Tensor]:
     """Texels and weights G×(4·rows·columns) of a grid of taps round `center` G×2, in texels of one level.
@@ -196,10 +226,10 @@ def _taps(
     and blocks are parallel, else over the upright box of the same extent (root of summed squares).
     """
     step_x, step_y = step_x / columns, step_y / rows
-    at = center[:, :, None, None] + step_x[:, :, None, None] * _centered(columns, center)
-    at = at + step_y[:, :, None, None] * _centered(rows, center)[:, None]
+    at = center[:, :, None, None] + step_x[:, :, None, None] * centered(columns, center.device)
+    at = at + step_y[:, :, None, None] * centered(rows, center.device)[:, None]
     size = size[:, :, None, None]
-    if wrap:
+    if where.wrap:
         at = at - (at / size).floor() * size
         low = torch.minimum(at.floor(), size - 1)  # rounding may leave a wrapped place at the size itself
     else:
@@ -210,7 +240,7 @@ def _taps(
         per_cell = 1 / (step_x * step_x + step_y * step_y).sqrt().clamp(1e-6, 1)[:, :, None, None]
         share = torch.addcmul(0.5 - 0.5 * per_cell, share, per_cell).clamp_(0, 1)
     x, y = share.unbind(1)
-    stride = size[:, 0].int() + 1
+    stride = size[:, 0].int() + 1 if where.pitch is None else torch.full_like(size[:, 0], where.pitch, dtype=torch.int)
     texel = torch.empty(len(center), 4, rows, columns, dtype=torch.int, device=center.device)
     low = low.int()
     first = torch.add(low[:, 1] * stride, low[:, 0] + offset[:, None, None].int(), out=texel[:, 0])
@@ -224,8 +254,10 @@ def _taps(
     return texel.flatten(1), weight.flatten(1)
 
 
-def _centered(count: int, like: Tensor) -> Tensor:
-    return torch.arange(count, device=like.device) - (count - 1) / 2
+@lru_cache
+def centered(count: int, device: torch.device) -> Tensor:
+    """Where so many taps stand, one apart round 0."""
+    return torch.arange(count, device=device) - (count - 1) / 2
 
 
 def look_up(footprint: Footprint, texels: Tensor) -> Tensor:

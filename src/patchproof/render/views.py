@@ -12,8 +12,10 @@ millimeters (see `pixels`). Left out on purpose: transparency.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -186,13 +188,15 @@ def see(
     fragments = rasterize(surface.vertices, surface.faces, placed, near)
     nearest = torch.full((math.prod(fragments.shape),), torch.inf, device=stage.device)
     nearest[fragments.pixel] = fragments.depth
-    look, parts = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None
+    look, parts, fixed = replace(look, taps=PHOTOGRAPHED.taps) if scene.LEARNED else look, None, None
     if piece is not None:
         printed = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
         own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
         hidden = nearest.index_select(0, own.pixel) < own.depth
         needs_position = light.lamp is not None or light.gloss is not None
         parts = piece_pixels(stage.piece_surface, piece, own, hidden, look, needs_position)
+    if not scene.LEARNED and not isinstance(shown, ObjectTextures):
+        fixed = surface.fixed(_reduced(stage, size_px))
     return Views(
         stage,
         conditions,
@@ -201,18 +205,10 @@ def see(
         light,
         eye.float(),
         backgrounds(scene, conditions, size_px, frame),
-        _own_looked_up(stage, shown, size_px, object_pixels(surface, fragments, light.lamp is not None, look)),
+        object_pixels(surface, fragments, light.lamp is not None, look, fixed),
         parts,
         outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
     )
-
-
-def _own_looked_up(stage: Stage, shown: Shown, size_px: tuple[int, int], pixels: ObjectPixels) -> ObjectPixels:
-    """The object's pixels with its own texture in their color, unless others will take its place."""
-    if pixels.texels is None or needs_mesh(stage.scene).LEARNED or isinstance(shown, ObjectTextures):
-        return pixels
-    own = stage.object_surface.texels(_reduced(stage, size_px))
-    return replace(pixels, texels=None, color=look_up(pixels.texels, own) * pixels.color)
 
 
 def _reduced(stage: Stage, size_px: tuple[int, int]) -> bool:
@@ -248,13 +244,12 @@ def seen_again(views: Views, conditions: Conditions) -> Views:
     return replace(views, conditions=conditions, background=backgrounds(scene, conditions, views.size_px, frame))
 
 
-def apart(views: Views, size: int) -> list[Views]:
-    """Views that were seen together, `size` at a time, each to the bit as if it had been seen without the others."""
+def apart(views: Views, sizes: Sequence[int]) -> list[Views]:
+    """Views that were seen together, so many at a time, each to the bit as if it had been seen without the others."""
     pixels, parts = views.frame_px[0] * views.frame_px[1], []
-    for first in range(0, len(views.conditions), size):
-        some = slice(first, first + size)
+    for first, last in pairwise(accumulate(sizes, initial=0)):
+        some, numbers = slice(first, last), range(first, last)
         own = replace(views, conditions=views.conditions[some], background=views.background[some])
-        numbers = range(first, first + len(own.conditions))
         own = replace(
             own,
             **{
