@@ -249,7 +249,7 @@ def test_the_promise_counts_what_was_recognized(tmp_path):
 
 @pytest.mark.parametrize(
     ("input_px", "training_px", "figure_px"),
-    [(8, 128, 128), (96, 144, 144), (192, 192, 288), (224, 224, 336), (800, 800, 1200), (1300, 1200, 1200)],
+    [(8, 128, 128), (96, 135, 135), (192, 192, 269), (224, 224, 314), (800, 800, 1120), (1300, 1200, 1200)],
 )
 def test_sizes_of_views_follow_the_network_s_up_to_the_photograph_s(tmp_path, input_px, training_px, figure_px):
     problem = replace(set_problem(scene_with(tmp_path)), classifiers=(SimpleNamespace(input_px=input_px),))

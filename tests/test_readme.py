@@ -14,6 +14,7 @@ import pytest
 
 from patchproof.bench.run import BENCHES
 from patchproof.claims import student_mean
+from patchproof.optimizer.problem import FIGURE_SCALE, FIGURED
 from patchproof.optimizer.run import load_run
 from patchproof.settings import SceneSettings
 from patchproof.strict import read_toml, validated
@@ -412,6 +413,16 @@ def test_figures_of_views_are_the_stored_ones():
         rates = f"{float(design['views_rate']):.1%} in views, {float(design['photographs_rate']):.1%} in photographs"
         sizes = f"{design['view_px']}, {design['photo_px']}"
         assert f"| {sizes} | {off} | {rates.replace('%', ' %')} |" in page
+
+
+def test_looks_of_views_are_the_stored_ones():
+    off, page = {}, words(NOTEBOOK)
+    for row in rows_of("views/looks.csv"):
+        if row["shown"] == "design":
+            off.setdefault((row["times"], row["width"], row["taps"]), []).append(f"{float(row['off']):+.3f}")
+    told = [look for look, each in off.items() if f"| {' | '.join([*look, *each])} |" in page]
+    chosen = str(FIGURE_SCALE), str(FIGURED.side), str(FIGURED.taps)
+    assert len(told) == 9 and f"| {' | '.join([f'**{value}**' for value in chosen] + off[chosen])} |" in page
 
 
 def test_figures_of_effort_are_the_stored_ones():
