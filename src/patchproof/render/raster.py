@@ -28,7 +28,7 @@ from patchproof.render.fragments import Cameras, Fragments, columns
 from patchproof.strict import Refused
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
-# Faces, rows, pixels or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose
+# Faces, rows or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose
 # temporaries leave the cache; beside the result some 100 MB are held.
 CHUNK = 1 << 18
 _FACE_BITS = 29  # a key is a float64 of 1/z whose lower bits give way to the face; 23 of the mantissa are left
@@ -48,7 +48,7 @@ def rasterize(vertices: Tensor, faces: Tensor, cameras: Cameras, near_mm: float)
         raise Refused(f"at most {_FACE_MASK} faces", str(len(faces)), "render the mesh in parts")
     width, height = cameras.size_px
     shape, vertices = (len(cameras), height, width), vertices.double()
-    at_once = max(1, CHUNK // max(len(vertices), len(faces), width * height, 1))
+    at_once = max(1, CHUNK // max(len(vertices), len(faces), 1))
     groups = range(0, len(cameras), at_once)
     nearest = torch.zeros(math.prod(shape), dtype=torch.int64, device=faces.device)
     for view in groups:
