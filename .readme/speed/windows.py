@@ -1,8 +1,9 @@
-"""Gradients in windows beside whole ones: what they take, and how far they differ.
+"""Gradients in windows, and answers to pictures that differ in them, beside whole ones: what they take, how far off.
 
 In: networks of DATA. Out: `windows.csv`: for windows of some shares of the picture's side, the medians of forward and
-backward passes of two pictures, in turn and on one thread, with freed memory kept, and the largest difference of the
-gradients in the windows, as a share of the largest gradient. Run in this folder, idle: python windows.py
+backward passes of two pictures and of forward passes of four beside four others, in turn with whole passes and on one
+thread, with freed memory kept; and the largest differences, of gradients in the windows as a share of the largest
+gradient, of logits as they are. Run in this folder, idle: python windows.py
 """
 
 import csv
@@ -32,37 +33,68 @@ def gradient(network, photos, windows):
     return found, 1000 * (time.perf_counter() - start)
 
 
+def placed(size: int, share: float, count: int) -> np.ndarray:
+    """Windows of that share of the side, anywhere."""
+    side = round(share * size)
+    starts = np.random.default_rng(0).integers(0, size - side, (count, 2), endpoint=True)
+    return np.hstack([starts, starts + side])
+
+
+def parts(photos, windows):
+    """What each picture shows in its window."""
+    edges = windows.tolist()
+    return [one[:, top:bottom, left:right] for one, (left, top, right, bottom) in zip(photos, edges, strict=True)]
+
+
+def asked_for_gradients(network, size: int, share: float) -> dict:
+    """Of two pictures, in the windows only and of all of them."""
+    windows, photos = placed(size, share, 2), torch.rand(2, 3, size, size)
+    times = {"whole": [], "windows": []}
+    for _ in range(ROUNDS + 2):
+        (whole, whole_ms), (some, windows_ms) = (gradient(network, photos, w) for w in (None, Windows(windows)))
+        times["whole"].append(whole_ms)
+        times["windows"].append(windows_ms)
+    largest = float(whole.abs().max())
+    pairs = zip(parts(some, windows), parts(whole, windows), strict=True)
+    difference = max(float((one - same).abs().max()) for one, same in pairs) / largest
+    whole_ms, windows_ms = (statistics.median(values[2:]) for values in times.values())  # the first are to warm up
+    row = {"whole_ms": round(whole_ms, 2), "windows_ms": round(windows_ms, 2)}
+    return row | {"ratio": round(windows_ms / whole_ms, 3), "difference": f"{difference:.1e}"}
+
+
+@torch.no_grad()
+def asked_beside_others(network, size: int, share: float) -> dict:
+    """Four pictures that differ in windows only from four others, whose answers are known."""
+    windows, photos = placed(size, share, 4), torch.rand(4, 3, size, size)
+    others, kept, times, difference = photos.clone(), {}, {"whole": [], "beside": []}, 0.0
+    for part in parts(others, windows):
+        part.uniform_()
+    network(photos, Windows(windows, kept))
+    for _ in range(ROUNDS + 2):
+        told = {}
+        for name, known in (("whole", None), ("beside", Windows(windows, kept))):
+            start = time.perf_counter()
+            told[name] = network(others, known)
+            times[name].append(1000 * (time.perf_counter() - start))
+        difference = max(difference, float((told["whole"] - told["beside"]).abs().max()))
+    whole_ms, beside_ms = (statistics.median(values[2:]) for values in times.values())
+    row = {"forward_ms": round(whole_ms, 2), "beside_ms": round(beside_ms, 2)}
+    return row | {"beside_ratio": round(beside_ms / whole_ms, 3), "beside_difference": f"{difference:.1e}"}
+
+
 def measured(name: str, share: float) -> dict:
     """A line of the table."""
     classifier = load_classifier(f"file:{os.environ['PATCHPROOF_DATA']}/models/{name}.pt2", Path())
-    network, size = classifier.network, classifier.input_px
-    side, photos = round(share * size), torch.rand(2, 3, size, size)
-    starts = np.random.default_rng(0).integers(0, size - side, (2, 2), endpoint=True)
-    windows = np.hstack([starts, starts + side])
-    times, difference = {"whole": [], "windows": []}, 0.0
-    for _ in range(ROUNDS + 2):
-        (whole, whole_ms), (parts, windows_ms) = (
-            gradient(network, photos, None),
-            gradient(network, photos, Windows(windows)),
-        )
-        times["whole"].append(whole_ms)
-        times["windows"].append(windows_ms)
-    for one, same, (left, top, right, bottom) in zip(parts, whole, windows.tolist(), strict=True):
-        difference = max(difference, float((one - same)[:, top:bottom, left:right].abs().max()))
-    whole_ms, windows_ms = (statistics.median(values[2:]) for values in times.values())  # the first are to warm up
-    row = {"network": name, "share": share, "whole_ms": round(whole_ms, 2), "windows_ms": round(windows_ms, 2)}
-    largest = float(whole.abs().max())
-    return row | {"ratio": round(windows_ms / whole_ms, 3), "difference": f"{difference / largest:.1e}"}
+    asked = classifier.network, classifier.input_px, share
+    return {"network": name, "share": share, **asked_for_gradients(*asked), **asked_beside_others(*asked)}
 
 
 if __name__ == "__main__":
     keep_freed_memory()
     torch.set_num_threads(1)
     torch.manual_seed(0)
+    rows = [measured(name, share) for name in NETWORKS for share in SHARES]
     with open("windows.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, ("network", "share", "whole_ms", "windows_ms", "ratio", "difference"))
+        writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
-        for name in NETWORKS:
-            for share in SHARES:
-                writer.writerow(measured(name, share))
-                file.flush()
+        writer.writerows(rows)

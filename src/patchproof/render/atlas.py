@@ -2,7 +2,8 @@
 
 In: textures H×W×3 that repeat, and per fragment what `texture.footprint` takes. Out: the P×3 that they see, in
 the same taps. All mip levels lie in one picture, each with a margin that goes on as the texture does and is wider than
-footprints reach: so taps need not be wrapped, and the library's own look-up takes them all, in a quarter of the time.
+footprints reach: so taps need not be wrapped, and the library's own look-up takes them all: with 2 to 4 taps
+in half of the time, of photographs in three quarters.
 """
 
 from __future__ import annotations
