@@ -299,6 +299,19 @@ def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side,
     assert bool(calls) == used
 
 
+@pytest.mark.parametrize(("side", "used"), [(20, True), (57, True), (88, True), (89, False), (SIZE, False)])
+def test_answers_are_shared_up_to_larger_windows(monkeypatch, side, used):
+    laid, first, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
+    other, found, calls = torch.rand_like(first), batches.answers, []
+    other[..., side:], other[..., side:, :] = first[..., side:], first[..., side:, :]
+    monkeypatch.setattr(batches, "answers", lambda *given: calls.append(1) or found(*given))
+    with torch.no_grad():
+        kept = {}
+        for photos in (first, other):
+            torch.testing.assert_close(laid(photos, Windows(asked, kept)), laid(photos), rtol=1e-4, atol=1e-5)
+    assert len(calls) == 2 * used
+
+
 def test_a_gradient_of_zero_proves_nothing():
     mean, (linear, [of, weight, bias]) = head(1, 8)
     layers = convolution("x", 3, 8, 2), convolution((0,), 8, 8, 2)

@@ -49,7 +49,7 @@ class InBatches(torch.nn.Module):
 
     def _answers(self, photos: Tensor, windows: Windows | None) -> Tensor:
         cut = None if windows is None or self.tried is None else self.cut
-        if windows is None or cut is None or cut.saves(windows.px, photos.shape[-1]) <= 0:
+        if windows is None or cut is None or cut.saves(windows, photos.shape[-1]) <= 0:
             return self.network(photos)
         return answers(cut, photos, windows)
 

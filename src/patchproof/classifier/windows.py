@@ -29,6 +29,7 @@ STEP_PX = 16  # rectangles' sides are multiples of it: a new size costs 3 ms onc
 # What rectangles save, in numbers that are made, is about LARGEST less their share of the picture, times all those of
 # the first steps, less FIXED: with windows of 0.2 to 0.6 of the side, MobileNetV2 saves nothing any more from a share
 # of 0.53 on, SqueezeNet 1.1 from 0.49, MobileNet v1 0.75 from 0.44; MobileNet v1 0.25 would lose a tenth with any.
+# Answers alone cost the rectangles and nothing twice: in place of LARGEST it is 1.
 LARGEST, FIXED = 0.54, 270_000
 TYPICAL = 0.3  # a window's side, of the picture's, that a cut is chosen for
 SAME = 1e-3  # of the largest gradient
@@ -70,10 +71,11 @@ class Cut:
         starts = (windows[:, :2] - margin_px).clip(0, size_px - sides) // self.stride * self.stride
         return np.hstack([starts, starts + sides])
 
-    def saves(self, windows: np.ndarray, size_px: int) -> float:
+    def saves(self, windows: Windows, size_px: int) -> float:
         """How many numbers less have to be made for these windows."""
-        left, top, right, bottom = self.rectangles(windows, size_px)[0]
-        return self.made * (LARGEST - (right - left) * (bottom - top) / size_px**2) - FIXED
+        left, top, right, bottom = self.rectangles(windows.px, size_px)[0]
+        largest = LARGEST if windows.kept is None else 1
+        return self.made * (largest - (right - left) * (bottom - top) / size_px**2) - FIXED
 
 
 def answers(cut: Cut, photos: Tensor, windows: Windows) -> Tensor:
@@ -153,7 +155,7 @@ def cut_of(network: Callable[[Tensor], Tensor], pictures: Tensor) -> Cut | None:
     if program is None:
         return None
     size_px = pictures.shape[-1]
-    window = np.array([[0, 0, *2 * [round(TYPICAL * size_px)]]])
+    window = Windows(np.array([[0, 0, *2 * [round(TYPICAL * size_px)]]]))
     try:
         best = max(_cuts(program, pictures), key=lambda cut: cut.saves(window, size_px), default=None)
         return best if best and best.saves(window, size_px) > 0 and _holds(network, best, pictures) else None

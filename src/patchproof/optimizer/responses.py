@@ -88,9 +88,10 @@ def asking(
         of_all = [_Part(part, numbers) for part in in_parts(rows[compared])]
         of_first = [_Part(part, numbers[:1]) for part in in_parts(rows[~compared])]
         # those of the same session go to the same process, which draws the place behind them once; the last ones go
-        # apart, so that no process waits long for another
+        # apart, the shortest last, so that no process waits long for another
         tasks = [[part for part in pair if part is not None] for pair in zip_longest(of_all, of_first)]
-        tasks[-problem.jobs :] = [[part] for task in tasks[-problem.jobs :] for part in task]
+        last = sorted(chain(*tasks[-problem.jobs :]), key=lambda part: -len(part.things))
+        tasks[-problem.jobs :] = [[part] for part in last]
         seen = np.cumsum([sum(len(part.rows) for part in task) for task in tasks])
         told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), len(rows)))
         told = {id(part): answer for part, answer in zip(chain(*tasks), chain(*told), strict=True)}

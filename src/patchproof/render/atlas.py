@@ -1,9 +1,9 @@
 """Textures that nothing changes, read at once: no numbers of texels are kept, as what is learned needs them.
 
-In: textures H×W×3 that repeat, and per fragment what `texture.footprint` takes. Out: the P×3 that they see, in
-the same taps. All mip levels lie in one picture, each with a margin that goes on as the texture does and is wider than
-footprints reach: so taps need not be wrapped, and the library's own look-up takes them all: with 2 to 4 taps
-in half of the time, of photographs in three quarters.
+In: textures H×W×3 that repeat, and per fragment what `texture.footprint` takes. Out: the P×3 that they see, in the
+same taps. All mip levels lie in one picture, each with a margin that goes on as the texture does and is wider than
+footprints reach, so that taps need not be wrapped and the library's own look-up takes them all: in half of the time in
+views, in three quarters in photographs.
 """
 
 from __future__ import annotations
