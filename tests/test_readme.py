@@ -328,11 +328,12 @@ def test_figures_of_windows_are_the_stored_ones():
         rows_of("speed/windows.csv"),
         ("MobileNetV2 1.0", "SqueezeNet 1.1", "MobileNet v1 0.75", "MobileNet v1 0.25"),
     )
-    assert len(rows) == 24 and {row["difference"] for row in rows} == {"0.0e+00"}
-    assert f"| network | {' | '.join(row['share'] for row in rows[:6])} |" in words(NOTEBOOK)
+    assert len(rows) == 24 and {row[of] for row in rows for of in ("difference", "beside_difference")} == {"0.0e+00"}
+    assert f"| network | what is asked for | {' | '.join(row['share'] for row in rows[:6])} |" in words(NOTEBOOK)
     for number, name in enumerate(told):
-        ratios = [f"{float(row['ratio']):.2f}" for row in rows[6 * number : 6 * number + 6]]
-        assert f"| {name} | {' | '.join(ratios)} |" in words(NOTEBOOK)
+        for asked, ratio in (("gradients", "ratio"), ("answers", "beside_ratio")):
+            ratios = [f"{float(row[ratio]):.2f}" for row in rows[6 * number : 6 * number + 6]]
+            assert f"| {name} | {asked} | {' | '.join(ratios)} |" in words(NOTEBOOK)
 
 
 def test_figures_of_selections_are_the_stored_ones():
