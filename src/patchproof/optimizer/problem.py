@@ -155,7 +155,8 @@ def set_problem(
             if stage.object is not None:
                 (stage.object.fixed if scene.HAS_PIECE else stage.object.texels)(reduced=True)
             for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
-                _ = network.cut if isinstance(network, InBatches) else None
+                if isinstance(network, InBatches):
+                    _ = network.cut  # found when it is asked for
     return Problem(scene, stage, printer, classifiers, indices, subject, loss, jobs)
 
 
