@@ -470,3 +470,13 @@ def test_more_taps_of_an_object_s_texture_bring_views_nearer_to_reduced_photogra
     textures = ObjectTextures(stage.object.textures_srgb)
     small, figure = (problem.see(textures, conditions, side).object.texels for side in (96, problem.figure_px))
     assert len(small.groups) == 1 < len(figure.groups), "views smaller than figures are looked at once a pixel"
+
+
+def test_fixed_textures_are_held_once(tmp_path):
+    """In their atlas: the table that textures need which may change would take as much memory again."""
+    scene = scene_of(tmp_path)
+    stage = set_stage(scene)
+    for shown in (piece_of(scene), None, ObjectTextures(stage.object.textures_srgb)):
+        for size in ((96, 96), (800, 600)):
+            photograph(stage, shown, scene.draw("promise", 1), size)
+    assert {fixed for fixed, _ in stage.object._tables} == {True}

@@ -91,16 +91,20 @@ class Views:
     @cached_property
     def bare(self) -> Tensor:
         """The lit object without the piece, its outlines jagged, N·H·W × 3."""
-        return self._behind if self.object is None else self.object_light(self._own_texels)
+        return self._behind if self.object is None else self.object_light()
 
-    def object_light(self, texels: Tensor) -> Tensor:
-        """The same with these texels; differentiable. Only views that were seen for textures can show others."""
+    def object_light(self, texels: Tensor | None = None) -> Tensor:
+        """The same with these texels in place of its own; differentiable. Only views that were seen for textures can
+        show others.
+        """
         return self._behind.index_copy(0, self.on_object.pixel, self._object_color(texels))
 
-    def _object_color(self, texels: Tensor) -> Tensor:
+    def _object_color(self, texels: Tensor | None = None) -> Tensor:
         """The light P×3 of the object's fragments."""
-        pixels = self.on_object
-        reflected = pixels.color if pixels.texels is None else look_up(pixels.texels, texels) * pixels.color
+        pixels, reflected = self.on_object, self.on_object.color
+        if pixels.texels is not None:
+            table = self.stage.object_surface.texels(self.reduced) if texels is None else texels
+            reflected = look_up(pixels.texels, table) * reflected
         return reflected * self._irradiance(pixels)
 
     def _irradiance(self, pixels: ObjectPixels | PiecePixels) -> Tensor:
@@ -108,10 +112,6 @@ class Views:
         if self.light is None:
             raise ValueError("pictures bring their own light")
         return irradiance(pixels.normal, pixels.view, self.light, pixels.position_mm)[:, None]
-
-    @property
-    def _own_texels(self) -> Tensor:
-        return self.stage.object_surface.texels(self.reduced)
 
     @cached_property
     def _behind(self) -> Tensor:
@@ -133,7 +133,7 @@ class Views:
             image = encoded_by_table(light, camera).view(-1, 3)
         if self.object is None:
             return image
-        color = self._object_color(self._own_texels) * self.exposure(self.object.pixel, self.object.view)
+        color = self._object_color() * self.exposure(self.object.pixel, self.object.view)
         return image.index_copy_(0, self.object.pixel, encoded_by_table(color, camera))
 
     def exposure(self, pixel: Tensor, view: Tensor) -> Tensor:
