@@ -230,6 +230,34 @@ def swallows_nan() -> Program:
     )
 
 
+def depends_without_gradient() -> Program:
+    """The picture's mean, in steps that have no gradient, and cleaned of the NaN that would show how far it reaches."""
+    return program(
+        convolution("x", 3, 8, 2),
+        (ATEN.mean.dim, ["x", [1, 2, 3], True]),
+        (ATEN.nan_to_num.default, [(1,)]),
+        (ATEN.mul.Tensor, [(2,), 1e5]),
+        (ATEN.round.default, [(3,)]),
+        (ATEN.add.Tensor, [(0,), (4,)]),
+        convolution((5,), 8, 8, 2),
+        *head(6, 8),
+    )
+
+
+def test_answers_that_depend_on_all_of_a_picture_without_a_gradient_are_not_shared(monkeypatch):
+    torch.manual_seed(0)
+    network, photos, asked = depends_without_gradient(), pictures(), np.array([[60, 50, 70, 60]] * 3)
+    laid, other = fastest(network, photos), photos.clone()
+    other[..., 50:60, 60:70] = 0
+    with torch.no_grad():
+        kept = {}
+        for each in (photos, other):
+            torch.testing.assert_close(laid(each, Windows(asked, kept)), network(each))
+    assert laid.cut is None
+    monkeypatch.setattr(windows, "_alike", lambda *_: True)
+    assert windows.cut_of(network, photos[:2]), "nothing else would have seen it"
+
+
 @pytest.mark.parametrize("made", [squeezes, of_one_size, with_places, pictures_again, swallows_nan])
 def test_programs_that_cannot_be_cut_give_their_whole_gradient(made):
     torch.manual_seed(0)

@@ -6,7 +6,7 @@ shows what another did before. Out: the same answers, and in the windows the sam
 steps are computed without a graph and, on the way back, once more with one, on rectangles so large that nothing a
 window reaches sees their edges; for answers alone, on rectangles of all pictures of some views but the first. Where
 steps can be cut is found by trying: NaN in a pixel shows how far it reaches, whatever the steps are, and a cut counts
-if it gives the gradient of the whole network.
+if it gives the gradient and the answers of the whole network.
 Left out on purpose: further cuts, each computed again by itself, which won nothing more; GPUs, where small pictures
 take as long as large ones; networks that torch.fx cannot follow.
 """
@@ -32,7 +32,7 @@ STEP_PX = 16  # rectangles' sides are multiples of it: a new size costs 3 ms onc
 # Answers alone cost the rectangles and nothing twice: in place of LARGEST it is 1.
 LARGEST, FIXED = 0.54, 270_000
 TYPICAL = 0.3  # a window's side, of the picture's, that a cut is chosen for
-SAME = 1e-3  # of the largest gradient
+SAME, SAME_ANSWER = 1e-3, 1e-5  # of the largest gradient, in which kinks count, and of the largest answer
 
 
 @dataclass(frozen=True)
@@ -196,11 +196,14 @@ def _cuts(program: Program, pictures: Tensor) -> list[Cut]:
 
 def _holds(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> bool:
     """Whether the gradient is that of the whole network in windows near two corners, so that rectangles have two edges
-    of the picture and two of their own, each on either side.
+    of the picture and two of their own, each on either side; and so are answers to pictures that differ there.
     """
     size_px, side = pictures.shape[-1], pictures.shape[-1] // 8
     starts = np.array([[0, 1], [size_px - side - 1, size_px - side]])
     windows = np.hstack([starts, starts + side])
+    changed, kept = pictures.clone(memory_format=torch.channels_last), {}
+    for part in _parts(changed, windows):
+        part.neg_().add_(1)
 
     @torch.enable_grad()
     def gradients(compute: Callable[[Tensor], Tensor]) -> Tensor:
@@ -209,6 +212,13 @@ def _holds(network: Callable[[Tensor], Tensor], cut: Cut, pictures: Tensor) -> b
         weights = torch.linspace(-1, 1, found.numel()).view(found.shape)
         return _joined(_parts(torch.autograd.grad((found * weights).sum(), photos)[0], windows))
 
-    whole, cut_off = gradients(network), gradients(lambda photos: answers(cut, photos, Windows(windows)))
+    with torch.no_grad():
+        _, beside = (answers(cut, photos, Windows(windows, kept)) for photos in (pictures, changed))
+        if not _alike(network(changed), beside, SAME_ANSWER):
+            return False
+    return _alike(gradients(network), gradients(lambda photos: answers(cut, photos, Windows(windows))), SAME)
+
+
+def _alike(whole: Tensor, cut_off: Tensor, share: float) -> bool:
     largest = float(whole.abs().max())  # 0 proves nothing
-    return 0 < largest and float((whole - cut_off).abs().max()) <= SAME * largest
+    return 0 < largest and float((whole - cut_off).abs().max()) <= share * largest
