@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from patchproof.scene import patterns
+from patchproof.scene import rooms as module
 from patchproof.scene.backgrounds import ENOUGH, FEW, RARE, ROOMS, load_backgrounds
 from patchproof.scene.rooms import PLACE_PX, place
 from patchproof.scene.scene import make_scene
@@ -121,3 +123,20 @@ def test_promises_of_another_scene_meet_other_draws_and_evaluations_the_same():
     for stream, same in (("promise", False), ("evaluate", True), ("train", True)):
         pair = [scene.draw(stream, 8).pose.azimuth_deg for scene in (one, other)]
         assert np.array_equal(*pair) == same
+
+
+def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
+    """So that a place stays the same whatever shows in it: all that is random is drawn before a texture is made."""
+    places = [module.place(number) for number in range(0, 40, 2)]
+
+    def at_once(rng, px):
+        picture = patterns.drawn_texture(rng, px)()
+        return lambda: picture
+
+    monkeypatch.setattr(module, "drawn_texture", at_once)
+    assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
+    for seed in range(60):  # every pattern
+        rng = np.random.default_rng(seed)
+        later = patterns.drawn_texture(rng, 32)
+        drawn = rng.bit_generator.state
+        assert np.array_equal(later(), later()) and rng.bit_generator.state == drawn

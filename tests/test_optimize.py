@@ -450,10 +450,10 @@ def test_texels_are_to_the_byte_those_of_one_thread_before_processes_share_views
     box.export(tmp_path / "box.glb")
     scene = scene_with(tmp_path, object__mesh=str(tmp_path / "box.glb"), object__length_mm=300)
     with threads(2):
-        shared = set_problem(scene, jobs=2).stage.object_surface.fixed(reduced=True)
-        on_two = set_problem(scene).stage.object_surface.fixed(reduced=True)
+        shared = set_problem(scene, jobs=2).stage.object_surface.texels(reduced=True, fixed=True)
+        on_two = set_problem(scene).stage.object_surface.texels(reduced=True, fixed=True)
     with threads(1):
-        alone = set_problem(scene).stage.object_surface.fixed(reduced=True)
+        alone = set_problem(scene).stage.object_surface.texels(reduced=True, fixed=True)
     assert torch.equal(shared, alone) and len(alone) > 150**2
     assert (on_two - alone).abs().max() < 1e-6, "two threads round otherwise, by no more"
 

@@ -204,6 +204,19 @@ def test_views_lit_anew_are_views_seen_anew(tmp_path, tables):
         assert torch.equal(expose(seen, shown), before)
 
 
+def test_the_back_of_a_piece_lies_in_its_window_too(tmp_path):
+    """A bare object has none: pictures with and without a piece are alike everywhere else."""
+    trimesh.creation.icosphere(2, 150).export(tmp_path / "ball.ply")
+    scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"))
+    seen = see(set_stage(scene), WHITE, posed(scene, 3, azimuth_deg=[110, 100, -60], distance_mm=900), (96, 96))
+    assert len(seen.on_piece.back_pixel)
+    differ = (expose(seen, WHITE) != expose(seen, None)).any(1)
+    assert differ.flatten(1).any(1).all()
+    for view, (left, top, right, bottom) in zip(differ, windows_of(seen).tolist(), strict=True):
+        view[top:bottom, left:right] = False
+    assert not differ.any()
+
+
 def test_where_it_is_not_known_what_a_design_changes_there_are_no_windows(tmp_path):
     lens = ("photo_px = [800, 600]", 'photo_px = [1600, 1200]\nfile = "phone"')
     for scene, known in ((scene_of(tmp_path), True), (scene_of(tmp_path, lens), False)):
@@ -479,4 +492,4 @@ def test_fixed_textures_are_held_once(tmp_path):
     for shown in (piece_of(scene), None, ObjectTextures(stage.object.textures_srgb)):
         for size in ((96, 96), (800, 600)):
             photograph(stage, shown, scene.draw("promise", 1), size)
-    assert {fixed for fixed, _ in stage.object._tables} == {True}
+    assert {fixed for _, fixed in stage.object._tables} == {True}

@@ -153,7 +153,7 @@ def set_problem(
     if jobs > 1:
         with threads(1):  # here, for all processes to be forked, and as one of them would: two threads round otherwise
             if stage.object is not None:
-                (stage.object.fixed if scene.HAS_PIECE else stage.object.texels)(reduced=True)
+                stage.object.texels(reduced=True, fixed=scene.HAS_PIECE)
             for network in (classifier.network for classifier in classifiers if scene.HAS_PIECE):
                 if isinstance(network, InBatches):
                     _ = network.cut  # found when it is asked for

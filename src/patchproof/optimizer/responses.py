@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, zip_longest
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -66,16 +66,17 @@ def asking(
     processes.
     """
     laid_out = next((thing for thing in shown.values() if thing is not None), None)
-    of_number = list(shown)
 
     @torch.no_grad()
-    def answers(task: Sequence[_Part]) -> list[list[Answers]]:
+    def answers(task: Sequence[_Part[Thing]]) -> list[dict[Thing, Answers]]:
         told, drawn = [], conditions[np.concatenate([part.rows for part in task])]
         together = problem.see(laid_out, drawn, side_px or problem.figure_px)
         for part, views in zip(task, apart(together, [len(part.rows) for part in task]), strict=True):
-            windows, kept = windows_of(views) if len(part.things) > 1 else None, {}
-            boxes, things = problem.boxes(views.conditions), [shown[of_number[number]] for number in part.things]
-            told.append([ask(problem, expose(views, thing), boxes, windows, kept) for thing in things])
+            boxes, windows, kept = problem.boxes(views.conditions), None, {}
+            if len(part.things) > 1:
+                windows = windows_of(views)
+            pictures = ((thing, expose(views, shown[thing])) for thing in part.things)
+            told.append({thing: ask(problem, photos, boxes, windows, kept) for thing, photos in pictures})
         return told
 
     def asked(
@@ -84,9 +85,9 @@ def asking(
         beside: np.ndarray | None = None,
         on_views: Callable[[int, int], None] = lambda done, total: None,
     ) -> dict[Thing, Answers]:
-        compared, numbers = np.ones(len(rows), bool) if beside is None else beside, [*map(of_number.index, things)]
-        of_all = [_Part(part, numbers) for part in in_parts(rows[compared])]
-        of_first = [_Part(part, numbers[:1]) for part in in_parts(rows[~compared])]
+        compared = np.ones(len(rows), bool) if beside is None else beside
+        of_all = [_Part(part, things) for part in in_parts(rows[compared])]
+        of_first = [_Part(part, things[:1]) for part in in_parts(rows[~compared])]
         # those of the same session go to the same process, which draws the place behind them once; the last ones go
         # apart, the shortest last, so that no process waits long for another
         tasks = [[part for part in pair if part is not None] for pair in zip_longest(of_all, of_first)]
@@ -94,21 +95,20 @@ def asking(
         tasks[-problem.jobs :] = [[part] for part in last]
         seen = np.cumsum([sum(len(part.rows) for part in task) for task in tasks])
         told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), len(rows)))
-        told = {id(part): answer for part, answer in zip(chain(*tasks), chain(*told), strict=True)}
-        parts = [*of_all, *of_first]
-        whole = joined([dict(zip(things, told[id(part)], strict=False)) for part in parts])
-        whole[things[0]] = whole[things[0]].at(np.argsort(np.concatenate([part.rows for part in parts])))
+        parts = list(zip(chain(*tasks), chain(*told), strict=True))  # the first of them has all things
+        whole = joined([answered for _, answered in parts])
+        whole[things[0]] = whole[things[0]].at(np.argsort(np.concatenate([part.rows for part, _ in parts])))
         return whole
 
     with sharing(answers, min(problem.jobs, math.ceil(len(conditions) / AT_A_TIME))) as (workers, share):
         yield asked
 
 
-class _Part(NamedTuple):
-    """Some conditions, by row, and what is shown under them, by number."""
+class _Part(NamedTuple, Generic[Thing]):
+    """Some conditions, by row, and what is shown under them."""
 
     rows: np.ndarray
-    things: list[int]
+    things: Sequence[Thing]
 
 
 def in_parts(conditions: Some) -> Iterator[Some]:

@@ -199,7 +199,7 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
 def object_pixels(
     surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look, fixed: Tensor | None
 ) -> ObjectPixels:
-    """The object's fragments, with its textures in their color where they are `fixed` (`ObjectSurface.fixed`); faces
+    """The object's fragments, with its textures in their color where they are `fixed` (`ObjectSurface.texels`); faces
     seen from behind turn their normal round.
     """
     at, (uv_dx, uv_dy) = _weighted(surface.corners, fragments), _slopes(surface.corner_uv, fragments)

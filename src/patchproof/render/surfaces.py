@@ -61,26 +61,18 @@ class ObjectSurface:
 
     @cached_property
     def atlas(self) -> Layout:
-        """Where those of `fixed` lie."""
+        """Where those of fixed textures lie."""
         return atlas_layout(self._sizes_px, self.material.device)
 
     @property
     def _sizes_px(self) -> list[tuple[int, int]]:
         return [(texture.shape[1], texture.shape[0]) for texture in self.textures_srgb]
 
-    def texels(self, reduced: bool) -> Tensor:
-        """The `light_texels` of its own textures, where others may take their place."""
-        return self._kept(False, reduced)
-
-    def fixed(self, reduced: bool) -> Tensor:
-        """The same in an atlas, where they may not."""
-        return self._kept(True, reduced)
-
-    def _kept(self, fixed: bool, reduced: bool) -> Tensor:
-        if (fixed, reduced) not in self._tables:
-            atlas = self.atlas if fixed else None
-            self._tables[fixed, reduced] = light_texels(self.textures_srgb, reduced, atlas)
-        return self._tables[fixed, reduced]
+    def texels(self, reduced: bool, fixed: bool) -> Tensor:
+        """The `light_texels` of its own textures: `fixed` in their atlas, else where others may take their place."""
+        if (reduced, fixed) not in self._tables:
+            self._tables[reduced, fixed] = light_texels(self.textures_srgb, reduced, self.atlas if fixed else None)
+        return self._tables[reduced, fixed]
 
     @cached_property
     def _tables(self) -> dict[tuple[bool, bool], Tensor]:

@@ -103,7 +103,7 @@ class Views:
         """The light P×3 of the object's fragments."""
         pixels, reflected = self.on_object, self.on_object.color
         if pixels.texels is not None:
-            table = self.stage.object_surface.texels(self.reduced) if texels is None else texels
+            table = self.stage.object_surface.texels(self.reduced, fixed=False) if texels is None else texels
             reflected = look_up(pixels.texels, table) * reflected
         return reflected * self._irradiance(pixels)
 
@@ -196,7 +196,7 @@ def see(
         needs_position = light.lamp is not None or light.gloss is not None
         parts = piece_pixels(stage.piece_surface, piece, own, hidden, look, needs_position)
     if not scene.LEARNED and not isinstance(shown, ObjectTextures):
-        fixed = surface.fixed(_reduced(stage, size_px))
+        fixed = surface.texels(_reduced(stage, size_px), fixed=True)
     return Views(
         stage,
         conditions,
