@@ -152,6 +152,8 @@ _IN_PLACE: dict[Callable[..., Any], Callable[..., Any]] = {
 }
 _CONVOLUTIONS = (_ATEN.conv2d.default, _ATEN.convolution.default)
 _MADE_ANEW = {*_CONVOLUTIONS, _ATEN.conv2d.padding, _ATEN.batch_norm.default, _ATEN.add.Tensor}
-_BY_BLOCKS = {convolution: _told_apart(convolution) for convolution in _CONVOLUTIONS}
+_BY_BLOCKS: dict[Callable[..., Any], Callable[..., Any]] = {
+    convolution: _told_apart(convolution) for convolution in _CONVOLUTIONS
+}
 _PADS = (_ATEN.pad.default, _ATEN.constant_pad_nd.default)
 _CONVOLUTION_DEFAULTS = [None, [1, 1], [0, 0], [1, 1]]  # bias, stride, padding, distance between taps
