@@ -140,3 +140,17 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
         later = patterns.drawn_texture(rng, 32)
         drawn = rng.bit_generator.state
         assert np.array_equal(later(), later()) and rng.bit_generator.state == drawn
+
+
+def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch):
+    places = [module.place(number) for number in range(0, 40, 2)]
+    monkeypatch.setattr(module, "_passing", lambda aim, ends: np.arange(aim.shape[1]))
+    assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 80, 800])
+@pytest.mark.parametrize("px", [30, 64])
+def test_pixels_have_their_nearest_point_whether_it_was_asked_for_or_not(count, px):
+    points = np.random.default_rng(count).random((count, 2)) * px
+    far = np.linalg.norm(np.argwhere(np.ones((px, px)))[:, None] - points, axis=2)
+    assert np.array_equal(patterns._nearest(points, px).ravel(), far.argmin(1))

@@ -103,9 +103,8 @@ def _placed(
     corners, whole = (first % where.pitch, first // where.pitch), (where.pitch, height)
     finest, levels = texture * (len(first) // len(where.levels)), where.levels.index_select(0, texture)
     sides = [(right.contiguous(), down.contiguous()) for right, down in zip(uv_dx.T, uv_dy.T, strict=True)]
-    x, y = (
-        [side * size.float().index_select(0, finest) for side in pair] for pair, size in zip(sides, sizes, strict=True)
-    )
+    extents = (size.float().index_select(0, finest) for size in sizes)
+    x, y = ([side * extent for side in pair] for pair, extent in zip(sides, extents, strict=True))
     across, down = ((a * a + b * b).sqrt() for a, b in zip(x, y, strict=True))
     level, counts = tap_grids(across, down, levels, taps)
     assert counts is not None

@@ -36,10 +36,11 @@ def _room(rng: np.random.Generator, px: int) -> np.ndarray:
     if rng.random() < 0.7:
         planes += [(2, rng.uniform(1.5, 6)), (0, -rng.uniform(1.2, 6)), (0, rng.uniform(1.2, 6))]
     everywhere, slope = np.arange(ray.shape[1]), np.where(np.abs(ray) < 1e-9, np.float32(1e-9), ray)
+    aim = ray[:2] / slope[2]
     for axis, at in planes:
         _put(rng, picture, depth, ray, everywhere, at / slope[axis], axis)
     for _ in range(int(rng.integers(2, 12))):
-        _put_box(rng, picture, depth, ray, slope)
+        _put_box(rng, picture, depth, ray, slope, aim)
     light = rng.normal(size=3).astype(np.float32) * rng.uniform(0, 0.35) / 3
     picture *= np.clip(1 + np.ascontiguousarray(np.clip(ray * np.minimum(depth, 5), -5, 5).T) @ light, 0.25, 1.8)[
         :, None
@@ -81,14 +82,23 @@ def _put(rng, picture, depth, ray, where, far, axis) -> None:
     depth[where] = far
 
 
-def _put_box(rng, picture, depth, ray, slope) -> None:
+def _put_box(rng, picture, depth, ray, slope, aim) -> None:
     """A box on the floor: it shows where a ray enters the last of its three slabs before it leaves the first."""
     size = np.exp(rng.uniform(-2.3, 0.3, 3))
     low = np.array([rng.uniform(-3, 3), -1.0, rng.uniform(1.2, 5)])
-    ends = np.stack([low, low + size]).astype(np.float32)[..., None] / slope
-    enter, leave = np.minimum(*ends), np.maximum(*ends)
+    ends = np.stack([low, low + size])
+    near = _passing(aim, ends)
+    slabs = ends.astype(np.float32)[..., None] / slope[:, near]
+    enter, leave = np.minimum(*slabs), np.maximum(*slabs)
     hit = np.flatnonzero(enter.max(0) < leave.min(0))
     face = enter[:, hit].argmax(0)
     for axis in range(3):
         on = hit[face == axis]
-        _put(rng, picture, depth, ray, on, enter[axis, on], axis)
+        _put(rng, picture, depth, ray, near[on], enter[axis, on], axis)
+
+
+def _passing(aim: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Which rays, by where they are one unit ahead (2×P²), may meet a box ahead that lies between two points 2×3."""
+    at = ends[:, :2, None] / ends[:, 2]
+    low, high = at.min((0, 2)) - 1e-3, at.max((0, 2)) + 1e-3
+    return np.flatnonzero(((aim > low[:, None]) & (aim < high[:, None])).all(0))
