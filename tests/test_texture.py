@@ -8,7 +8,7 @@ import time
 import pytest
 import torch
 
-from patchproof.render.pixels import DESIGN_TAPS
+from patchproof.render.pixels import PHOTOGRAPHED
 from patchproof.render.texture import footprint, layout, look_up, texel_table
 from tolerances import FLOAT32
 
@@ -91,7 +91,7 @@ def test_blocks_are_averaged_exactly_where_the_pixel_is_upright(size):
         shares.append((torch.minimum(high, edge + 1) - torch.maximum(low, edge)).clamp_min(0) / size[axis])
     expected = torch.einsum("px,py,yxc->pc", *shares, texture)
     per = torch.tensor([[size[0] / 30, 0.0]]), torch.tensor([[0.0, size[1] / 20]])
-    seen = look(texture, middle / torch.tensor([30, 20]), *per, taps=DESIGN_TAPS, blocks=True)
+    seen = look(texture, middle / torch.tensor([30, 20]), *per, taps=PHOTOGRAPHED.piece_taps, blocks=True)
     torch.testing.assert_close(seen, expected, atol=1e-5, rtol=0)
 
 
@@ -205,7 +205,7 @@ def test_a_footprint_is_the_mean_of_16_by_16_samples(scale, tilt_deg):
         for texture, least in zip(pictures(), (33, 45 if longest <= 16 else 37), strict=True):
             if not as_blocks and least == 33 and 0.5 < scale <= 1:
                 least = 25
-            seen = look(texture, uv, dx, dy, wrap=True, taps=DESIGN_TAPS, blocks=as_blocks)
+            seen = look(texture, uv, dx, dy, wrap=True, taps=PHOTOGRAPHED.piece_taps, blocks=as_blocks)
             assert loss_db(seen, sampled(texture, samples).view(256, 300, 3).mean(0)) > least
 
 

@@ -20,7 +20,7 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
 from patchproof.render.photograph import expose, photograph, shade, windows_of
-from patchproof.render.pixels import Look, ObjectTextures, PiecePicture
+from patchproof.render.pixels import PHOTOGRAPHED, ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import apart, relit, see, seen_again
@@ -175,7 +175,7 @@ def test_views_seen_together_come_apart_as_if_each_had_been_seen_alone(tmp_path,
     trimesh.creation.icosphere(2, 150).export(tmp_path / "ball.ply")
     scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"), tables=tables)
     conditions = posed(scene, 5, azimuth_deg=[-60, -20, 110, 180, 30], distance_mm=900)
-    stage, look = set_stage(scene), Look(taps, 1.0)
+    stage, look = set_stage(scene), replace(PHOTOGRAPHED, taps=taps)
     together = see(stage, WHITE, conditions, (64, 64), look)
     assert len(together.on_piece.back_pixel)
     for sizes in ([1] * 5, [2, 2, 1], [1, 4]):
@@ -476,7 +476,7 @@ def test_more_taps_of_an_object_s_texture_bring_views_nearer_to_reduced_photogra
     reduced = avg_pool2d(photograph(stage, None, conditions, (768, 768), jpeg=False), 4)
     off = {}
     for taps in (1, 2, 4):
-        view = expose(see(stage, None, conditions, (192, 192), Look(taps, 1.0)), None, jpeg=False)
+        view = expose(see(stage, None, conditions, (192, 192), replace(PHOTOGRAPHED, taps=taps)), None, jpeg=False)
         off[taps] = float(((view - reduced) ** 2).mean().sqrt())
     assert off[4] < off[2] < 0.8 * off[1], off
     problem = set_problem(scene)

@@ -7,6 +7,7 @@ averaged over, taps and what is shown: means over conditions that `views.py` doe
 
 import csv
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import patchproof as pp
@@ -15,7 +16,6 @@ from patchproof.optimizer import problem as problems
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.responses import in_a_row, responses
-from patchproof.render.pixels import Look
 
 N, SEED = 120, 81
 LOOKS = [
@@ -36,7 +36,7 @@ def measured(name: str) -> list[dict]:
     each = [responses(problem, shown, conditions[i : i + 1], photo_px) for i in range(N)]
     photographs, rows = {thing: in_a_row([answers[thing] for answers in each]) for thing in shown}, []
     for scale, side, taps in LOOKS:
-        problems.FIGURE_SCALE, problems.FIGURED = scale, Look(taps, side)
+        problems.FIGURE_SCALE, problems.FIGURED = scale, replace(problems.FIGURED, taps=taps, side=side)
         views = responses(problem, shown, conditions)
         for thing in shown:
             off = student_mean(views[thing].confidence[0] - photographs[thing].confidence[0])

@@ -20,25 +20,24 @@ from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface
 from patchproof.render.texture import Footprint, footprint, layout, texel_table
 
-# Taps along the shorter side of a pixel's footprint. Eight leave 38 dB and more against 16×16 samples per pixel for
-# optimized designs 20 to 200 px wide, four 30.
-DESIGN_TAPS = 8
 LEAST_SHARE = 1 / 512  # of a pixel: less moves no 8-bit value
 
 
 @dataclass(frozen=True)
 class Look:
-    """How pixels look at textures: each over `side` of its own width and height, at the object's in so many `taps`
-    along its footprint's shorter side.
+    """How pixels look at textures: each over `side` of its own width and height, in so many `taps` along its
+    footprint's shorter side at the object's, and in so many `piece_taps` at the printed piece.
     """
 
     taps: int
     side: float
+    piece_taps: int
 
 
 # Four taps leave an object's own texture within 0.003 of the confidence that a network has with eight (60 photographs
-# of a textured car), one within 0.073.
-PHOTOGRAPHED = Look(taps=4, side=1.0)
+# of a textured car), one within 0.073. At pieces eight leave 38 dB and more against 16×16 samples per pixel for
+# optimized designs 20 to 200 px wide, four 30.
+PHOTOGRAPHED = Look(taps=4, side=1.0, piece_taps=8)
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def piece_pixels(
         kept.pixel,
         kept.view,
         share.index_select(0, front)[:, None],
-        _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size),
+        _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size, look.piece_taps),
         torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
         position,
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
@@ -190,10 +189,10 @@ def _boxes(pixel: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
     return torch.cat([torch.minimum(low, high), high], 1).cpu().numpy()
 
 
-def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor) -> Footprint:
+def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tensor, taps: int) -> Footprint:
     """Which texels of the piece's picture are seen; `at` P×2 from 0 to 1 across the piece."""
     where, texture = layout([piece.size_px], wrap=False, device=at.device), at.new_zeros(len(at), dtype=torch.long)
-    return footprint(where, texture, at, at_dx, at_dy, taps=DESIGN_TAPS, blocks=True)
+    return footprint(where, texture, at, at_dx, at_dy, taps=taps, blocks=True)
 
 
 def object_pixels(
