@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from archives import LABELS, ConvNeXt, Hostile, ResNet, Small, ViT, exported, save, seeded
-from patchproof.classifier import center_square, graph, load_classifier, program, rewritten
+from patchproof.classifier import center_square, graph, load_classifier, program
 from patchproof.classifier.program import load_program
 from patchproof.strict import Refused
 
@@ -471,39 +471,3 @@ def test_zeros_around_a_picture_are_a_convolutions_own_where_it_can_say_so(decom
     assert len([name for name in kept if "reflection" not in name]) == 5 - decomposed, kept
     for ours, theirs in zip(answered(network, photos), answered(module, photos), strict=True):
         torch.testing.assert_close(ours, theirs)
-
-
-class Points(torch.nn.Module):
-    """Convolutions of 1×1 in every way."""
-
-    def __init__(self):
-        super().__init__()
-        ways = [{}, {"stride": 2}, {"padding": (1, 2)}, {"dilation": 3}, {"groups": 2}, {"bias": False}]
-        self.convs = torch.nn.ModuleList(torch.nn.Conv2d(4, 512, 1, **way) for way in ways)
-        self.few, self.back = torch.nn.Conv2d(4, 2, 1), torch.nn.ConvTranspose2d(4, 512, 1, stride=2)
-        self.first = torch.nn.Conv2d(3, 4, 3, padding=1)
-
-    def forward(self, x):
-        x = self.first(x).relu()
-        found = [conv(x)[:, :4] for conv in (*self.convs, self.back)]
-        return (
-            torch.stack([values.square().mean((2, 3)) for values in found]).sum(0) + self.few(x).sum((1, 2, 3))[:, None]
-        )
-
-
-@pytest.mark.parametrize("decomposed", [False, True])
-def test_products_of_points_are_the_same_by_another_library(decomposed, tmp_path, honest, monkeypatch):
-    module, photos = seeded(Points()), torch.randn(2, 3, 16, 16).contiguous(memory_format=torch.channels_last)
-    form = exported(module)
-    if decomposed:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns of itself
-            form = form.run_decompositions()
-    network = load_program(save(tmp_path, form)).network.network
-    assert [step.compute.__name__ for step in network.steps].count("by_blocks") == 7 + decomposed
-    module.double()
-    whole = answered(module, photos.double())
-    for much in (0, rewritten._MUCH):
-        monkeypatch.setattr(rewritten, "_MUCH", much)
-        for ours, theirs in zip(answered(network, photos), whole, strict=True):
-            torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=1e-5 * float(theirs.abs().max()))

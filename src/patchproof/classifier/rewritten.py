@@ -1,8 +1,7 @@
 """The same steps with fewer copies: on a CPU they are what a small network's time goes into.
 
-In: a program's steps and weights. Out: steps that compute the same, gradients too, to the bit where values are finite,
-but for products of 1×1, which round otherwise. Figures are of four pictures of 224 px on one core, torch 2.13, November
-2026.
+In: a program's steps and weights. Out: steps that compute the same, gradients too, to the bit where values are finite.
+Figures are of four pictures of 224 px on one core, torch 2.13, November 2026.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ _ATEN = torch.ops.aten
 
 def rewritten(steps: list[Step], weights: Sequence[Tensor]) -> list[Step]:
     """Steps that make the same of the same pictures; the first values are the weights."""
-    return _by_blocks(_written_over(_padded_within(steps, weights)), weights)
+    return _written_over(_padded_within(steps, weights))
 
 
 def _written_over(steps: list[Step]) -> list[Step]:
@@ -58,62 +57,27 @@ def _with_padding(step: Step, pad: Step, weights: Sequence[Tensor]) -> list[Step
     if pad.compute not in _PADS or step.compute not in _CONVOLUTIONS or pad.keywords or step.keywords:
         return None
     (made,), (photos, sides, *filled) = pad.results, pad.arguments
-    arguments = _complete(step)
-    here, weight, bias, stride, own, apart, *others = arguments
+    arguments = [*step.arguments, *_CONVOLUTION_DEFAULTS[len(step.arguments) - 2 :]]
+    here, weight, bias, stride, own, *others = arguments
     zeros = all(item in ("constant", None, 0) for item in filled)
     counts = all(type(side) is int and side >= 0 for side in [*sides, *own])
     alone = here == Value(made) and made in step.spent and [*numbers_in(arguments)].count(made) == 1
     if not (zeros and counts and alone and (len(sides), len(own)) == (4, 2)) or (
-        step.compute is _ATEN.convolution.default and others[0]
+        step.compute is _ATEN.convolution.default and others[1]
     ):
         return None
     left, right, top, bottom = sides
     own = [own[0] + max(top, bottom), own[1] + max(left, right)]
     if (left, top) == (right, bottom):
         spent = [*pad.spent, *(number for number in step.spent if number != made)]
-        return [replace(step, arguments=[photos, weight, bias, stride, own, apart, *others], spent=spent)]
+        return [replace(step, arguments=[photos, weight, bias, stride, own, *others], spent=spent)]
     missing = [max(0, right - left), max(0, left - right), max(0, bottom - top), max(0, top - bottom)]
     of_one = type(weight) is Value and weight.number < len(weights) and weights[weight.number].shape[1:2] == (1,)
-    if not of_one or max(missing) > 1 or apart != [1, 1]:  # of more colors, zeros take longer
+    if not of_one or max(missing) > 1 or others[:1] not in ([], [[1, 1]]):  # of more colors, zeros take longer
         return None
     widened = replace(pad, arguments=[weight, missing], spent=[])
-    arguments = [photos, Value(made), bias, stride, own, apart, *others]
+    arguments = [photos, Value(made), bias, stride, own, *others]
     return [widened, replace(step, arguments=arguments, spent=[*pad.spent, *step.spent])]
-
-
-def _by_blocks(steps: list[Step], weights: Sequence[Tensor]) -> list[Step]:
-    """Convolutions of 1×1 go to the library that takes all others and, on several threads, these, too: MobileNetV2's
-    answers take 0.93 and its gradients 0.92 of the time.
-    """
-    points = {number for number, weight in enumerate(weights) if weight.shape[2:] == (1, 1)}
-    return [
-        replace(step, compute=_BY_BLOCKS[step.compute], arguments=_complete(step))
-        if step.compute in _BY_BLOCKS and not step.keywords and points.intersection(numbers_in(step.arguments[1:2]))
-        else step
-        for step in steps
-    ]
-
-
-def _complete(step: Step) -> list[Any]:
-    """A convolution's arguments: values, weight, bias, stride, padding, distance between taps, and others."""
-    return [*step.arguments, *_CONVOLUTION_DEFAULTS[len(step.arguments) - 2 :]]
-
-
-_MUCH = 10_000_000  # products: of half as many the other library's call alone costs a sixth, of twice as many it wins
-
-
-def _told_apart(convolution: Callable[..., Any]) -> Callable[..., Any]:
-    """With a distance between its taps: there is one, so that nothing changes but torch's choice, which takes longer
-    with little to do, and with colors one after the other.
-    """
-
-    def by_blocks(values: Tensor, weight: Tensor, bias: Any, stride: Any, pad: Any, apart: Any, *others: Any) -> Tensor:
-        much = values.is_cpu and values.numel() * len(weight) >= _MUCH
-        if much and values.is_contiguous(memory_format=torch.channels_last):
-            apart = [2, 2]
-        return convolution(values, weight, bias, stride, pad, apart, *others)
-
-    return by_blocks
 
 
 class _Clamped(torch.autograd.Function):
@@ -152,8 +116,5 @@ _IN_PLACE: dict[Callable[..., Any], Callable[..., Any]] = {
 }
 _CONVOLUTIONS = (_ATEN.conv2d.default, _ATEN.convolution.default)
 _MADE_ANEW = {*_CONVOLUTIONS, _ATEN.conv2d.padding, _ATEN.batch_norm.default, _ATEN.add.Tensor}
-_BY_BLOCKS: dict[Callable[..., Any], Callable[..., Any]] = {
-    convolution: _told_apart(convolution) for convolution in _CONVOLUTIONS
-}
 _PADS = (_ATEN.pad.default, _ATEN.constant_pad_nd.default)
-_CONVOLUTION_DEFAULTS = [None, [1, 1], [0, 0], [1, 1]]  # bias, stride, padding, distance between taps
+_CONVOLUTION_DEFAULTS = [None, [1, 1], [0, 0]]  # bias, stride, padding
