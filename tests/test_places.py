@@ -190,7 +190,7 @@ def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     screens = (places.PLACES + 3 * places.TURNED) * 2 * places.SCREEN_VIEWS + places.SCREEN_VIEWS
     drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
     assert screens + drafts <= default_passes() / 4 and default_passes() / 5 < place.passes <= default_passes() / 4
-    assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 100 + 3 * 50
+    assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
 
 
 def test_the_same_scene_gives_the_same_place(a_small_search):

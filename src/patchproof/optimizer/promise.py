@@ -6,7 +6,7 @@ and place. Out: the manifest's `Promise`. Controls are shown in some of each ses
 are paired: the bare object, and a mean-color, a gray and a noise design in the same printed markers. The set is drawn
 after the design is frozen. Where not all of it is asked for, a control is left out as soon as its difference is
 settled, and the promise stops as soon as none is left and the rate's interval is as narrow as asked: both are looked at
-after half and three quarters, and after one whether controls other than the best differ beyond doubt.
+after half and three quarters.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -29,19 +30,16 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import PieceScene, needs_piece
 from patchproof.sessions import difference_in_sessions, in_sessions, spread_of
-from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target, best_of
+from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 # Many short sessions: how much they differ is known from their number, not from their length.
 PROMISE_VIEWS, PER_SESSION = 400, 4
 CONTROL_VIEWS = 2  # of each session: of one, differences would be known to ± 6 to 10 points in place of 5 to 8
 CONTROLS = ("bare", "mean", "gray", "noise")
-# Where a promise may be looked at: a part of its sessions, and of a difference, in half widths of its interval, the
-# least that settles it there. Of 3,000 simulated controls as good as a design of 80 and 95 %, 6.0 and 4.0 % were told
-# from it, and 5.2 and 3.9 % if all were shown to the end; intervals of real differences held in 95.0 to 97.5 %. With
-# 1.25 after a quarter, too, 6.4 % were told, and a difference of 5 points held in 94.3 % (`python
-# tests/test_promise_stops.py`).
-SETTLED = {0.25: 2.0, 0.5: 1.25, 0.75: 1.25}
-LEAST_PART = 0.5  # of a promise, and of its best control
+# Of a difference, in half widths of its interval: the least that settles it before the end. Of 3,000 simulated controls
+# as good as a design of 80 and 95 %, 6.0 and 4.0 % were told from it, and 5.2 and 3.9 % if all were shown to the end;
+# intervals of real differences held in 95.7 to 97.1 % (`python tests/test_promise_stops.py`).
+SETTLED = 1.25
 
 
 def make_promise(
@@ -56,8 +54,7 @@ def make_promise(
     """Show the design in all conditions, `per_session` in a row of one session, and the controls in the first
     `CONTROL_VIEWS` of each; rate, interval and controls are those of the primary (first) network. With a `half_width`
     it stops after half or three quarters of the sessions, if the rate's interval is at most twice as wide there and
-    every control's difference is settled; else it goes on without those that are. After a quarter it does that without
-    those that are surely not the best.
+    every control's difference is settled; else it goes on without those that are.
     """
     shown = shown_with_controls(problem, design, controls)
     compared = _until_known(problem, shown, conditions, per_session, half_width, on_views)
@@ -92,22 +89,20 @@ def _until_known(
     `half_width`.
     """
     compared: dict[str, Answers] = {}
-    unsettled, first, total, goal = list(shown), 0, len(conditions), problem.scene.settings.target.goal
+    unsettled, looks = list(shown), [0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)
     with asking(problem, shown, conditions) as asked:
-        for last, part in ({total: 1} if half_width is None else _looks(total, per_session)).items():
-            on_part = partial(_counted, on_views, first, total)
+        for first, last in pairwise(looks):
+            on_part = partial(_counted, on_views, first, len(conditions))
             answers = asked(unsettled, np.arange(first, last), _with_controls(last - first, per_session), on_part)
-            compared, first = joined([compared, answers]) if compared else answers, last
-            if half_width is None or part == 1:
+            compared = joined([compared, answers]) if compared else answers
+            if half_width is None or last == len(conditions):
                 break
             claims = _beside_controls(compared, per_session)
-            kept = {best_of(claims, goal)} if part < LEAST_PART and claims else set()
-            settled = {kind for kind, claim in claims.items() if _settled(claim, half_width, SETTLED[part])}
-            unsettled = [kind for kind in unsettled if kind not in settled - kept]
+            settled = {kind for kind, claim in claims.items() if _settled(claim, half_width)}
+            unsettled = [kind for kind in unsettled if kind not in settled]
             places = _places(conditions[:last], per_session)
             counts = in_sessions(compared["design"].recognized[0], per_session, places)
-            known = part >= LEAST_PART and np.ptp(spread_of(*counts).rate) <= 2 * half_width
-            if known and unsettled == ["design"]:
+            if unsettled == ["design"] and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
                 on_views(last, last)  # a bar that stays at half would look broken
                 break
     return compared
@@ -125,29 +120,28 @@ def _beside_controls(compared: Mapping[str, Answers], per_session: int) -> dict[
     return control_claims({**compared, "design": paired}, 0, min(CONTROL_VIEWS, per_session))
 
 
-def _settled(claim: ControlClaim, half_width: float, surely: float) -> bool:
+def _settled(claim: ControlClaim, half_width: float) -> bool:
     """Whether a control's difference is known as well as the rate has to be, or so surely not zero that looking before
     the end leaves its interval what it says.
     """
     half = np.ptp(claim.difference_interval) / 2
-    return bool(half <= half_width or abs(claim.difference) >= surely * half)
+    return bool(half <= half_width or abs(claim.difference) >= SETTLED * half)
 
 
-def _looks(total: int, per_session: int) -> dict[int, float]:
-    """After how many conditions a promise is looked at, and which part of it they are. Of 1,000 simulated promises
-    each, of rates from 85 to 99 % to ± 4 points, the intervals of those that could stop after half and three quarters
-    held in 93.5 to 97.1 %, of full ones in 94.4 to 96.4 %; a first stop after two fifths, then one every fifth, saved 1
-    to 20 % more views, but held in 91.9 % of one kind (`python tests/test_promise_stops.py`).
+def _looks(total: int, per_session: int) -> list[int]:
+    """Where the parts of a promise begin and end that may stop between them. Of 1,000 simulated promises each, of rates
+    from 85 to 99 % to ± 4 points, the intervals of those that looked so held in 93.5 to 97.1 %, of full ones in 94.4 to
+    96.4 %; a first look after two fifths, then one every fifth, saved 1 to 20 % more views, but held in 91.9 % of one
+    kind (`python tests/test_promise_stops.py`).
     """
     sessions = math.ceil(total / per_session)
-    return {min(total, math.ceil(sessions * part) * per_session): part for part in (*SETTLED, 1)}
+    return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]
 
 
 def fewest_passes() -> int:
     """Pictures that a network sees in a promise that stops as early as it may."""
-    after = {part: views for views, part in _looks(PROMISE_VIEWS, PER_SESSION).items()}
-    best, others = (int(_with_controls(after[part], PER_SESSION).sum()) for part in (LEAST_PART, min(SETTLED)))
-    return after[LEAST_PART] + best + (len(CONTROLS) - 1) * others
+    views = _looks(PROMISE_VIEWS, PER_SESSION)[1]
+    return views + len(CONTROLS) * int(_with_controls(views, PER_SESSION).sum())
 
 
 def _counted(on_views: Callable[[int, int], None], before: int, total: int, done: int, _: int) -> None:

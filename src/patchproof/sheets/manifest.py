@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -141,11 +140,6 @@ class ControlClaim(Strict):
     difference_interval: SignedInterval
 
 
-def best_of(controls: Mapping[str, ControlClaim], goal: Goal) -> str:
-    """The control that is hardest to beat."""
-    return max(controls, key=lambda name: goal.sign * controls[name].rate)
-
-
 class ConditionClaim(Strict):
     """What a photograph can show of one promised condition, and whether it was recognized."""
 
@@ -193,7 +187,7 @@ class Promise(Strict):
     @property
     def best_control(self) -> str:
         """The control that is hardest to beat."""
-        return best_of(self.controls, self.target.goal)
+        return max(self.controls, key=lambda name: self.target.goal.sign * self.controls[name].rate)
 
     @property
     def worth(self) -> Worth:
