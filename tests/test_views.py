@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 from conftest import SCENE
 from patchproof import geometry
 from patchproof.channel.lens import distort_points
-from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.problem import FIGURED, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
 from patchproof.render.photograph import expose, photograph, shade, windows_of
@@ -493,3 +493,17 @@ def test_fixed_textures_are_held_once(tmp_path):
         for size in ((96, 96), (800, 600)):
             photograph(stage, shown, scene.draw("promise", 1), size)
     assert {fixed for _, fixed in stage.object._tables} == {True}
+
+
+def test_figures_look_at_a_piece_in_fewer_taps_than_photographs_and_see_nearly_the_same(tmp_path):
+    problem = set_problem(scene_of(tmp_path))
+    generator = torch.Generator().manual_seed(2)
+    shown = PiecePicture.of(torch.rand(400, 400, 3, generator=generator))  # finer than any print: the worst case
+    conditions, side = problem.scene.draw("promise", 2), (problem.figure_px,) * 2
+    looks = FIGURED, replace(FIGURED, piece_taps=PHOTOGRAPHED.piece_taps)
+    few, many = (see(problem.stage, shown, conditions, side, look) for look in looks)
+    of_few, of_many = (sum(group.weight.numel() for group in views.on_piece.texels.groups) for views in (few, many))
+    assert of_few < 0.6 * of_many
+    own = problem.see(shown, conditions, problem.figure_px).on_piece.texels
+    assert sum(group.weight.numel() for group in own.groups) == of_few
+    assert float((expose(few, shown) - expose(many, shown)).square().mean().sqrt()) < 0.01
