@@ -416,6 +416,15 @@ def test_figures_of_views_are_the_stored_ones():
         assert f"| {sizes} | {off} | {rates.replace('%', ' %')} |" in page
 
 
+def test_figures_of_fewer_taps_at_a_piece_are_the_stored_ones():
+    rows = [row for row in rows_of("views/taps.csv") if int(row["taps"]) == FIGURED.piece_taps]
+    assert [row["scene"] for row in rows] == ["suv", "postbox", "carton", "truck"]
+    assert max(abs(float(row["mean"])) for row in rows) < 0.0004 and max(float(row["rms"]) for row in rows) < 0.004
+    for told in ([f"{float(row['mean']):+.4f}" for row in rows], [f"{float(row['rms']):.3f}" for row in rows]):
+        assert f"{', '.join(told[:3])} and {told[3]} in the" in words(NOTEBOOK)
+    assert "{}, {}, {} and {} of them change sides".format(*(row["other"] for row in rows)) in words(NOTEBOOK)
+
+
 def test_looks_of_views_are_the_stored_ones():
     off, page = {}, words(NOTEBOOK)
     for row in rows_of("views/looks.csv"):

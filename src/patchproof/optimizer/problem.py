@@ -39,7 +39,7 @@ from patchproof.workers import threads
 # Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
 # no less than so many pixels, since each of them takes one sample. Averaging textures over eight tenths of a pixel
 # leaves them as sharp; of a piece four taps leave confidences within 0.004 (root mean square) of those of eight, and
-# their mean within 0.0005. Training's views are of the network's own side, but for small networks.
+# their mean within 0.0004. Training's views are of the network's own side, but for small networks.
 FIGURE_SCALE, LEAST_PX, SMALL_PX = 1.4, 128, 192
 TRAINED, FIGURED = Look(taps=1, side=1.0, piece_taps=8), Look(taps=2, side=0.8, piece_taps=4)
 

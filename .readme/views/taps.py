@@ -1,0 +1,49 @@
+"""What fewer taps at a piece change in the views that figures come from.
+
+In: scene files. Out: lines of `taps.csv`, by scene and taps along a pixel's shorter side: confidences of 200 views of a
+design less those with as many taps as photographs have, as mean and root mean square, and views that change sides. One
+design each. Run in this folder: python taps.py suv postbox carton truck
+"""
+
+import csv
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import patchproof as pp
+from patchproof.optimizer import problem as problems
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.responses import responses
+from patchproof.render.pixels import PHOTOGRAPHED
+
+N, TAPS = 200, (6, 4, 3, 2)
+
+
+def measured(name: str) -> list[dict]:
+    """The lines of one scene."""
+    problem, look, told = problems.set_problem(pp.load_scene(f"{name}.toml")), problems.FIGURED, {}
+    shown = {"design": problem.subject.shown(from_pixels(best_design(problem), problem.device), "design")}
+    conditions = problem.scene.draw("promise", N, per_session=4)
+    for taps in (PHOTOGRAPHED.piece_taps, *TAPS):
+        problems.FIGURED = replace(look, piece_taps=taps)
+        told[taps] = responses(problem, shown, conditions)["design"]
+    problems.FIGURED, rows, many = look, [], told[PHOTOGRAPHED.piece_taps]
+    for taps in TAPS:
+        off, other = (told[taps].confidence - many.confidence)[0], told[taps].recognized != many.recognized
+        figures = {"mean": off.mean(), "rms": np.sqrt((off**2).mean())}
+        row = {"scene": name, "taps": taps, **{key: f"{value:.5f}" for key, value in figures.items()}}
+        rows.append(row | {"other": int(other.sum())})
+    return rows
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        rows, new = measured(name), not Path("taps.csv").exists()
+        with open("taps.csv", "a", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            if new:
+                writer.writeheader()
+            writer.writerows(rows)
