@@ -49,7 +49,9 @@ def open_scene(base=".", mesh=None, seed=0, **changes):
 
 
 @pytest.fixture(autouse=True)
-def few_views_for_the_size_of_markers(monkeypatch):
+def few_points_and_views(monkeypatch):
+    """Points that are tried, and views for the size of markers."""
+    monkeypatch.setattr("patchproof.scene.places._POOL", 40)
     monkeypatch.setattr("patchproof.scene.patch_scene.SCALE_VIEWS", 32)
 
 
@@ -104,6 +106,7 @@ def test_the_place_is_where_the_network_looks():
 
 def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
     monkeypatch.setattr(places, "PLACES", 8)
+    monkeypatch.setattr(places, "PASSES", 0)
     scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
     assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
 

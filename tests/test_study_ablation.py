@@ -48,7 +48,7 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
 
 def test_an_effect_that_takes_time_costs_a_share_of_a_step(problem, monkeypatch):
     slow = ablation.Without.see
-    monkeypatch.setattr(ablation.Without, "see", lambda *a: (time.sleep(1), slow(*a))[1])
+    monkeypatch.setattr(ablation.Without, "see", lambda *a: (time.sleep(0.3), slow(*a))[1])
     monkeypatch.setattr(plan_cost, "REPEATS", 1)
     costs = ablation._costs(problem, ["noise"])
     assert list(costs) == ["noise"] and costs["noise"] < -0.5  # without it, a step takes seconds longer

@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,9 +47,6 @@ from patchproof.study.grid import Count, Names, Seeds, cell_of, grouped, of_valu
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
-
-if TYPE_CHECKING:
-    pass
 
 KINDS = ("bare", "gray", "noise", "patch")
 OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target

@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -47,9 +47,6 @@ from patchproof.study.grid import Count, GridSettings, Seeds, cell_of, grouped, 
 from patchproof.study.pictures import contact_sheet, enlarged, photographs
 from patchproof.study.record import Record, hits_of, recorded
 from patchproof.study.study import Cell, Result, Study
-
-if TYPE_CHECKING:
-    pass
 
 KINDS = ("bare", "gray", "noise", "2d", "3d")
 HARD = 0.2  # clean rate up to which an object counts as misread

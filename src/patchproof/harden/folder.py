@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -34,9 +34,6 @@ from patchproof.report.tables import Table
 from patchproof.strict import Positive, Refused, Share, Strict, expand
 from patchproof.study.grid import Count, Names, short_name
 from patchproof.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
-
-if TYPE_CHECKING:
-    pass
 
 Attack = Literal["fgsm", "pgd"]
 Condition = tuple[str, float]  # an attack and its ε

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,6 +24,7 @@ UNKNOWN_FOCAL = 0.5  # of its logarithm, where no file names one
 _TYPICAL_FOCAL = 0.7  # of the picture's diagonal, between a phone's 26 mm (0.6) and 35 mm (0.8)
 _FIRST_BEND = (0.02, 0.6)  # radians over half the sheet, least and most, from which fits start
 _ANY_BEND = [(bend, direction) for direction in np.radians([0, 45, 90, 135]) for bend in (-0.3, 0.3)]
+_STEP = np.finfo(float).eps ** 0.5  # of a parameter, as MINPACK takes it
 _LOST_PX = 1.0  # rms of a fit that ended in the wrong place, as 2 of 378 did, all of strong bends, before _ANY_BEND
 
 Project = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -61,17 +63,20 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CO
     focal = focal_px or _TYPICAL_FOCAL * np.hypot(*size)
 
     def project(p, points):
-        # p: rotation vector, the page center in the camera (mm), log of focal / guess, bend, direction of the bend
-        camera = Rotation.from_rotvec(p[:3]).apply(in_space(p, points)[0]) + p[3:6]
-        return focal * np.exp(p[6]) * camera[:, :2] / np.maximum(camera[:, 2:], 1e-3) + middle
+        # p: rotation vector, the page center in the camera (mm), log of focal / guess, bend, direction of the bend; of
+        # several, one to a row
+        turned = np.swapaxes(Rotation.from_rotvec(p[..., :3]).as_matrix(), -1, -2)
+        camera = in_space(p, points)[0] @ turned + p[..., None, 3:6]
+        return focal * np.exp(p[..., 6, None, None]) * camera[..., :2] / np.maximum(camera[..., 2:], 1e-3) + middle
 
     def in_space(p, points):
-        c, s = np.cos(p[8]), np.sin(p[8])
-        x, y = ((points - center) @ [[c, -s], [s, c]]).T  # along the bend, along the rulings
-        turn = p[7] * x / reach
+        c, s = np.cos(p[..., 8:]), np.sin(p[..., 8:])
+        right, down = (points - center).T
+        x, y = c * right + s * down, c * down - s * right  # along the bend, along the rulings
+        turn = p[..., 7:8] * x / reach
         across = x * np.sinc(turn / np.pi)
         depth = x * np.sinc(turn / 2 / np.pi) * np.sin(turn / 2)  # (1 - cos t) / t, without its hole at 0
-        return np.column_stack([c * across - s * y, s * across + c * y, depth]), turn
+        return np.stack([c * across - s * y, s * across + c * y, depth], -1), turn
 
     def tangent(p, point, turned_rad):
         (place,), (turn,) = in_space(p, np.asarray(point, float)[None])
@@ -88,14 +93,24 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CO
     pose = plane_pose(flat @ np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1.0]]), matrix)
     begin = [*Rotation.from_matrix(pose[:3, :3]).as_rotvec(), *pose[:3, 3], 0.0]
     prior = CORNER_NOISE_PX / (UNKNOWN_FOCAL if focal_px is None else focal_spread)
-    rows = lambda p: np.append((project(p, mm) - px).ravel(), prior * p[6])  # noqa: E731
+
+    def rows(p):
+        off = (project(p, mm) - px).reshape(*p.shape[:-1], -1)
+        return np.concatenate([off, prior * p[..., 6:7]], -1)
+
+    def slopes(p):
+        steps = _STEP * np.where(p == 0, 1, np.abs(p))
+        here, *beside = rows(np.stack([p, *(p + np.diag(steps))]))  # together: few points cost no more than one
+        return ((beside - here) / steps[:, None]).T
+
     fits = []
     for starts in (_starts(flat, mm, px, matrix @ pose[:3], center, reach), _ANY_BEND):
         for bend, direction in starts:
             start = np.array([*begin, bend, direction])
             # how far each parameter may be off, about
             scales = np.array([0.1, 0.1, 0.1, *[0.05 * max(abs(start[5]), 1.0)] * 3, 0.2, 0.2, 0.5])
-            fits.append(least_squares(rows, start, x_scale=scales, max_nfev=40, method="lm"))
+            jac = cast(Any, slopes)  # of which scipy's signature names only the words
+            fits.append(least_squares(rows, start, jac, x_scale=scales, max_nfev=40, method="lm"))
         best = min(fits, key=lambda fit: fit.cost)
         if rms(best.fun) < _LOST_PX:
             break

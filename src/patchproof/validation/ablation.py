@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -39,9 +39,6 @@ from patchproof.strict import Refused
 from patchproof.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
 from patchproof.study.record import Record, recorded
 from patchproof.study.study import Cell, Result, Study
-
-if TYPE_CHECKING:
-    pass
 
 ALL = "all"
 # What goes together, because alone it is too little to tell.
