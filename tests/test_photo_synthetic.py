@@ -164,9 +164,9 @@ def test_the_hand_made_page_lies_where_its_homography_says(azimuth):
     assert center == pytest.approx([600.0, 450.0], abs=1e-6)
 
 
-def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=2, blur_px=0.6, seed=0):
+def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=3, blur_px=0.6, seed=0):
     """uint8 sRGB photo of the piece rolled round an upright cylinder that touches the page's plane at the design's
-    center: each ray of 2×2 per pixel is met with the cylinder, so nothing of the tool's own model is used.
+    center: each ray of 3×3 per pixel is met with the cylinder, so nothing of the tool's own model is used.
     """
     center, radius = np.array(DESIGN_MM[:2]) + np.array(DESIGN_MM[2:]) / 2, 1 / curvature
     width, height = size_px

@@ -143,7 +143,7 @@ def test_an_uncut_page_is_not_counted_however_it_curls(radius_mm, monkeypatch):
     whole = page_raster(manifest, only_piece=False)
     with monkeypatch.context() as patch:
         patch.setattr(test_photo_synthetic, "CUT_MM", (0.0, 0.0, *test_photo_synthetic.PAGE_MM))
-        photo = curled_photograph(whole, pose(), MATRIX, 1 / radius_mm)
+        photo = curled_photograph(whole, pose(), MATRIX, 1 / radius_mm, fine=2)
     assert not measured(photo).counted
-    piece = curled_photograph(page_raster(manifest, only_piece=True), pose(), MATRIX, 1 / radius_mm)
+    piece = curled_photograph(page_raster(manifest, only_piece=True), pose(), MATRIX, 1 / radius_mm, fine=2)
     assert measured(piece).counted
