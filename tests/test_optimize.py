@@ -365,6 +365,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatc
     of the five poses a process keeps.
     """
     monkeypatch.setattr(loop, "POSES", 5)
+    monkeypatch.setattr("patchproof.scene.places._POOL", 12)
     monkeypatch.setattr(places, "PLACES", 3)
     monkeypatch.setattr(places, "PASSES", 0)
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")

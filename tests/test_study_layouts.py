@@ -43,6 +43,7 @@ def test_a_layout_reserves_what_it_says(scene):
 
 def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
+    monkeypatch.setattr("patchproof.scene.places._POOL", 12)
     monkeypatch.setattr(places, "PLACES", 3)
     monkeypatch.setattr(places, "PASSES", 0)  # the shortest drafts: which place is chosen is tested elsewhere
     (tmp_path / "scene.toml").write_text(
