@@ -336,6 +336,18 @@ def test_figures_of_windows_are_the_stored_ones():
             assert f"| {name} | {asked} | {' | '.join(ratios)} |" in words(NOTEBOOK)
 
 
+def test_figures_of_half_precision_are_the_stored_ones():
+    rows = rows_of("speed/half.csv")
+    told = dict(zip(("suv", "postbox", "carton", "truck"), ("SUV", "letter box", "carton", "truck"), strict=True))
+    assert [row["scene"] for row in rows[::2]] == [*told] and all(float(row["mean"]) < 0 for row in rows)
+    for pair in zip(rows[::2], rows[1::2], strict=True):
+        cells = [told[pair[0]["scene"]], f"{float(pair[0]['share']):.2f}"]
+        for row in pair:
+            rates = (f"{100 * float(row[name]):.1f}" for name in ("rate", "half_rate"))
+            cells += [f"{float(row['mean']):.3f}, {float(row['rms']):.3f}", row["other"], " and ".join(rates)]
+        assert f"| {' | '.join(cells)} |" in words(NOTEBOOK)
+
+
 def test_figures_of_selections_are_the_stored_ones():
     rows = rows_of("speed/selections.csv")
     kept = sum(row["all_best"] == row["half_best"] == "960" for row in rows)
