@@ -13,9 +13,10 @@ import torch
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.color import ciede2000, lab_from_linear, linear_from_srgb
+from patchproof.evidence.classify import square_of
 from patchproof.evidence.ledger import _ledger, shapley
 from patchproof.evidence.print_fit import LEAST_CELLS, fit_print
-from patchproof.evidence.reproject import Shot, deblurred, light_fit, shot_of
+from patchproof.evidence.reproject import Reference, Shot, deblurred, light_fit, shot_of, square_with, squares_with
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.surface import Promised, piece_picture, promised_of, surface_of
 from patchproof.evidence.task import Options
@@ -268,6 +269,25 @@ def test_the_piece_is_drawn_as_the_page_shows_it():
         page_raster(sheet(), True)[y : y + h, x : x + w], drawn.shape[1::-1], interpolation=cv2.INTER_AREA
     )
     assert np.abs(drawn - page).mean() < 0.02
+
+
+def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
+    """Of another print on the same sheet, in the photograph's own light and blur and in a promised condition's."""
+    surface, homography = surface_of(sheet()), view(15, 5, 300, size_px=SIZE)
+    taken, other, promised_one = (
+        photograph(raster(False, two), homography, SIZE, blur_px=blur_px, light=light)
+        for two, light, blur_px in ((False, 0.75, 0.8), (True, 0.75, 0.8), (True, 0.5, 0.3))
+    )
+    photo = measured(taken, manifest=sheet())
+    geometry, promised = photo.entry.geometry, promised_of(sheet(True), surface, identity_printer())
+    shot = shot_of("a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240)
+    drawn, fit = piece_picture(surface, promised.design, promised.ink), light_fit(shot, promised)
+    put = squares_with(shot, {(): drawn}, surface.piece_mm, fit, fit, Reference(0.5, 0.3, 0.0))
+    assert np.array_equal(put[True, True], square_with(shot, drawn, surface.piece_mm, fit))
+    for on, expected in ((True, other), (False, promised_one)):
+        assert (
+            np.abs(put[on, on] - square_of(expected)[0] / 255).mean() < 0.009
+        )  # the print that was taken is 0.036 off and more
 
 
 def test_blur_is_taken_back_as_far_as_noise_allows():
