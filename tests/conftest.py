@@ -34,6 +34,14 @@ def data() -> Path:
     return Path(folder)
 
 
+@pytest.fixture
+def a_small_search(monkeypatch):
+    """For a place: few points, few places, short drafts. For tests of files, not of choices."""
+    monkeypatch.setattr("patchproof.scene.places._POOL", 12)
+    for name, count in (("PLACES", 3), ("PASSES", 0), ("HELD_OUT_VIEWS", 4)):
+        monkeypatch.setattr(f"patchproof.optimizer.places.{name}", count)
+
+
 @pytest.fixture(scope="session")
 def torchvision():
     """torchvision; one that was built for CUDA lacks, beside a CPU torch, operators that no classifier needs."""

@@ -18,7 +18,7 @@ from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.raster import attached_manifest
 from patchproof.strict import shipped
 
-PHOTOS = 6
+PHOTOS = 8
 
 
 def command(*arguments) -> int:

@@ -17,7 +17,7 @@ from PIL import Image
 from patchproof.claims import wilson
 from patchproof.classifier.network import Classifier
 from patchproof.goal import Goal
-from patchproof.optimizer import loop, places, run
+from patchproof.optimizer import loop, run
 from patchproof.optimizer.goals import target_loss, total_variation
 from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -360,14 +360,11 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
 
 
 @pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
-def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, monkeypatch):
+def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_search, monkeypatch):
     """A step of 5 views, the selection, promise and controls, and the search for a place among three; nor does it what
     of the five poses a process keeps.
     """
     monkeypatch.setattr(loop, "POSES", 5)
-    monkeypatch.setattr("patchproof.scene.places._POOL", 12)
-    monkeypatch.setattr(places, "PLACES", 3)
-    monkeypatch.setattr(places, "PASSES", 0)
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with threads(1):

@@ -49,18 +49,13 @@ def open_scene(base=".", mesh=None, seed=0, **changes):
 
 
 @pytest.fixture(autouse=True)
-def few_points_and_views(monkeypatch):
-    """Points that are tried, and views for the size of markers."""
-    monkeypatch.setattr("patchproof.scene.places._POOL", 40)
+def few_views_for_the_size_of_markers(monkeypatch):
     monkeypatch.setattr("patchproof.scene.patch_scene.SCALE_VIEWS", 32)
 
 
 @pytest.fixture
-def a_small_search(monkeypatch):
-    """Few places and a short draft: for tests of files, not of choices."""
-    monkeypatch.setattr(places, "PLACES", 3)
-    monkeypatch.setattr(places, "PASSES", 0)
-    monkeypatch.setattr(places, "HELD_OUT_VIEWS", 4)
+def a_small_run(monkeypatch, a_small_search):
+    """Such a search, and a promise and pictures to match."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(place_files, "_SIDE_PX", 64)
 
@@ -106,7 +101,6 @@ def test_the_place_is_where_the_network_looks():
 
 def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
     monkeypatch.setattr(places, "PLACES", 8)
-    monkeypatch.setattr(places, "PASSES", 0)
     scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
     assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
 
@@ -258,7 +252,7 @@ def no_search(*_, **__):
     raise AssertionError("searched again")
 
 
-def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_path, monkeypatch, a_small_search):
+def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_path, monkeypatch, a_small_run):
     path, out = scene_file(tmp_path), tmp_path / "run"
     first = pp.optimize(path, out)
     place = read_place(out)
@@ -278,7 +272,7 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
         pp.optimize(scene_file(tmp_path), out, resume=True)
 
 
-def test_the_settings_of_a_run_are_a_scene_file_with_that_place(tmp_path, a_small_search):
+def test_the_settings_of_a_run_are_a_scene_file_with_that_place(tmp_path, a_small_run):
     chosen = pp.optimize(scene_file(tmp_path), tmp_path / "run")
     details = json.loads((tmp_path / "run" / "run.json").read_text())
     again = pp.make_scene(validated(SceneSettings, details["settings"], "run"), base=tmp_path)
@@ -310,7 +304,7 @@ def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
     assert {(253, 231, 37), (33, 145, 140), (68, 1, 84), (230, 0, 90)} <= shown
 
 
-def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_search):
+def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
     monkeypatch.setattr("patchproof.plan.plan.SELECT_VIEWS", 8)
     plan = measured_plan(*plan_geometry(scene_file(tmp_path)), timing=False, views=2)
     assert plan.place is not None and plan.surface.family == "card"

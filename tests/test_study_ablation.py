@@ -51,7 +51,7 @@ def test_an_effect_that_takes_time_costs_a_share_of_a_step(problem, monkeypatch)
     monkeypatch.setattr(ablation.Without, "see", lambda *a: (time.sleep(0.3), slow(*a))[1])
     monkeypatch.setattr(plan_cost, "REPEATS", 1)
     costs = ablation._costs(problem, ["noise"])
-    assert list(costs) == ["noise"] and costs["noise"] < -0.5  # without it, a step takes seconds longer
+    assert list(costs) == ["noise"] and costs["noise"] < -0.5  # without it, a step takes far longer
 
 
 @pytest.mark.parametrize(("effect", "says"), [("lamp", "with lamp in it"), ("smell", "this kind of scene has")])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from patchproof.optimizer import loop, places
+from patchproof.optimizer import loop
 from patchproof.scene.scene import make_scene, needs_patch
 from patchproof.sheets.piece import marker_image
 from patchproof.study.study import run_study
@@ -41,11 +41,8 @@ def test_a_layout_reserves_what_it_says(scene):
     assert laid_out(scene, Layout(size=0.7)).piece.marker_mm == pytest.approx(0.7 * scene.piece.marker_mm)
 
 
-def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch):
+def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch, a_small_search):
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
-    monkeypatch.setattr("patchproof.scene.places._POOL", 12)
-    monkeypatch.setattr(places, "PLACES", 3)
-    monkeypatch.setattr(places, "PASSES", 0)  # the shortest drafts: which place is chosen is tested elsewhere
     (tmp_path / "scene.toml").write_text(
         '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 120\nheight_mm = 120\n'
         '[target]\nlabel = "red"\nmodels = ["module:fake_networks.red_against_blue"]\n'

@@ -19,11 +19,11 @@ import patchproof as pp
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, _with_controls, shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.workers import keep_freed_memory
 
-N, PER_SESSION, ROUNDS = 400, 4, 3
+ROUNDS = 3
 asked = Classifier._asked
 
 
@@ -37,7 +37,8 @@ def measured(path: str) -> list[dict]:
     """The lines of one scene."""
     problem = set_problem(pp.load_scene(path))
     shown = shown_with_controls(problem, best_design(problem), CONTROLS)
-    conditions, beside = problem.scene.draw("promise", N, per_session=PER_SESSION), np.arange(N) % PER_SESSION < 2
+    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=PER_SESSION)
+    beside = _with_controls(PROMISE_VIEWS, PER_SESSION)
     told, shares = {}, []
     for _ in range(ROUNDS + 1):
         seconds = []

@@ -1,6 +1,6 @@
 """What fewer taps at a piece change in the views that figures come from.
 
-In: scene files. Out: lines of `taps.csv`, by scene and taps along a pixel's shorter side: confidences of 200 views of a
+In: scene files. Out: `taps.csv`, by scene and taps along a pixel's shorter side: confidences of 200 views of a
 design less those with as many taps as photographs have, as mean and root mean square, and views that change sides. One
 design each. Run in this folder: python taps.py suv postbox carton truck
 """
@@ -8,14 +8,13 @@ design each. Run in this folder: python taps.py suv postbox carton truck
 import csv
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 import patchproof as pp
 from patchproof.optimizer import problem as problems
 from patchproof.optimizer.loop import best_design
-from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.render.pixels import PHOTOGRAPHED
 
@@ -25,7 +24,7 @@ N, TAPS = 200, (6, 4, 3, 2)
 def measured(name: str) -> list[dict]:
     """The lines of one scene."""
     problem, look, told = problems.set_problem(pp.load_scene(f"{name}.toml")), problems.FIGURED, {}
-    shown = {"design": problem.subject.shown(from_pixels(best_design(problem), problem.device), "design")}
+    shown = shown_with_controls(problem, best_design(problem), ())
     conditions = problem.scene.draw("promise", N, per_session=4)
     for taps in (PHOTOGRAPHED.piece_taps, *TAPS):
         problems.FIGURED = replace(look, piece_taps=taps)
@@ -40,10 +39,8 @@ def measured(name: str) -> list[dict]:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        rows, new = measured(name), not Path("taps.csv").exists()
-        with open("taps.csv", "a", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            if new:
-                writer.writeheader()
-            writer.writerows(rows)
+    rows = [row for name in sys.argv[1:] for row in measured(name)]
+    with open("taps.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)

@@ -224,7 +224,7 @@ def _covered(
     """
     share = layer[..., 3:]
     mixed = cv2.transform(layer, matrix.astype(np.float32)) + (1 - share) * behind
-    if at_white is not None:  # what it is at this light
+    if at_white is not None:  # what it is at this light; a scalar of numpy's would make all of it float64
         noise = at_white * math.sqrt(float(np.clip(np.mean(mixed), 0, 1)) + _READ_SHARE_SQUARE)
     return np.clip(mixed + share * noise * _grain(behind.shape), 0, 1)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -100,8 +99,8 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CO
 
     def slopes(p):
         steps = _STEP * np.where(p == 0, 1, np.abs(p))
-        here, *beside = rows(np.stack([p, *(p + np.diag(steps))]))  # together: few points cost no more than one
-        return ((beside - here) / steps[:, None]).T
+        left = rows(np.vstack([p, p + np.diag(steps)]))  # together: so few points cost no more than one
+        return ((left[1:] - left[0]) / steps[:, None]).T
 
     fits = []
     for starts in (_starts(flat, mm, px, matrix @ pose[:3], center, reach), _ANY_BEND):
@@ -109,8 +108,8 @@ def rolled(flat, mm, px, size, focal_px, focal_spread=UNKNOWN_FOCAL, floor_px=CO
             start = np.array([*begin, bend, direction])
             # how far each parameter may be off, about
             scales = np.array([0.1, 0.1, 0.1, *[0.05 * max(abs(start[5]), 1.0)] * 3, 0.2, 0.2, 0.5])
-            jac = cast(Any, slopes)  # of which scipy's signature names only the words
-            fits.append(least_squares(rows, start, jac, x_scale=scales, max_nfev=40, method="lm"))
+            fit = least_squares(rows, start, slopes, x_scale=scales, max_nfev=40, method="lm")  # pyright: ignore[reportArgumentType]
+            fits.append(fit)
         best = min(fits, key=lambda fit: fit.cost)
         if rms(best.fun) < _LOST_PX:
             break
