@@ -12,15 +12,15 @@ from functools import cache
 import cv2
 import numpy as np
 import torch
+from synthetic_photos import noisy_design, some_design
 
+from patchproof.base.color import linear_from_srgb
+from patchproof.base.geometry import look_at
 from patchproof.channel.printer import load_printer
-from patchproof.color import linear_from_srgb
 from patchproof.evidence.surface import Promised, Surface, promised_of, surface_of
-from patchproof.geometry import look_at
 from patchproof.sheets.content import png_base64
 from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.piece import lay_out_piece, marker_image
-from test_photo_synthetic import noisy_design, some_design
 
 SIDE_MM, MARKER_MM, PAGE_PER_MM = 140.0, 14.0, 8
 CENTER = np.array([SIDE_MM, SIDE_MM]) / 2

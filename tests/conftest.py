@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from patchproof.workers import keep_freed_memory
+from patchproof.base.workers import keep_freed_memory
 
 # the tests run side by side, a process per core, and so do the programs that they start
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
 keep_freed_memory()
+
+# tests of one room take helpers from those of another
+sys.path += [str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir()]
 
 LONG = ("types", "readme", "journey", "optimize", "first_hour", "kill_anywhere")  # of the file's name
 

@@ -14,12 +14,12 @@ from functools import cache, partial
 
 import cv2
 import numpy as np
+from bent_paper import CENTER, PAGE_PER_MM, SIDE_MM, Place, bent, camera, cone, flat, folded, rolled, sheet
 from PIL import Image
 
-from bent_paper import CENTER, PAGE_PER_MM, SIDE_MM, Place, bent, camera, cone, flat, folded, rolled, sheet
-from patchproof.color import srgb_from_linear
+from patchproof.base.color import srgb_from_linear
+from patchproof.base.geometry import look_at, view_angles
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import look_at, view_angles
 
 SIZE = (1200, 900)
 FOCAL_35MM = 36

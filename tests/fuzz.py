@@ -23,9 +23,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageCms
-from safetensors.numpy import save as safetensors_bytes
-
 from hostile_bytes import (
     PHOTO_KINDS,
     Rng,
@@ -40,8 +37,11 @@ from hostile_bytes import (
     tweaked,
     whole_photo,
 )
-from patchproof.strict import Refused
+from PIL import Image, ImageCms
+from safetensors.numpy import save as safetensors_bytes
 from watch import MOST_BYTES, SECONDS, TooLong, Watch, limits, peak_bytes, temporary_files_in
+
+from patchproof.base.strict import Refused
 
 Read = Callable[[], object]
 
@@ -89,9 +89,10 @@ def measured(path: Path) -> None:
 
 @functools.cache
 def small_task():
+    from synthetic_photos import make_manifest
+
     from patchproof.channel.printer import identity_printer
     from patchproof.evidence.task import Options, task_of
-    from test_photo_synthetic import make_manifest
 
     return task_of(make_manifest(), Options([], identity_printer()), None)
 
@@ -99,12 +100,13 @@ def small_task():
 @functools.cache
 def manifests() -> list[dict]:
     """A sheet with a promise and settings, and one in tiles."""
+    from synthetic_photos import CONDITION, make_manifest, some_design
+
     from patchproof.sheets.content import PrintedPiece
     from patchproof.sheets.manifest import dump_manifest
     from patchproof.sheets.piece import lay_out_piece
     from patchproof.sheets.template import load_template
     from patchproof.sheets.write import write_sheet
-    from test_photo_synthetic import CONDITION, make_manifest, some_design
     from test_verify_run import promise
 
     claims = [CONDITION | dict(px_per_mm=2.0, contrast=0.7 + 0.01 * i, blur_px=0.5) for i in range(4)]
@@ -127,7 +129,7 @@ def manifests() -> list[dict]:
 @functools.cache
 def honest_photo() -> bytes:
     """A photograph of the first manifest's sheet that is measured."""
-    from test_photo_synthetic import make_manifest, page_raster, photograph, view
+    from synthetic_photos import make_manifest, page_raster, photograph, view
 
     homography = view(10, 5, 550, size_px=(400, 300))
     pixels = photograph(page_raster(make_manifest(), True), homography, (400, 300), blur_px=0.5, fine=2)
@@ -339,8 +341,8 @@ def camera_json(rng: Rng, folder: Path) -> Read:
 
 
 def printer(rng: Rng, folder: Path) -> Read:
+    from patchproof.base.strict import shipped
     from patchproof.channel.printer import SIZE, load_printer
-    from patchproof.strict import shipped
 
     source = shipped("calibration", "printers")
     head, tables = (source / "coated.json").read_text(), (source / "coated.npz").read_bytes()
@@ -400,7 +402,7 @@ CARD = {"input_px": 16, "labels": ["a", "b", "c"]}
 
 
 def labels_csv(rng: Rng, folder: Path) -> Read:
-    from patchproof.harden.labeled import labeled_files
+    from patchlab.harden.labeled import labeled_files
     from patchproof.scene.image_scene import labels_of
 
     (folder / "labels.csv").write_bytes(broken_lines(rng, LABELS))
@@ -542,9 +544,9 @@ def onnx_file(rng: Rng, folder: Path) -> Read:
 
 
 def mask(rng: Rng, folder: Path) -> Read:
+    from patchproof.base.settings import BackgroundSettings
     from patchproof.scene.backgrounds import load_backgrounds
     from patchproof.scene.texture import _read_mask
-    from patchproof.settings import BackgroundSettings
 
     pictures = folder / "pictures"
     pictures.mkdir()
@@ -557,6 +559,7 @@ def mask(rng: Rng, folder: Path) -> Read:
 
 def scene_toml(rng: Rng, folder: Path) -> Read:
     from conftest import SCENE
+
     from patchproof.scene.scene import load_scene
 
     (folder / "scene.toml").write_bytes(broken_lines(rng, SCENE))
@@ -567,11 +570,11 @@ TEMPLATES = ("a4", "blank_a4", "chart_a4", "charuco_a4", "a4_tiles")
 
 
 def template_toml(rng: Rng, folder: Path) -> Read:
-    from patchproof.printing.sheet import blank_page
+    from patchproof.base.strict import shipped
+    from patchproof.reprint.run_sheet import blank_page
     from patchproof.sheets.piece import lay_out_piece
     from patchproof.sheets.template import load_template
     from patchproof.sheets.tiles import refuse_larger_than_page
-    from patchproof.strict import shipped
 
     name = str(rng.choice(TEMPLATES))
     text = shipped("print_templates", f"{name}.toml").read_text(encoding="utf-8")

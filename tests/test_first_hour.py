@@ -105,7 +105,7 @@ def spent(folder: Path, typed: Typed) -> dict[str, tuple[str, float]]:
 
 def typed_here(line: str, folder: Path) -> tuple[int, str, float]:
     """In this process."""
-    from patchproof.cli import main
+    from patchproof.app.cli import main
 
     text = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):

@@ -13,7 +13,6 @@ import sys
 
 import numpy as np
 import pytest
-
 from fuzz import READERS, Outcome, attempt
 from watch import MOST_BYTES, SECONDS, Watch
 

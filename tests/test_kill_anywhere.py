@@ -29,8 +29,8 @@ IN_THE_SUITE = len(JOBS)
 LATE = """
     kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
     pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz test_optimize test_verify_run fake_networks
-    toy_studies patchproof.study.study patchproof.report.write
-    patchproof.journey.verify patchproof.optimizer.run patchproof.printing.sheet patchproof.reprints.reprint
+    toy_studies patchlab.study.study patchproof.report.write
+    patchproof.app.verify patchproof.optimizer.run patchproof.reprint.run_sheet patchproof.reprint.reprint
     patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
 
 
@@ -51,14 +51,15 @@ def optimize(base: Path, out: Path, again: bool) -> None:
 
 def verify(base: Path, out: Path, again: bool) -> None:
     from fuzz import network
-    from patchproof.journey.verify import verify_photos
+
+    from patchproof.app.verify import verify_photos
 
     verify_photos(base / "photos", base / "sheet.json", out, models=[network()], resume=again)
 
 
 def sheet(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer.run import load_run
-    from patchproof.printing.sheet import sheet_of
+    from patchproof.reprint.run_sheet import sheet_of
 
     out.mkdir(exist_ok=True)
     sheet_of(load_run(base / "run"), out / "sheet.pdf", control="gray")  # without its plan of photographs
@@ -66,14 +67,15 @@ def sheet(base: Path, out: Path, again: bool) -> None:
 
 def reprint(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.reprint import reprint
+    from patchproof.reprint.reprint import reprint
 
     reprint(base / "sheet.pdf", load_run(base / "run"), 3, out)
 
 
 def study(base: Path, out: Path, again: bool) -> None:
     import toy_studies as toy
-    from patchproof.study.study import Work, carry_out
+
+    from patchlab.study.study import Work, carry_out
 
     carry_out(toy.STUDY, toy.ToySettings(numbers=(1, 2, 13, 4)), base, out, Work(resume=again))  # one cell fails
 
@@ -84,6 +86,7 @@ DO = dict(zip(JOBS, (optimize, verify, sheet, reprint, study), strict=True))
 def prepare(base: Path) -> None:
     """What the jobs work on: a scene, a finished run and its sheet, photographs and theirs."""
     from fuzz import honest_photo, manifests
+
     from test_optimize import toml
 
     toml(base / "scene.toml", optimize__steps=6, background__color=[0.5, 0.5, 0.5])

@@ -16,15 +16,15 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-
 from bent_paper import SIDE_MM
 from degraded_photos import KINDS, take
+
+from patchproof.base.geometry import rect_corners
 from patchproof.evidence import measure as measuring
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.placed import Placed, place
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.results import PhotoEntry
-from patchproof.geometry import rect_corners
 from patchproof.photo.read import read_photo
 
 FIGURES = ("corners", "azimuth", "distance", "tilt")

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from console import command
+from test_imports import GROUND, MAY_IMPORT
 
-from patchproof.bench.run import BENCHES
-from patchproof.claims import student_mean
+from patchlab.bench.run import BENCHES
+from patchlab.study.record import hits_of
+from patchlab.study.study import load_study
+from patchproof.base.claims import student_mean
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import read_toml, validated
 from patchproof.optimizer.problem import FIGURE_SCALE, FIGURED
 from patchproof.optimizer.run import load_run
-from patchproof.settings import SceneSettings
-from patchproof.strict import read_toml, validated
-from patchproof.study.record import hits_of
-from patchproof.study.study import load_study
-from test_imports import GROUND, MAY_IMPORT
-from test_journey import command
 
 ROOT = Path(__file__).resolve().parents[1]
 README, NOTEBOOK, CONTRIBUTING = (
@@ -89,7 +89,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
     ],
 )
 def test_the_studies_that_are_quoted_can_be_run_again(folder, name, count):
-    study, path = load_study(name), README.parent / ".readme" / folder / f"{name}.toml"
+    study, path = load_study(name), README.parent / "src/patchlab/results" / folder / f"{name}.toml"
     settings = validated(study.settings, read_toml(path), name)
     assert len({cell.name for cell in study.cells(settings, path.parent)}) == count
 
@@ -180,7 +180,7 @@ def test_figures_of_the_detector_are_the_stored_ones():
 
 def test_gains_of_the_detector_s_other_seeds_are_the_stored_ones():
     gains, shown = dict[str, list[str]](), 0
-    for row in csv.DictReader((ROOT / ".readme/detector/seeds.csv").read_text("utf-8").splitlines()):
+    for row in csv.DictReader((ROOT / "src/patchlab/results/detector/seeds.csv").read_text("utf-8").splitlines()):
         gains.setdefault(row["object"], []).append(f"{100 * float(row['gain']):+.0f}")
         assert (float(row["gain"]) >= 0.15) == (row["object"] != "mailbox")
         assert float(row["low"]) > 0 or row["object"] == "mailbox"
@@ -208,7 +208,7 @@ def test_figures_of_promises_made_again_are_the_stored_ones():
 
 def test_our_photographs_differ_from_the_path_tracers_as_it_is_said():
     said = []
-    rows = list(csv.DictReader((ROOT / ".readme/promises/traced.csv").read_text("utf-8").splitlines()))
+    rows = list(csv.DictReader((ROOT / "src/patchlab/results/promises/traced.csv").read_text("utf-8").splitlines()))
     for shown, form in (("design", "rate {:.1f} points [{:.1f}, {:.1f}]"), ("bare", "{:.1f} [{:.1f}, {:.1f}]")):
         ours = [row for row in rows if row["shown"] == shown]
         rate, sure = (

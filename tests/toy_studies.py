@@ -7,13 +7,13 @@ import signal
 import time
 from pathlib import Path
 
-from patchproof import input as bounds
-from patchproof.claims import rate
+from patchlab.study.study import Cell, Study
+from patchproof.base import input as bounds
+from patchproof.base.claims import rate
+from patchproof.base.strict import Refused, Strict
 from patchproof.photo import limits
 from patchproof.photo.cannot import CannotJudge
 from patchproof.report.tables import Drawing, Table
-from patchproof.strict import Refused, Strict
-from patchproof.study.study import Cell, Study
 
 
 class ToySettings(Strict):

@@ -9,9 +9,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from patchproof.version import __version__ as __version__
+from patchproof.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from patchproof.app.compare import compare_runs as compare
+    from patchproof.app.verify import verify_photos as verify
+    from patchproof.base.goal import Goal as Goal
+    from patchproof.base.settings import SceneSettings as SceneSettings
+    from patchproof.base.strict import Refused as Refused
     from patchproof.channel.printer import Printer as Printer
     from patchproof.channel.printer import load_printer as load_printer
     from patchproof.classifier.custom import classifier_of as classifier_of
@@ -20,9 +25,6 @@ if TYPE_CHECKING:
     from patchproof.classifier.load import load_classifier as load_classifier
     from patchproof.classifier.network import Classifier as Classifier
     from patchproof.evidence.results import Report as Report
-    from patchproof.goal import Goal as Goal
-    from patchproof.journey.compare import compare_runs as compare
-    from patchproof.journey.verify import verify_photos as verify
     from patchproof.optimizer.evaluate import evaluate_run as evaluate
     from patchproof.optimizer.given import import_patch as import_patch
     from patchproof.optimizer.places import Place as Place
@@ -30,40 +32,38 @@ if TYPE_CHECKING:
     from patchproof.optimizer.run import Run as Run
     from patchproof.optimizer.run import load_run as load_run
     from patchproof.optimizer.run import optimize_scene as optimize
-    from patchproof.printing.sheet import sheet_of as sheet
     from patchproof.render.photograph import photograph as photograph
     from patchproof.render.stage import Stage as Stage
     from patchproof.render.stage import set_stage as set_stage
-    from patchproof.reprints.reprint import reprint as reprint
+    from patchproof.reprint.reprint import reprint as reprint
+    from patchproof.reprint.run_sheet import sheet_of as sheet
     from patchproof.scene.conditions import Conditions as Conditions
     from patchproof.scene.scene import Scene as Scene
     from patchproof.scene.scene import load_scene as load_scene
     from patchproof.scene.scene import make_scene as make_scene
-    from patchproof.settings import SceneSettings as SceneSettings
     from patchproof.sheets.manifest import Manifest as Manifest
     from patchproof.sheets.manifest import Promise as Promise
     from patchproof.sheets.manifest import load_manifest as load_manifest
-    from patchproof.strict import Refused as Refused
 
 # where each public name comes from, and what it is called there
 _HOME = {
     "Classifier": "classifier.network:Classifier",
     "Conditions": "scene.conditions:Conditions",
     "Detector": "classifier.detector:Detector",
-    "Goal": "goal:Goal",
+    "Goal": "base.goal:Goal",
     "Manifest": "sheets.manifest:Manifest",
     "Place": "optimizer.places:Place",
     "Printer": "channel.printer:Printer",
     "Promise": "sheets.manifest:Promise",
-    "Refused": "strict:Refused",
+    "Refused": "base.strict:Refused",
     "Report": "evidence.results:Report",
     "Run": "optimizer.run:Run",
     "Scene": "scene.scene:Scene",
-    "SceneSettings": "settings:SceneSettings",
+    "SceneSettings": "base.settings:SceneSettings",
     "Stage": "render.stage:Stage",
     "choose_place": "optimizer.places:choose_place",
     "classifier_of": "classifier.custom:classifier_of",
-    "compare": "journey.compare:compare_runs",
+    "compare": "app.compare:compare_runs",
     "detector_of": "classifier.custom:detector_of",
     "evaluate": "optimizer.evaluate:evaluate_run",
     "import_patch": "optimizer.given:import_patch",
@@ -75,10 +75,10 @@ _HOME = {
     "make_scene": "scene.scene:make_scene",
     "optimize": "optimizer.run:optimize_scene",
     "photograph": "render.photograph:photograph",
-    "reprint": "reprints.reprint:reprint",
+    "reprint": "reprint.reprint:reprint",
     "set_stage": "render.stage:set_stage",
-    "sheet": "printing.sheet:sheet_of",
-    "verify": "journey.verify:verify_photos",
+    "sheet": "reprint.run_sheet:sheet_of",
+    "verify": "app.verify:verify_photos",
 }
 
 __all__ = [

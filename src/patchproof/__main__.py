@@ -1,5 +1,5 @@
 """`python -m patchproof`."""
 
-from patchproof.cli import main
+from patchproof.app.cli import main
 
 main()

@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.base.output import check_file, write_together
+from patchproof.base.strict import Refused
 from patchproof.calibrate.boards import FEWEST_CORNERS, View, see_boards
 from patchproof.calibrate.camera_picture import residual_picture
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import NUMBERS, Fit, climb, fit_rung
 from patchproof.channel.lens import Camera, check_camera
-from patchproof.output import check_file, write_together
 from patchproof.sheets.board import Board, load_board
-from patchproof.strict import Refused
 
 FEWEST_PHOTOS = 6
 LEAST_TURN_DEG = 10.0  # between the two boards that differ most; 20 to 45° of tilt are asked for

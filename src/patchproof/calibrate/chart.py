@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 import torch
 
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.input import is_file, is_folder
+from patchproof.base.strict import Refused
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, printer_from_table, vary
-from patchproof.color import linear_from_srgb, srgb_from_linear
-from patchproof.input import is_file, is_folder
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.limits import limited
 from patchproof.photo.read import pictures_in, read_photo
 from patchproof.sheets.manifest import Manifest
-from patchproof.strict import Refused
 
 PRIORS = ("coated", "uncoated")
 LEAST_SWATCHES = 4  # paper, black and two more

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.channel.lens import Camera
 from patchproof.channel.tone import light_of_codes
-from patchproof.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored

@@ -21,8 +21,8 @@ from functools import partial
 
 import numpy as np
 
+from patchproof.base.color import ciede2000, lab_from_srgb, linear_from_srgb, srgb_from_linear
 from patchproof.calibrate.ladder import Rung, compared, simplest
-from patchproof.color import ciede2000, lab_from_srgb, linear_from_srgb, srgb_from_linear
 
 Colors = np.ndarray  # N×3 sRGB in [0, 1]
 Map = Callable[[Colors], Colors]

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from patchproof.base.strict import Refused
 from patchproof.calibrate.boards import View
 from patchproof.calibrate.ladder import Rung, compared, simplest
-from patchproof.strict import Refused
 
 FOLDS = 5
 NUMBERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

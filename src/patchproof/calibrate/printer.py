@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from patchproof.base.output import check_file, write_together
+from patchproof.base.strict import Refused
 from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
 from patchproof.channel.lens import load_camera
 from patchproof.channel.printer import Printer, save_printer
-from patchproof.output import check_file, write_together
 from patchproof.sheets.manifest import load_manifest
-from patchproof.strict import Refused
 
 
 def printer_from_icc(

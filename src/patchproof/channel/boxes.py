@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from patchproof.base.geometry import project
 from patchproof.channel.lens import Camera, distort_points
-from patchproof.geometry import project
 
 MOST_POINTS = 500  # of a ball: their box lacks 0.3 % of its size
 

@@ -18,10 +18,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from patchproof.base.color import clamped
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.tone import codes_of_light
-from patchproof.color import clamped
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4

@@ -21,8 +21,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from patchproof.color import tinted_white
-from patchproof.settings import SceneSettings
+from patchproof.base.color import tinted_white
+from patchproof.base.settings import SceneSettings
 
 _UNIT = (0.0, 1.0)
 # Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from patchproof.input import is_file, read_json
-from patchproof.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
+from patchproof.base.input import is_file, read_json
+from patchproof.base.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof import geometry
+from patchproof.base import geometry
 from patchproof.channel.effects import Light
 
 # Irradiance per unit of the coefficients L1-1 L10 L11 L2-2 L2-1 L20 L21 L22 (eq. 13).

@@ -23,9 +23,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.color import clamped, lab_from_srgb
-from patchproof.input import is_file, read_json
-from patchproof.strict import Finite, Refused, Strict, nearest, shipped, validated
+from patchproof.base.color import clamped, lab_from_srgb
+from patchproof.base.input import is_file, read_json
+from patchproof.base.strict import Finite, Refused, Strict, nearest, shipped, validated
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.channel.lens import Camera
-from patchproof.color import linear_from_srgb, srgb_from_linear
 
 
 def light_of_codes(codes: np.ndarray, camera: Camera | None) -> np.ndarray:

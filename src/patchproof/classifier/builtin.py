@@ -18,8 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from patchproof.base.strict import Refused
 from patchproof.classifier.network import Classifier
-from patchproof.strict import Refused
 
 INPUT_PX = 96
 WIDTHS = (16, 32, 64, 96, 160)  # channels after each halving of the picture: 48, 24, 12, 6, 3 pixels

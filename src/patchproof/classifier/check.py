@@ -14,9 +14,9 @@ import warnings
 import torch
 from torch import Tensor
 
+from patchproof.base.strict import Refused
 from patchproof.classifier.detector import NOTHING, Detector
 from patchproof.classifier.network import Classifier
-from patchproof.strict import Refused
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.

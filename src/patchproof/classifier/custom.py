@@ -16,9 +16,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from patchproof.base.strict import Refused
 from patchproof.classifier.detector import NOTHING, Detector
 from patchproof.classifier.network import Classifier, weights_sha256
-from patchproof.strict import Refused
 
 MOST_FOUND = 1000  # boxes in a picture, of networks that find any number
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from patchproof.classifier.network import Classifier, Odds
-from patchproof.classifier.windows import Windows
+from patchproof.networks.windows import Windows
 
 LEAST_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
 NOTHING = -20.0  # the logit where no candidate lies on the object: a score of 2e-9

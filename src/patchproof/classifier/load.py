@@ -21,10 +21,10 @@ from pathlib import Path
 
 import torch
 
-from patchproof.classifier.batches import fastest
+from patchproof.base.strict import Refused, expand
 from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.network import Classifier
-from patchproof.strict import Refused, expand
+from patchproof.networks.batches import fastest
 
 
 def load_classifier(name: str | Classifier, base: Path, device: torch.device | str = "cpu") -> Classifier:

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.batches import InBatches
-from patchproof.classifier.windows import Windows
-from patchproof.strict import Refused
+from patchproof.base.strict import Refused
+from patchproof.networks.batches import InBatches
+from patchproof.networks.windows import Windows
 
 
 class Odds(NamedTuple):

@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 
 import torch
 
-from patchproof.classifier.archive import Unwanted, read_archive
-from patchproof.classifier.batches import InBatches
-from patchproof.classifier.description import read_program
+from patchproof.base.input import is_file, read_json
+from patchproof.base.strict import Refused
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
-from patchproof.classifier.onnx_file import read_onnx
-from patchproof.input import is_file, read_json
-from patchproof.strict import Refused
+from patchproof.networks.archive import Unwanted, read_archive
+from patchproof.networks.batches import InBatches
+from patchproof.networks.description import read_program
+from patchproof.networks.onnx_file import read_onnx
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
 

@@ -26,14 +26,14 @@ from urllib.request import getproxies
 import torch
 from torch import Tensor, nn
 
+from patchproof.base.input import is_file
+from patchproof.base.strict import Refused
 from patchproof.classifier.check import first_line
 from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
 from patchproof.classifier.program import Card, network_bytes, read_card
-from patchproof.input import is_file
-from patchproof.strict import Refused
 
 
 class Normalized(nn.Module):

@@ -16,10 +16,10 @@ from functools import partial
 import cv2
 import numpy as np
 
-from patchproof.color import ciede2000, lab_from_linear, photo_codes_of, srgb_from_linear
+from patchproof.base.color import ciede2000, lab_from_linear, photo_codes_of, srgb_from_linear
+from patchproof.base.geometry import rect_corners
 from patchproof.evidence.results import Color, Geometry
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import rect_corners
 from patchproof.photo.colorfit import ColorFit, affine12, white_black
 from patchproof.photo.detect import LIGHT
 from patchproof.photo.quality import CLIPPED_CODE, FrameLight

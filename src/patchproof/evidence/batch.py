@@ -19,6 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.strict import Finite, Share, Strict
+from patchproof.base.workers import WorkerDied, Workers, result_of
 from patchproof.evidence.boxes import in_square
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.classify import Box, Judges, square_of, squares_of
@@ -29,14 +32,11 @@ from patchproof.evidence.reproject import Shot, shot_of
 from patchproof.evidence.results import PhotoEntry, Remark
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
-from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.exif import of_a_camera
 from patchproof.photo.limits import limited
 from patchproof.photo.quality import FrameLight, shows_nothing
 from patchproof.photo.read import Photo, read_photo
-from patchproof.strict import Finite, Share, Strict
-from patchproof.workers import WorkerDied, Workers, result_of
 
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG

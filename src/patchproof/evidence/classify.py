@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse import csr_array
 
+from patchproof.base.strict import Refused
 from patchproof.evidence.results import Prediction
 from patchproof.sheets.manifest import Manifest, Promise
-from patchproof.strict import Refused
 
 if TYPE_CHECKING:
     from patchproof.classifier import Classifier

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import PhotoEntry, Remark
-from patchproof.geometry import apply_homography, rect_corners
 from patchproof.sheets.manifest import Rect
 
 COPY = "copy"

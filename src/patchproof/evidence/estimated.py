@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchproof.claims import paired_difference
+from patchproof.base.claims import paired_difference
 from patchproof.evidence.classify import Judges, predict, squares_of
 from patchproof.evidence.reproject import Shot, print_and_lights, square_with
 from patchproof.evidence.results import Estimated, EstimatedControl

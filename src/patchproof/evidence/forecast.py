@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from patchproof.base.sessions import TAIL
 from patchproof.evidence.results import Forecast
-from patchproof.sessions import TAIL
 
 # Standard deviation of the odds' logarithm between sessions: 30 of 30 path-traced ones held with it, 28 with none.
 SHIFT = 0.7

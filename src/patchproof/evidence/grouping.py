@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from patchproof.input import is_folder, readable_formats
+from patchproof.base.input import is_folder, readable_formats
 from patchproof.photo.limits import limited
 from patchproof.photo.read import list_photos, pictures_in, printable
 

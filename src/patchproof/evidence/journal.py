@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, TextIO
 import cv2
 import numpy as np
 
-from patchproof.input import LARGEST_JSON
-from patchproof.output import make_folder, write_whole
+from patchproof.base.input import LARGEST_JSON
+from patchproof.base.output import make_folder, write_whole
+from patchproof.base.strict import Strict, validated
+from patchproof.base.version import __version__
 from patchproof.photo.limits import MOST_BYTES
-from patchproof.strict import Strict, validated
-from patchproof.version import __version__
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer

@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.claims import LEAST_CLUSTERS, resampled_means
-from patchproof.color import linear_from_srgb
+from patchproof.base.claims import LEAST_CLUSTERS, resampled_means
+from patchproof.base.color import linear_from_srgb
 from patchproof.evidence.classify import Box, Judges, boxes_of
 from patchproof.evidence.reproject import Reference, Shot, Switches, print_and_lights, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare

@@ -14,13 +14,13 @@ from functools import partial
 
 import numpy as np
 
+from patchproof.base.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.evidence.appearance import MOST_CLIPPED, appearance
 from patchproof.evidence.camera import View
 from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, object_box, place, pose_of
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import MM_PER_INCH, apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from patchproof.base.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.channel.boxes import box_of
 from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.classify import Box
 from patchproof.evidence.results import Focal, Geometry, Pose
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import apply_homography, fit_homography, intrinsics, plane_pose, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.pose import bent_stance, flat_stance, scale_and_tilt, tilt_uncertainty_deg, turn_rad

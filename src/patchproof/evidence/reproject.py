@@ -20,12 +20,12 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from patchproof.color import LUMINANCE, srgb_from_linear
+from patchproof.base.color import LUMINANCE, srgb_from_linear
+from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.evidence.appearance import cells_fit
 from patchproof.evidence.classify import Box, square_of
 from patchproof.evidence.print_fit import fit_print
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.geometry import apply_homography, rect_corners
 from patchproof.photo.colorfit import ColorFit, inverse, white_black
 from patchproof.photo.detect import LIGHT
 from patchproof.photo.pattern_light import pattern_light

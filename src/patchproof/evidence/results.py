@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from patchproof.base.strict import Finite, Strict
 from patchproof.evidence.worth import Worth
 from patchproof.photo.cannot import CannotJudge
-from patchproof.strict import Finite, Strict
 
 Status = Literal["judged", "measured", "rejected"]
 Word = Literal["kept", "broken", "cannot_tell"]

@@ -16,7 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.claims import wilson
+from patchproof.base.claims import wilson
+from patchproof.base.input import is_folder
+from patchproof.base.sessions import TAIL
+from patchproof.base.settings import behind
+from patchproof.base.strict import Refused
+from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
 from patchproof.evidence.boxes import box_in
 from patchproof.evidence.classify import Judges, judges_of
@@ -33,13 +38,8 @@ from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, S
 from patchproof.evidence.task import Options, task_of
 from patchproof.evidence.verdict import Verdict, compare, effect_of, judge, next_step
 from patchproof.evidence.worth import worth_of
-from patchproof.input import is_folder
 from patchproof.photo.read import not_looked_at, pictures_in, printable
-from patchproof.sessions import TAIL
-from patchproof.settings import behind
 from patchproof.sheets.manifest import Manifest
-from patchproof.strict import Refused
-from patchproof.workers import open_workers
 
 
 def gather_evidence(

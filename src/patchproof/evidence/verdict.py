@@ -18,10 +18,10 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from patchproof.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, wilson
+from patchproof.base.claims import CONFIDENCE, independent_difference, mcnemar_p, paired_difference, wilson
+from patchproof.base.goal import Goal
+from patchproof.base.sessions import TAIL
 from patchproof.evidence.results import Control, Effect, Word
-from patchproof.goal import Goal
-from patchproof.sessions import TAIL
 from patchproof.sheets.manifest import Promise
 
 LEAST_JUDGED = 5

@@ -17,10 +17,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
-from patchproof.claims import rates_difference
-from patchproof.goal import Goal
+from patchproof.base.claims import rates_difference
+from patchproof.base.goal import Goal
+from patchproof.base.strict import Finite, Strict
 from patchproof.sheets.manifest import Promise
-from patchproof.strict import Finite, Strict
 
 if TYPE_CHECKING:
     from patchproof.evidence.results import Control

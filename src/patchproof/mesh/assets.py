@@ -10,7 +10,7 @@ import io
 import urllib.parse
 from pathlib import Path
 
-from patchproof.input import is_file, readable_formats
+from patchproof.base.input import is_file, readable_formats
 
 MOST_BYTES = 1 << 30  # of one file
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.color import codes_of
+from patchproof.base.color import codes_of
 from patchproof.mesh.mesh import Mesh, Part
 
 _M_FROM_MM = 1e-3

@@ -17,8 +17,8 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
+from patchproof.base.strict import Refused
 from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
-from patchproof.strict import Refused
 
 GIVEN = "python:"
 

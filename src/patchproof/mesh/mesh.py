@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from patchproof.strict import Refused
+from patchproof.base.strict import Refused
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.color import linear_from_srgb
-from patchproof.input import FORMATS as PICTURES
-from patchproof.input import LARGEST_PX, is_file
+from patchproof.base.color import linear_from_srgb
+from patchproof.base.input import FORMATS as PICTURES
+from patchproof.base.input import LARGEST_PX, is_file
+from patchproof.base.strict import Refused
 from patchproof.mesh.assets import MOST_BYTES, Assets
 from patchproof.mesh.mesh import Material, Part, normal_transform, topology_warnings
-from patchproof.strict import Refused
 
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl")
 MOST_FACES = 20_000_000  # a scan of a building has fewer

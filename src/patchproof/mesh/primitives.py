@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from patchproof.base.strict import Refused, nearest
 from patchproof.mesh.mesh import Mesh, Part, from_parts
 from patchproof.mesh.solids import box, lathe, moved, prism, tube, turned
-from patchproof.strict import Refused, nearest
 
 
 def names() -> tuple[str, ...]:

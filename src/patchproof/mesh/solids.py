@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from patchproof.color import linear_from_srgb
+from patchproof.base.color import linear_from_srgb
 from patchproof.mesh.mesh import Material, Part
 
 AROUND = 24  # corners of a round cross-section: 15° each, below the crease, so that sides shade smoothly

@@ -15,10 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.base.strict import Refused
 from patchproof.mesh.mesh import Material, Mesh
 from patchproof.mesh.texels import coverage, face_counts, spans
-from patchproof.strict import Refused
 
 PADDING_TEXELS = 2  # between charts; measured, 3 stay free: rims of 1.5 texels on either side do not meet
 # float32 coordinates further out are coarser than a tenth of a texel of a 1024² texture

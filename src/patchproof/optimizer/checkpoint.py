@@ -13,11 +13,11 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from patchproof.input import is_file
+from patchproof.base.input import is_file
+from patchproof.base.output import write_whole
+from patchproof.base.strict import Refused, Strict
 from patchproof.optimizer.loop import State, start
 from patchproof.optimizer.problem import Problem
-from patchproof.output import write_whole
-from patchproof.strict import Refused, Strict
 
 CHECKPOINT = "checkpoint.safetensors"
 

@@ -15,19 +15,19 @@ from typing import Any
 
 import torch
 
+from patchproof.base.input import is_file
+from patchproof.base.output import write_whole
+from patchproof.base.strict import Refused
+from patchproof.base.workers import Workers, open_workers
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier, center_square
 from patchproof.classifier.precision import Finding, average_precision, findings
-from patchproof.input import is_file
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS, control_claims, model_claims, shown_with_controls
 from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined, responses
 from patchproof.optimizer.run import Run, load_run
-from patchproof.output import write_whole
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
-from patchproof.strict import Refused
-from patchproof.workers import Workers, open_workers
 
 Networks = tuple[str | Classifier, ...] | None
 Found = dict[str, dict[str, list[Finding]]]  # by detector and what is shown

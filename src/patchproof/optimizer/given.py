@@ -22,22 +22,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from patchproof.base.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.input import is_file
+from patchproof.base.output import check_folder, new_folder
+from patchproof.base.strict import Refused, listed
 from patchproof.classifier.network import Classifier
-from patchproof.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
-from patchproof.geometry import MM_PER_INCH
-from patchproof.input import is_file
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
 from patchproof.optimizer.run import OWN, Run, check_promise, finish_run, load_run
-from patchproof.output import check_folder, new_folder
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable, read_photo
 from patchproof.scene.scene import PieceScene, Scene, load_scene, needs_piece
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
-from patchproof.strict import Refused, listed
 
 LEAST_PX = 32  # of the shorter side; our own designs have no fewer either
 MOST_PX = 1024  # of the longer side: a manifest carries the pixels, and a view of 12 megapixels shows about as many

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
+from patchproof.base.goal import Goal
 from patchproof.classifier.network import Odds
-from patchproof.goal import Goal
 
 Loss = Callable[[Tensor, Sequence[int]], Tensor]  # (logits N×K, label indices) -> N losses to descend on
 

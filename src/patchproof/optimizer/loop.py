@@ -24,15 +24,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.settings import OptimizeSettings
+from patchproof.base.strict import Refused
+from patchproof.base.workers import sharing
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import expose, windows_of
 from patchproof.render.views import Views, apart, seen_again
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene
-from patchproof.settings import OptimizeSettings
-from patchproof.strict import Refused
-from patchproof.workers import sharing
 
 # Training views. Tried twice as often, 28 of 30 runs kept their last design all the same, and two one that was better
 # by 0.00 and 0.02 of loss; steps four times as large as the default's lost 0.01.

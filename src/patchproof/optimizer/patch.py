@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.output import image_bytes
 from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.goals import total_variation
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.subject import Grid, write_png
-from patchproof.output import image_bytes
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
 from patchproof.scene.interface import PieceScene

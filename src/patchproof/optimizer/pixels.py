@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.color import codes_of
+from patchproof.base.color import codes_of
 
 
 def as_pixels(design_srgb: Tensor) -> np.ndarray:

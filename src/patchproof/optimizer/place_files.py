@@ -15,12 +15,14 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from patchproof import geometry
+from patchproof.base import geometry
+from patchproof.base.color import photo_codes_of, srgb_from_linear
+from patchproof.base.input import is_file, read_json
+from patchproof.base.output import write_whole
+from patchproof.base.settings import BackgroundSettings
+from patchproof.base.strict import Refused, validated
 from patchproof.channel.effects import Light, Pose
-from patchproof.color import photo_codes_of, srgb_from_linear
-from patchproof.input import is_file, read_json
 from patchproof.optimizer.places import Candidate, Place
-from patchproof.output import write_whole
 from patchproof.render.photograph import shade
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage, set_stage
@@ -29,8 +31,6 @@ from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import OpenScene, PatchScene
 from patchproof.scene.placement import patch_frame, side_frame, spun
-from patchproof.settings import BackgroundSettings
-from patchproof.strict import Refused, validated
 
 PLACE_FILES = _RECORD, _PICTURE = ("place.json", "place.png")
 _DIRECTIONS, _SIDE_PX = 4, 420

@@ -19,7 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.claims import student_mean
+from patchproof.base.claims import student_mean
+from patchproof.base.settings import OptimizeSettings
+from patchproof.base.strict import Refused, Side, Strict
+from patchproof.base.workers import sharing
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import draft, gradient_of, part_of, seen, start, views_seen
@@ -32,9 +35,6 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import At, OpenScene
 from patchproof.scene.places import APART, Ground, Spot
 from patchproof.scene.scene import Scene, needs_open
-from patchproof.settings import OptimizeSettings
-from patchproof.strict import Refused, Side, Strict
-from patchproof.workers import sharing
 
 PASSES = 608  # at most: pictures that go through a network, and once more those that gradients come back through
 PLACES, SCREEN_VIEWS = 24, 4  # 192 of them, and 4 of the bare object

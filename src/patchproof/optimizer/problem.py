@@ -15,12 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.settings import OptimizeSettings
+from patchproof.base.strict import Refused
+from patchproof.base.workers import threads
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.classifier.batches import InBatches
 from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.networks.batches import InBatches
 from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.subject import Subject
@@ -32,9 +35,6 @@ from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import Scene, needs_piece, needs_texture
-from patchproof.settings import OptimizeSettings
-from patchproof.strict import Refused
-from patchproof.workers import threads
 
 # Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
 # no less than so many pixels, since each of them takes one sample. Averaging textures over eight tenths of a pixel

@@ -19,9 +19,10 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from patchproof import geometry
+from patchproof.base import geometry
+from patchproof.base.color import linear_from_srgb
+from patchproof.base.sessions import difference_in_sessions, in_sessions, spread_of
 from patchproof.classifier.detector import Detector
-from patchproof.color import linear_from_srgb
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, asking, joined
@@ -29,7 +30,6 @@ from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import PieceScene, needs_piece
-from patchproof.sessions import difference_in_sessions, in_sessions, spread_of
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 # Many short sessions: how much they differ is known from their number, not from their length.

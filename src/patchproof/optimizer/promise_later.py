@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from patchproof.base.output import write_whole
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import RUN_FILE, Run, check_promise, load_run, promise_of
-from patchproof.output import write_whole
 
 
 def promise_run(

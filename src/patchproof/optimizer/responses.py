@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.workers import sharing
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose, windows_of
 from patchproof.render.views import apart
 from patchproof.scene.conditions import Conditions
-from patchproof.workers import sharing
 
 AT_A_TIME = 4  # views: before a small network 16 took 1.4 times as long, out of the cache
 Thing = TypeVar("Thing", bound=Hashable)

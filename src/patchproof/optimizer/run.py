@@ -23,8 +23,12 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 
+from patchproof.base.input import is_file, read_json
+from patchproof.base.output import check_folder, make_folder, write_whole
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Positive, Refused, validated
+from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
-from patchproof.input import is_file, read_json
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, saves, start, steps
@@ -36,13 +40,9 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, make_promise
 from patchproof.optimizer.subject import read_png, write_png
 from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
-from patchproof.output import check_folder, make_folder, write_whole
 from patchproof.scene.patch_scene import OpenScene
 from patchproof.scene.scene import Scene, build_scene, load_scene, needs_patch, needs_texture
-from patchproof.settings import SceneSettings
 from patchproof.sheets.manifest import Promise
-from patchproof.strict import Positive, Refused, validated
-from patchproof.version import __version__
 
 _LOG, RUN_FILE, _VIEWS = ("steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"  # the mesh of a scene that was made in Python

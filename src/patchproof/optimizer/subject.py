@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from patchproof.base.input import opened_picture
+from patchproof.base.output import write_whole
 from patchproof.channel.printer import Printer
-from patchproof.input import opened_picture
-from patchproof.output import write_whole
 from patchproof.render.pixels import Shown
 
 

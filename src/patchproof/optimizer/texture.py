@@ -20,17 +20,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.output import write_whole
+from patchproof.base.strict import Refused
 from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.subject import Grid, read_png, write_png
-from patchproof.output import write_whole
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
 from patchproof.scene.mesh_scene import TextureScene
 from patchproof.sheets.piece import CELLS, control_design
-from patchproof.strict import Refused
 
 OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "object.glb", "texture_*.png", "mask.png"
 

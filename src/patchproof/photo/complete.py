@@ -14,7 +14,7 @@ from collections.abc import Mapping, Set
 import cv2
 import numpy as np
 
-from patchproof.geometry import apply_homography
+from patchproof.base.geometry import apply_homography
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import (
     COARSEST_PX,

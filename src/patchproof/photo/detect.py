@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from patchproof.color import LIGHT_OF_CODE, LUMINANCE
-from patchproof.input import seconds_left
+from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE
+from patchproof.base.input import seconds_left
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import squares_in

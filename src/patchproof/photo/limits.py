@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from patchproof.input import Arguments, OutOfTime, Result, has_timer, within_time
+from patchproof.base.input import Arguments, OutOfTime, Result, has_timer, within_time
 from patchproof.photo.cannot import CannotJudge
 
 MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.5 GB while they are read

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from patchproof.color import linear_from_srgb
-from patchproof.geometry import apply_homography, local_scale
+from patchproof.base.color import linear_from_srgb
+from patchproof.base.geometry import apply_homography, local_scale
 from patchproof.photo.detect import cells_of
 from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from patchproof.geometry import plane_pose, scaled_about, view_angles
+from patchproof.base.geometry import plane_pose, scaled_about, view_angles
 from patchproof.photo.ratio import cosine, gradient, log_ratio
 from patchproof.photo.rectify import PageFit, root_of
 from patchproof.photo.shapes import Project, Shape

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-from patchproof.color import LUMINANCE, linear_from_srgb
+from patchproof.base.color import LUMINANCE, linear_from_srgb
 from patchproof.photo.edges import Borders, border_frame, sample
 
 CLIPPED_CODE = 253  # JPEG and sharpening move full white by a code or two

@@ -21,11 +21,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from patchproof.input import LARGEST_PX, is_file, is_folder, readable_formats
+from patchproof.base.input import LARGEST_PX, is_file, is_folder, readable_formats
+from patchproof.base.strict import Refused, listed
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.exif import EXIF_SPREAD, focal_of, is_part
 from patchproof.photo.limits import MOST_BYTES, limited, limited_memory
-from patchproof.strict import Refused, listed
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 _ORIENTATION = 0x0112

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy.special import fdtri, stdtrit
 
-from patchproof.geometry import apply_homography, fit_homography, normalized, rect_corners
+from patchproof.base.geometry import apply_homography, fit_homography, normalized, rect_corners
 from patchproof.photo.cannot import CannotJudge
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from patchproof.color import LUMINANCE
-from patchproof.geometry import rect_corners
+from patchproof.base.color import LUMINANCE
+from patchproof.base.geometry import rect_corners
 from patchproof.photo.detect import luminance
 from patchproof.photo.rectify import averaged, crop, rectify
 

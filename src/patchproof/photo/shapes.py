@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from patchproof.geometry import apply_homography, plane_pose
+from patchproof.base.geometry import apply_homography, plane_pose
 from patchproof.photo.rectify import CORNER_NOISE_PX, covariance_of, noise_and_bend
 
 UNKNOWN_FOCAL = 0.5  # of its logarithm, where no file names one

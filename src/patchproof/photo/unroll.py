@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from patchproof.geometry import apply_homography, fit_homography, rect_corners
+from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
 from patchproof.photo.detect import strips
 from patchproof.photo.edges import GRID, REACH, border_frame, meet
 from patchproof.photo.rectify import (

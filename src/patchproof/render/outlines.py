@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from patchproof.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.edges import Edges
 from patchproof.render.fragments import Cameras
 from patchproof.render.raster import CHUNK, homogeneous, ramp, ranked

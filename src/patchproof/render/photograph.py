@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.channel.camera import (
     SMALLEST_BLUR_PX,
     SMALLEST_NOISE,
@@ -25,7 +26,6 @@ from patchproof.channel.camera import (
 from patchproof.channel.lens import distorted
 from patchproof.channel.light import PAPER_REFLECTANCE
 from patchproof.channel.printer import misregistered, vary
-from patchproof.color import linear_from_srgb, srgb_from_linear
 from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels

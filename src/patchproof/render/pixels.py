@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.color import linear_from_srgb
+from patchproof.base.color import linear_from_srgb
 from patchproof.render.atlas import sampled
 from patchproof.render.fragments import Fragments
 from patchproof.render.surfaces import ObjectSurface, PieceSurface

@@ -22,10 +22,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from patchproof.geometry import cross, dot
+from patchproof.base.geometry import cross, dot
+from patchproof.base.strict import Refused
 from patchproof.render.clip import GUARD_PX, clipped
 from patchproof.render.fragments import Cameras, Fragments, columns
-from patchproof.strict import Refused
 
 SUBPIXELS = 256  # corners snap to this fraction of a pixel
 # Faces, rows or fragments held at a time. Sixteen views of 20k faces took 1.9 times as long with 2^20, whose

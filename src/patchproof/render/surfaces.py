@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.color import linear_from_srgb
+from patchproof.base.color import linear_from_srgb
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.atlas import atlas_layout, atlas_table
 from patchproof.render.edges import Edges, edges_of

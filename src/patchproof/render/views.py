@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.color import LIGHT_OF_CODE
 from patchproof.channel.camera import diagonal_share_of, encoded, encoded_by_table, falloff, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
-from patchproof.color import LIGHT_OF_CODE
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines
 from patchproof.render.pixels import (

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.output import image_bytes, make_folder
+from patchproof.base.output import image_bytes, make_folder
 
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")

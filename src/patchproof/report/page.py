@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from patchproof.claims import Estimate
+from patchproof.base.claims import Estimate
 from patchproof.report.tables import shown
 
 

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from patchproof.output import write_whole
+from patchproof.base.output import write_whole
 from patchproof.report.images import data_uri
 from patchproof.report.page import page
 from patchproof.report.tables import Drawing, Table, csv_text, png

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from patchproof.claims import Estimate
+from patchproof.base.claims import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from patchproof.strict import listed
+from patchproof.base.strict import listed
 
 VERDICTS = {"kept": "Promise kept", "broken": "Promise broken", "cannot_tell": "Promise neither broken nor proved"}
 _CONTROLS = {

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from patchproof.output import make_folder, write_whole
+from patchproof.base.output import make_folder, write_whole
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import page
 from patchproof.report.photo_table import photos_csv

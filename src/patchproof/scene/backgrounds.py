@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.color import codes_of
-from patchproof.input import is_file, is_folder, opened_picture
+from patchproof.base.color import codes_of
+from patchproof.base.input import is_file, is_folder, opened_picture
+from patchproof.base.settings import BackgroundSettings
+from patchproof.base.strict import Refused, expand
 from patchproof.scene.rooms import place
-from patchproof.settings import BackgroundSettings
-from patchproof.strict import Refused, expand
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits
 FEW = 10  # files of which the scene is told that they are few

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from patchproof.base.strict import Refused
 from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.surface import Chart, crop, edge_points, heights, net, surface_at
@@ -28,7 +29,6 @@ from patchproof.scene.placement import (
     refuse_larger_than_side,
     spun,
 )
-from patchproof.strict import Refused
 
 # Mean gap, as a share of the shorter edge, up to which a simpler family lies on the surface: 0.6 mm on 60 mm.
 CLOSE_SHARE = 0.01

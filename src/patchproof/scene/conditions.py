@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from patchproof.base.settings import SceneSettings
 from patchproof.channel.effects import (
     EFFECTS,
     FIELDS,
@@ -33,7 +34,6 @@ from patchproof.channel.effects import (
     Rows,
     Sensor,
 )
-from patchproof.settings import SceneSettings
 
 Stream = Literal["train", "select", "promise", "reprint", "evaluate"]
 _STREAMS = ("train", "select", "promise", "reprint", "evaluate")

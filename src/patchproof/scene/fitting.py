@@ -14,11 +14,11 @@ from typing import get_args
 
 import numpy as np
 
+from patchproof.base.settings import PatchSettings
+from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.bend import place_bent
 from patchproof.scene.placement import WARN_GAP_SHARE, WARN_OVERHANG_SHARE, Frame, patch_frame, place_card, side_frame
-from patchproof.settings import PatchSettings
-from patchproof.strict import Refused, Side
 
 _STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
 _TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes some 5 and 200 ms

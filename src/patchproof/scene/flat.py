@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.geometry import rect_corners, scaled_about
+from patchproof.base.geometry import rect_corners, scaled_about
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Refused
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PieceScene
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
-from patchproof.settings import SceneSettings
 from patchproof.sheets.piece import Piece
-from patchproof.strict import Refused
 
 VIEWS_TRIED = 256  # for figures over a scene's views
 

@@ -22,17 +22,17 @@ from typing import Self
 
 import numpy as np
 
-from patchproof.input import is_file
+from patchproof.base.input import is_file
+from patchproof.base.settings import SceneSettings, identifying
+from patchproof.base.strict import Refused, expand
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
-from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
-from patchproof.strict import Refused, expand
 
 SPLIT_FROM = 2
 FEW = 20  # images, of which half say little of others

@@ -15,15 +15,15 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from patchproof.base.geometry import apply_homography, local_scales
+from patchproof.base.settings import SceneSettings, identifying
+from patchproof.base.strict import Refused
 from patchproof.channel.effects import Effect
 from patchproof.channel.lens import Camera
-from patchproof.geometry import apply_homography, local_scales
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.scene.placement import Placement
 from patchproof.scene.resolution import design_grid
-from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.piece import Piece, sheet_id
-from patchproof.strict import Refused
 
 SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
 

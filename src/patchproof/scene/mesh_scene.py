@@ -13,7 +13,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from patchproof import geometry
+from patchproof.base import geometry
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Refused
 from patchproof.channel import lens
 from patchproof.channel.boxes import box_of, outermost
 from patchproof.channel.effects import Pose
@@ -23,8 +25,6 @@ from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
 from patchproof.scene.placement import Frame, view_frame
 from patchproof.scene.texture import Canvas
-from patchproof.settings import SceneSettings
-from patchproof.strict import Refused
 
 CLEARANCE = 5e-3  # of the object's length between it and a camera: what is nearer than the near plane would vanish
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.color import LIGHT_OF_CODE
-from patchproof.geometry import apply_homography, local_scale, rect_corners
+from patchproof.base.color import LIGHT_OF_CODE
+from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.sheets.piece import Piece, marker_rect

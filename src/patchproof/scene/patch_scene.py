@@ -14,7 +14,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from patchproof import geometry
+from patchproof.base import geometry
+from patchproof.base.settings import SceneSettings, SearchSettings, identifying
+from patchproof.base.strict import Refused, Side, expand
 from patchproof.channel import lens
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.backgrounds import load_backgrounds
@@ -26,11 +28,9 @@ from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
 from patchproof.scene.placement import Placement, patch_frame, place_card, view_frame
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.texture import texture_canvas
-from patchproof.settings import SceneSettings, SearchSettings, identifying
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id, smallest_piece_mm
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
-from patchproof.strict import Refused, Side, expand
 
 At = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from patchproof.color import codes_of
+from patchproof.base.color import codes_of
 
 _SQUARE_PX = 4  # whose corners are asked for their nearest point first; with 8 textures took up to half as long again
 Picture = Callable[[], np.ndarray]  # drawn, but not made yet: of what nobody sees, nothing else is needed

@@ -23,7 +23,9 @@ from typing import Self
 
 import numpy as np
 
-from patchproof.input import is_file, is_folder
+from patchproof.base.input import is_file, is_folder
+from patchproof.base.settings import SceneSettings, identifying
+from patchproof.base.strict import Refused, expand
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import DICTIONARY, find_markers
@@ -35,14 +37,12 @@ from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Part
 from patchproof.scene.paper_light import PaperLight, paper_light
-from patchproof.settings import SceneSettings, identifying
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.piece import Piece, sheet_id, with_ids
 from patchproof.sheets.rects import holds, moved
 from patchproof.sheets.template import load_template
 from patchproof.sheets.tiles import refuse_larger_than_page
-from patchproof.strict import Refused, expand
 
 LEAST_PHOTOS = 6
 _MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small

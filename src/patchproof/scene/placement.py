@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from patchproof.base.settings import PatchSettings, SceneSettings
+from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.surface import Chart, heights
-from patchproof.settings import PatchSettings, SceneSettings
-from patchproof.strict import Refused, Side
 
 GRID = 65  # heights are sampled on this many points along each edge of the card
 LIFT_MM = 0.15  # the paper's own thickness, which also keeps it clear of the surface in the z-buffer

@@ -16,6 +16,7 @@ from typing import get_args
 
 import numpy as np
 
+from patchproof.base.strict import Refused, Side
 from patchproof.mesh.surface import Chart, crop, heights, net
 from patchproof.scene.bend import place_bent
 from patchproof.scene.mesh_scene import camera_poses
@@ -31,7 +32,6 @@ from patchproof.scene.placement import (
     surface_frame,
 )
 from patchproof.scene.texture import named_faces
-from patchproof.strict import Refused, Side
 
 APART = 0.5  # of the piece's shorter edge between two places
 _POOL_APART, _POOL = 0.25, 96  # the same between points that are tried, and how many at most

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from patchproof.color import codes_of
+from patchproof.base.color import codes_of
 from patchproof.scene.patterns import background, color, drawn_texture
 
 PLACE_PX = 256

@@ -11,6 +11,8 @@ from typing import Any
 
 import trimesh
 
+from patchproof.base.settings import SceneSettings, load_scene_settings
+from patchproof.base.strict import Refused, validated
 from patchproof.mesh.load_mesh import glb_of
 from patchproof.scene.flat import FlatScene
 from patchproof.scene.image_scene import load_image_scene
@@ -19,8 +21,6 @@ from patchproof.scene.interface import Scene as Scene
 from patchproof.scene.mesh_scene import MeshScene, TextureScene
 from patchproof.scene.patch_scene import OpenScene, PatchScene, load_mesh_scene
 from patchproof.scene.photo_scene import load_photo_scene
-from patchproof.settings import SceneSettings, load_scene_settings
-from patchproof.strict import Refused, validated
 
 
 def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from patchproof.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
-from patchproof.input import is_file, opened_picture
+from patchproof.base.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
+from patchproof.base.input import is_file, opened_picture
+from patchproof.base.settings import PatchSettings
+from patchproof.base.strict import Refused, expand, nearest
 from patchproof.mesh.mesh import Material, Mesh
 from patchproof.mesh.texels import coverage, face_counts
 from patchproof.mesh.unwrap import has_place, unwrap
-from patchproof.settings import PatchSettings
-from patchproof.strict import Refused, expand, nearest
 
 TEXELS = 1024  # side of a texture that has to be made: 0.7 mm per texel over a cube of 300 mm
 GUTTER_TEXELS = 1.5  # every texel that a face touches and one more: what bilinear look-ups within the face can read

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.page import lay_out_parts
@@ -27,7 +28,6 @@ from patchproof.sheets.piece import (
 from patchproof.sheets.rects import holds
 from patchproof.sheets.template import Template, load_template, template_names
 from patchproof.sheets.write import write_page, write_sheet
-from patchproof.strict import Refused
 
 BLANK, CHART = "blank", "chart"
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from patchproof.base.strict import Refused, validated
 from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.page import furnished
@@ -18,7 +19,6 @@ from patchproof.sheets.piece import DICTIONARY, MODULES, marker_at, page_id
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardGrid, BoardTemplate, template_data, template_names
 from patchproof.sheets.write import write_page
-from patchproof.strict import Refused, validated
 
 KIND = "board"
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.output import image_bytes
+from patchproof.base.output import image_bytes
+from patchproof.base.strict import Refused
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import WHOLE_PIECE, Design, Manifest, Promise, Swatch, design_sha256
 from patchproof.sheets.piece import Piece, on_paper, printed
 from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import BoardTemplate, Template
-from patchproof.strict import Refused
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
 
+from patchproof.base.strict import Refused
 from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheets.piece import PieceMarker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet
 from patchproof.sheets.template import Rulers, TextLine
-from patchproof.strict import Refused
 
 TICK_MM = 0.15
 SLACK_MM = 1e-3  # that parts may touch by

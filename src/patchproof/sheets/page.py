@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
+from patchproof.base.strict import Refused
 from patchproof.sheets.chart import chart_swatches
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, PageLayout, Parts, prove_apart, quiet_box, ruler_parts, text_box
@@ -26,7 +27,6 @@ from patchproof.sheets.piece import (
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grown, moved, rounded, size_text
 from patchproof.sheets.template import BoardTemplate, Template, TextLine, template_names
-from patchproof.strict import Refused
 
 CUT_LINE_MM = 0.2  # drawn wholly outside the cut, so that no ink of it stays on the piece
 BETWEEN_MM = 4.0  # of white paper from piece to piece, for scissors

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from patchproof.geometry import MM_PER_INCH
+from patchproof.base.geometry import MM_PER_INCH
 from patchproof.sheets.fonts import font_name
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.page import CUT_LINE_MM

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.color import codes_of, linear_from_srgb, srgb_from_linear
-from patchproof.settings import identifying
+from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.base.settings import identifying
+from patchproof.base.strict import Refused, Strict, nearest
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.rects import PointMm, RectMm, grown
-from patchproof.strict import Refused, Strict, nearest
 
 DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")

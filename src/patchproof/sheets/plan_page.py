@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from patchproof.base.strict import Refused
 from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheets.layout import Box, Line, PageLayout, prove_apart, text_box
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.rects import PointMm, RectMm
 from patchproof.sheets.template import Template, TextLine
-from patchproof.strict import Refused
 
 PICTURE_SHARE = 0.42  # of the page's height at most
 ABOVE_MM, BESIDE_MM = 13.0, 22.0  # for the dimension chains

@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.geometry import MM_PER_INCH
-from patchproof.input import LARGEST_JSON, OutOfTime, Result, is_file, left_behind, within_time
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.input import LARGEST_JSON, OutOfTime, Result, is_file, left_behind, within_time
+from patchproof.base.strict import Refused, validated
 from patchproof.sheets.manifest import Manifest, Tile
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
-from patchproof.strict import Refused, validated
 
 LARGEST_PX = 20_000  # along a side,
 MOST_PX = 160_000_000  # and in all: 0.5 GB, A2 at 600 dpi

@@ -17,6 +17,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import PageLayout, joined
 from patchproof.sheets.manifest import Manifest, design_sha256
@@ -28,7 +29,6 @@ from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import PointMm, size_text
 from patchproof.sheets.template import Template
 from patchproof.sheets.write import manifest_paths, pdf_name, save_sheets
-from patchproof.strict import Refused
 
 
 def write_several(

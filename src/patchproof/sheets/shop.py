@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from patchproof.geometry import MM_PER_INCH
-from patchproof.strict import Refused
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.strict import Refused
 
 _MM = MM_PER_INCH / 72
 _LOSSLESS = {"/FlateDecode", "/LZWDecode", "/RunLengthDecode", "/ASCII85Decode", "/ASCIIHexDecode"}

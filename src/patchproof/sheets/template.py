@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from patchproof.strict import (
+from patchproof.base.strict import (
     Finite,
     NotNegative,
     Positive,

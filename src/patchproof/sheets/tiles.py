@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.fonts import text_width_mm
 from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
@@ -23,7 +24,6 @@ from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, mark
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
-from patchproof.strict import Refused
 
 BLEED_MM = 1.0  # of the piece's picture on a flap
 MARKERS = 5  # of a tile's own: whichever corner is hidden, four are left that surround most of it

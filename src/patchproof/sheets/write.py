@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from patchproof.output import write_together
+from patchproof.base.output import write_together
+from patchproof.base.strict import Refused, Strict
 from patchproof.sheets.content import PrintedPiece, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
@@ -23,7 +24,6 @@ from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardTemplate, Template
 from patchproof.sheets.tile_pages import tile_pages
-from patchproof.strict import Refused, Strict
 
 
 def write_sheet(

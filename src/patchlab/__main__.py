@@ -1,0 +1,5 @@
+"""`python -m patchlab`."""
+
+from patchlab.cli import main
+
+main()

@@ -1,0 +1,118 @@
+"""The knobs of detection: at which size the search starts, how corners are refined, how large photographs are.
+
+In: photographs of flat paper. Out: a chart by photo size: milliseconds per photograph against the error of the
+design's corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from patchlab.bench.chart import Chart, Check, OnStage, Point
+from patchlab.bench.measure import clocked
+from patchlab.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
+from patchproof.base.claims import median
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.complete import find_sheet
+from patchproof.photo.detect import COARSEST_PX, DICTIONARY, levels, look, printed_markers, whole
+from patchproof.photo.rectify import fit_page
+from patchproof.report.tables import Table
+
+SIZES_PX = ((1600, 1200), (2400, 1800), (4000, 3000))
+COARSEST = (500, COARSEST_PX, 2000)
+ASIDE_DEG = 50.0
+MOST_MS = 333.0  # 12 megapixels, three a second
+
+Corners = dict[int, np.ndarray]
+Find = Callable[[np.ndarray, int], Corners]
+Shot = tuple[np.ndarray, Sheet]  # a photograph, and where its millimeters truly lie
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Milliseconds per photograph, all errors of the design's corners in px (infinite without a fit), and the share of
+    markers that was found.
+    """
+
+    milliseconds: list[float]
+    errors_px: np.ndarray
+    share: float
+
+
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """Start size and refinement, one chart per photo size."""
+    count = 3 if quick else 12
+    for number, size_px in enumerate(SIZES_PX):
+        yield _levels_chart([shoot(size_px, seed) for seed in range(count)], size_px)
+        on_stage("detect", number + 1, len(SIZES_PX))
+
+
+def _levels_chart(shots: list[Shot], size_px: tuple[int, int]) -> Chart:
+    megapixels, points, shares = round(size_px[0] * size_px[1] / 1e6), [], []
+    for coarsest_px in COARSEST:
+        for name, find in (("fitted", find_fitted), ("OpenCV's", find_plain)):
+            trial, setting = tried(shots, find, coarsest_px), f"{coarsest_px} px, {name}"
+            cost, error = median(trial.milliseconds), median(trial.errors_px)
+            points.append(Point(setting, cost, error, coarsest_px == COARSEST_PX and find is find_fitted))
+            shares.append((setting, trial.share))
+    default = next(point for point in points if point.default)
+    checks = [Check("px of corner error by default", default.at[1], 0.1)]
+    if size_px == SIZES_PX[-1]:
+        checks.append(Check("milliseconds by default", default.at[0], MOST_MS))
+    return Chart(
+        name=f"levels_{megapixels}mp",
+        title=f"Detection in photographs of {megapixels} MP: start size and refinement",
+        cost="milliseconds of processor time per photograph (median)",
+        error="error of the design's corners, px (median)",
+        series={f"{megapixels} MP": points},
+        about="The search starts at so many px; corners are fitted or OpenCV's. "
+        f"{len(shots)} photographs, tilt to 60°, blur to 1.2 px, JPEG 60 to 95; decoding is not counted.",
+        checks=tuple(checks),
+        tables=(Table(f"found_{megapixels}mp", "Markers found", ("setting", "share"), tuple(shares)),),
+    )
+
+
+def shoot(size_px: tuple[int, int], seed: int) -> Shot:
+    """One photograph of flat paper from a fixed seed."""
+    sheet, rng = drawn_sheet("flat", seed, size_px, ASIDE_DEG)
+    return photographed(sheet, rng), sheet
+
+
+def find_fitted(srgb: np.ndarray, coarsest_px: int) -> Corners:
+    """Corners as patchproof takes them."""
+    return find_sheet(srgb, frozenset(corners_mm()), corners_mm(), DICTIONARY, coarsest_px).corners_px
+
+
+def find_plain(srgb: np.ndarray, coarsest_px: int) -> Corners:
+    """Corners as OpenCV refines them on the level that first shows each marker."""
+    quads: dict[int, list[np.ndarray]] = {}
+    for level in levels(srgb, whole(srgb), coarsest_px):
+        look(srgb, whole(srgb), level, printed_markers(DICTIONARY), quads)
+        if corners_mm().keys() <= quads.keys():
+            break
+    return {i: quads[i][0] for i in quads if i in corners_mm()}
+
+
+def tried(shots: list[Shot], find: Find, coarsest_px: int) -> Trial:
+    """A way to find corners on all photographs."""
+    milliseconds, errors, markers = [], [], 0
+    for photo, sheet in shots:
+        corners, taken = clocked(partial(find, photo, coarsest_px))
+        milliseconds.append(taken)
+        markers += len(corners)
+        errors.append(_errors(corners, sheet))
+    return Trial(milliseconds, np.concatenate(errors), markers / (len(shots) * len(corners_mm())))
+
+
+def _errors(corners: Corners, sheet: Sheet) -> np.ndarray:
+    design = rect_corners(DESIGN_MM)
+    try:
+        fit = fit_page(corners, corners_mm())
+    except (CannotJudge, np.linalg.LinAlgError):
+        return np.full(4, np.inf)
+    return np.linalg.norm(apply_homography(fit.px_from_mm, design) - sheet.px(design), axis=1)

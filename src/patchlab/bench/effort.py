@@ -1,0 +1,105 @@
+"""The whole tool: what a draft, the default and three times its effort take, and how good their designs are.
+
+In: five of the package's own objects before the built-in classifier, in the demo's hard conditions. Out: one chart, and
+a table of seconds and promises. A run is timed from its scene to the promise with controls, in one process on one
+thread, so that its seconds compare with those of its other efforts. The designs of an object are judged in the same
+fresh conditions.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+from patchlab.bench.chart import Chart, OnStage, Point
+from patchproof.app.demo import SCENE
+from patchproof.base.claims import Estimate, rate
+from patchproof.base.settings import OptimizeSettings, SceneSettings
+from patchproof.base.strict import validated
+from patchproof.base.workers import threads
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.responses import responses
+from patchproof.optimizer.run import DRAFT, THOROUGH, Run, optimize_scene
+from patchproof.report.tables import Table
+from patchproof.scene.scene import Scene, build_scene
+
+# By label, all from above: the primitive, its length, how far the piece is off its middle, and its size, in mm.
+OBJECTS = {
+    "box truck": ("box_truck", 400, 45, 147),
+    "carton": ("carton", 300, 0, 140),
+    "chair": ("chair", 450, 0, 140),
+    "mailbox": ("mailbox", 400, 0, 90),
+    "table lamp": ("table_lamp", 450, 0, 90),
+}
+DEFAULT = "default"
+# By name the steps, and the views of the promise (None: as many as the scene's half width needs).
+EFFORTS = {"draft": DRAFT, DEFAULT: (OptimizeSettings().steps, None), "thorough": THOROUGH}
+QUICK_EFFORTS = {"draft": DRAFT, DEFAULT: (2 * DRAFT[0], 2 * DRAFT[1])}
+
+
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """The one chart."""
+    labels = list(OBJECTS)[:1] if quick else list(OBJECTS)
+    yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, on_stage)
+
+
+def effort_chart(
+    labels: list[str], efforts: Mapping[str, tuple[int, int | None]], judged: int, on_stage: OnStage
+) -> Chart:
+    """Each effort's seconds beside the default's against the share of `judged` views that its design misses."""
+    series, rows = {}, []
+    for label in labels:
+        runs = {}
+        for name, (steps, views) in efforts.items():
+            runs[name] = _timed_run(_scene(label, steps), views)
+            on_stage("runs", len(series) * len(efforts) + len(runs), len(labels) * len(efforts))
+        missed = _missed({name: run for name, (run, _) in runs.items()}, judged)
+        seconds = {name: taken for name, (_, taken) in runs.items()}
+        series[label] = [
+            Point(name, seconds[name] / seconds[DEFAULT], missed[name], name == DEFAULT) for name in efforts
+        ]
+        for name, (run, taken) in runs.items():
+            low, high = run.promise.interval
+            best = max(claim.rate for claim in run.promise.controls.values())
+            rows.append((label, name, taken, run.promise.rate, (high - low) / 2, best, 1 - missed[name].value))
+    head = ("object", "effort", "seconds", "promised", "half width", "best control", "rate of fresh views")
+    return Chart(
+        name="effort",
+        title="A draft, the default, and three times the steps with four times the promise",
+        cost="seconds from the scene to its promise, relative to the default",
+        error=f"share of {judged} fresh views in which the design is not recognized",
+        series=series,
+        about="One run of each, in one process on one thread; intervals are over the views.",
+        tables=(Table("effort_runs", "Runs", head, tuple(rows), "seconds on this machine"),),
+    )
+
+
+def _scene(label: str, steps: int) -> Scene:
+    primitive, length_mm, off_mm, size_mm = OBJECTS[label]
+    settings: dict[str, Any] = tomllib.loads(SCENE)
+    settings["object"] |= {"mesh": f"primitive:{primitive}", "length_mm": length_mm}
+    settings["patch"] |= {"offset_mm": [0, off_mm], "width_mm": size_mm, "height_mm": size_mm}
+    settings["target"]["label"] = label
+    settings["optimize"]["steps"] = steps
+    return build_scene(validated(SceneSettings, settings, label), Path())
+
+
+def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
+    with TemporaryDirectory() as folder, threads(1):
+        begin = perf_counter()
+        run = optimize_scene(scene, Path(folder) / "run", promise_views=views)
+        return run, perf_counter() - begin
+
+
+def _missed(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:
+    """By name the share of the same fresh views in which each run's design is not recognized."""
+    problem = set_problem(next(iter(runs.values())).scene)
+    shown = {name: problem.subject.shown(from_pixels(run.design), "design") for name, run in runs.items()}
+    answers = responses(problem, shown, problem.scene.draw("evaluate", judged))
+    missed = {name: rate([not hit for hit in answer.recognized[0]]) for name, answer in answers.items()}
+    return {name: estimate for name, estimate in missed.items() if estimate is not None}

@@ -1,0 +1,141 @@
+"""Photographs of paper whose true place is known: flat, through a lens that bends, or rolled.
+
+In: a seed. Out: `Sheet`s and photographs. A frame of eight markers is drawn by OpenCV; every pixel is traced back to
+the paper by OpenCV's lens and a ray through a cylinder, and developed by means of this module's own (area-averaged
+look-up, Gaussian blur and noise in linear light, JPEG), so that neither our renderer nor our page nor our models of a
+sheet are their own judges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from patchproof.base.color import photo_codes_of, srgb_from_linear
+from patchproof.base.geometry import intrinsics, look_at, rect_corners
+from patchproof.photo.detect import DICTIONARY, printed_markers
+
+Kind = Literal["flat", "lens", "rolled"]
+PIECE_MM, MARKER_MM = 140.0, 14.0
+DESIGN_MM = (20.0, 20.0, 100.0, 100.0)
+SIZE_PX = (1600, 1200)
+LENS = np.array([-0.12, 0.03, 5e-4, -5e-4, 0.0])  # k1 k2 p1 p2 k3: a wide phone camera
+RADII_MM = (100.0, 400.0)
+ASIDE_DEG = 35.0  # rolled paper hides a part of itself beyond
+_RASTER_PX_PER_MM = 10
+_SAMPLES = 3  # along each side of a pixel
+_AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])  # the piece's corners, as shares of it
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Paper before a camera (mm, z into the paper): flat where `curvature` (1/mm) is 0, else rolled about its upright
+    middle.
+    """
+
+    camera_from_piece: np.ndarray
+    matrix_px: np.ndarray
+    size_px: tuple[int, int]
+    terms: np.ndarray
+    curvature: float
+
+    def px(self, mm: np.ndarray) -> np.ndarray:
+        """Where points N×2 of the paper are seen, N×2."""
+        x, y = np.asarray(mm, float).T
+        along, k = x - PIECE_MM / 2, self.curvature
+        away = (1 - np.cos(k * along)) / k if k else 0 * x
+        points = np.column_stack([PIECE_MM / 2 + (np.sin(k * along) / k if k else along), y, away])
+        turn, move = cv2.Rodrigues(self.camera_from_piece[:3, :3])[0], self.camera_from_piece[:3, 3]
+        return cv2.projectPoints(points, turn, move, self.matrix_px, self.terms)[0].reshape(-1, 2)
+
+    def mm(self, px: np.ndarray) -> np.ndarray:
+        """Which point N×2 of the paper is seen at pixels N×2; NaN where none is."""
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
+        bent = px.reshape(-1, 1, 2), self.matrix_px, self.terms
+        before_5 = getattr(cv2, "undistortPointsIter", None)  # what OpenCV 4 calls it with a criterion
+        straight = before_5(*bent, None, None, stop) if before_5 else cv2.undistortPoints(*bent, criteria=stop)
+        ray = straight.reshape(-1, 2)
+        rotation, k = self.camera_from_piece[:3, :3], self.curvature
+        ray = np.column_stack([ray, np.ones(len(ray))]) @ rotation
+        eye = -rotation.T @ self.camera_from_piece[:3, 3] - [PIECE_MM / 2, 0, 0]
+        if not k:
+            points = eye - ray * (eye[2] / ray[:, 2])[:, None]
+            return points[:, :2] + [PIECE_MM / 2, 0]
+        radius = 1 / k
+        a, b = (ray[:, [0, 2]] ** 2).sum(1), ray[:, 0] * eye[0] + ray[:, 2] * (eye[2] - radius)
+        rest = b * b - a * (eye[0] ** 2 + (eye[2] - radius) ** 2 - radius**2)
+        far = (-b - np.sign(radius) * np.sqrt(np.where(rest > 0, rest, np.nan))) / a
+        x, y, z = (eye[i] + far * ray[:, i] for i in range(3))
+        return np.column_stack([radius * np.arctan2(x * k, 1 - z * k) + PIECE_MM / 2, y])
+
+
+@lru_cache(maxsize=1)
+def corners_mm() -> dict[int, np.ndarray]:
+    """The frame's markers: corners and middles of the piece's sides."""
+    near, middle, far = 2.0, (PIECE_MM - MARKER_MM) / 2, PIECE_MM - 2.0 - MARKER_MM
+    places = [(x, y) for y in (near, middle, far) for x in (near, middle, far) if (x, y) != (middle, middle)]
+    return {100 + i: rect_corners([x, y, MARKER_MM, MARKER_MM]) for i, (x, y) in enumerate(places)}
+
+
+def drawn_sheet(
+    kind: Kind, seed: int, size_px: tuple[int, int] = SIZE_PX, aside_deg: float = ASIDE_DEG
+) -> tuple[Sheet, np.random.Generator]:
+    """A sheet that fills a third of a photograph's height or so, and what draws the rest of its photograph."""
+    rng = np.random.default_rng([seed, 1])
+    azimuth, elevation = np.radians(rng.uniform([-aside_deg, -30], [aside_deg, 30]))
+    toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    world_from_piece = np.diag([1.0, -1.0, -1.0, 1.0])
+    world_from_piece[:2, 3] = [-PIECE_MM / 2, PIECE_MM / 2]
+    camera_from_world = look_at(rng.uniform(350, 700) * np.array(toward), [0, 0, 0], rng.uniform(-20, 20))
+    curvature = rng.choice([-1, 1]) / rng.uniform(*RADII_MM) if kind == "rolled" else 0.0
+    terms = LENS if kind == "lens" else np.zeros(5)
+    pose, matrix = camera_from_world @ world_from_piece, intrinsics(50.0, size_px)
+    return Sheet(pose, matrix, size_px, terms, float(curvature)), rng
+
+
+def photographed(sheet: Sheet, rng: np.random.Generator) -> np.ndarray:
+    """uint8 H×W×3 photograph of the sheet over something soft."""
+    clutter = rng.uniform(0.05, 0.6, (24, 32)).astype(np.float32)
+    picture, raster = cv2.resize(clutter, sheet.size_px, interpolation=cv2.INTER_CUBIC), _raster(rng)
+    border = sheet.px(np.concatenate([PIECE_MM * np.linspace(a, b, 50) for a, b in pairwise(_AROUND)]))
+    left, top = np.clip(np.floor(border.min(0)).astype(int) - 2, 0, sheet.size_px)
+    right, bottom = np.clip(np.ceil(border.max(0)).astype(int) + 2, 0, sheet.size_px)
+    y, x = np.mgrid[top:bottom, left:right] + 0.5
+    mm = sheet.mm(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 2)
+    # the map from pixels to paper is smooth: between pixels it is straight to a thousandth of one
+    fine = (_SAMPLES * (right - left), _SAMPLES * (bottom - top))
+    at = cv2.resize(np.nan_to_num(mm, nan=-1e3).astype(np.float32), fine, interpolation=cv2.INTER_LINEAR)
+    inside = np.asarray(((at > 0) & (at < PIECE_MM)).all(2), np.float32)
+    column, row = cv2.split(at * _RASTER_PX_PER_MM - 0.5)
+    light = cv2.multiply(inside, cv2.remap(raster, column, row, cv2.INTER_NEAREST))
+    light, cover = (cv2.resize(part, x.shape[::-1], interpolation=cv2.INTER_AREA) for part in (light, inside))
+    picture[top:bottom, left:right] = picture[top:bottom, left:right] * (1 - cover) + light
+    return _developed(picture, rng)
+
+
+def _raster(rng: np.random.Generator) -> np.ndarray:
+    """Light of the piece: markers, and a soft design."""
+    side, marker_px = (round(mm * _RASTER_PX_PER_MM) for mm in (PIECE_MM, MARKER_MM))
+    raster = np.full((side, side), 0.95, np.float32)
+    x, y, width, height = (round(v * _RASTER_PX_PER_MM) for v in DESIGN_MM)
+    design = rng.uniform(0.05, 0.9, (12, 12)).astype(np.float32)
+    raster[y : y + height, x : x + width] = cv2.resize(design, (width, height), interpolation=cv2.INTER_LINEAR)
+    for marker_id, corners in corners_mm().items():
+        column, row = np.round(corners[0] * _RASTER_PX_PER_MM).astype(int)
+        code = cv2.aruco.generateImageMarker(printed_markers(DICTIONARY), marker_id, marker_px) / 255
+        raster[row : row + marker_px, column : column + marker_px] = 0.03 + 0.92 * code
+    return raster
+
+
+def _developed(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """uint8 H×W×3: the light H×W with drawn exposure, blur, noise and JPEG."""
+    light = cv2.GaussianBlur(rng.uniform(0.3, 0.9) * light, (0, 0), rng.uniform(0.3, 1.2))
+    light += rng.normal(0, rng.uniform(0, 0.01), light.shape).astype(np.float32)
+    codes = photo_codes_of(srgb_from_linear(light.clip(0, 1)))
+    jpeg = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(60, 96))])[1]
+    return np.repeat(np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE))[..., None], 3, 2)

@@ -1,0 +1,211 @@
+"""Our designs beside those of other tools and recipes, on the same piece, for as many passes and in the same views.
+
+In: scene files with meshes, networks, seeds; for the benchmark, the demo's scene. A cell is one of each: every method
+makes a design for the scene's piece (`bench.methods`), then all hang in it under conditions of the evaluate stream,
+beside the bare object and gray. Out: rates, gains over the best control, ours minus each, passes and seconds; pictures.
+
+A gain counts in the direction of the goal: with `deceive`, a rate that falls. Unlike in other studies the tables hold
+times, which differ from run to run: seconds of one core, with all that a method prepares but without the network's
+loading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.measure import clocked
+from patchlab.bench.methods import METHODS, load_art
+from patchlab.paper.patch3d import patch_cells
+from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import Count, GridSettings, Seeds, grouped, of_values, problem_of, who, with_tables
+from patchlab.study.pictures import contact_sheet, enlarged, photographs
+from patchlab.study.record import gain_of, hardest, rate_of, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchproof.app.demo import demo_scene
+from patchproof.base.claims import clustered, median, paired_means
+from patchproof.base.strict import Refused
+from patchproof.base.workers import threads
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
+from patchproof.report.images import png
+from patchproof.report.tables import Drawing, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Peer = Literal["sign", "flat", "art"]
+PEERS: tuple[Peer, ...] = ("sign", "flat", "art")
+PEERS_ALWAYS: tuple[Peer, ...] = ("sign", "flat")  # those that need no extra
+CONTROLS = ("bare", "gray")
+_TILE_PX = 192
+_QUICK_STEPS, _QUICK_VIEWS = 30, 40
+
+
+class PeersSettings(GridSettings):
+    """How long designs are trained stands in each scene's [optimize]; every method has as many passes."""
+
+    seeds: Seeds = (0, 1, 2)  # of the scenes' draws
+    # What ours is held against: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[peers]"`).
+    peers: Annotated[tuple[Peer, ...], Field(min_length=1)] = PEERS
+    n: Count = 400  # conditions per cell, of the evaluate stream
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Ours and its peers."""
+        return ("ours", *self.peers)
+
+
+def cells(settings: PeersSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network and seed."""
+    if "art" in settings.peers:
+        load_art()  # refused before hours of other methods
+    return patch_cells(settings, base)
+
+
+def run(settings: PeersSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Every method's design for one object, network and seed, in the same views."""
+    problem = problem_of(base, cell.values)
+    made = {name: clocked(partial(METHODS[name], problem)) for name in settings.methods}
+    pixels = {name: design.pixels for name, (design, _) in made.items()}
+    controls = shown_with_controls(problem, pixels["ours"], CONTROLS)
+    things = {name: controls[name] for name in CONTROLS}
+    things |= {name: problem.subject.shown(from_pixels(each, problem.device)) for name, each in pixels.items()}
+    conditions = problem.scene.draw("evaluate", settings.n)
+    view = conditions[problem.scene.facing(conditions)][:1]
+    hung = [photographs(problem, things[name], view, _TILE_PX)[0] for name in pixels]
+    return {
+        **recorded(responses(problem, things, conditions)),
+        "passes": {name: design.passes for name, (design, _) in made.items()},
+        "seconds": {name: milliseconds / 1000 for name, (_, milliseconds) in made.items()},
+        f"{cell.name}.png": contact_sheet([[enlarged(each, _TILE_PX) for each in pixels.values()], hung]),
+        **{f"{cell.name}-{name}.png": png(each) for name, each in pixels.items()},
+    }
+
+
+def tables(settings: PeersSettings, results: Sequence[Result]) -> list[Table]:
+    """Pooled, and cell by cell."""
+    return [_pooled(settings, results), _by_cell(settings, results)]
+
+
+def _pooled(settings: PeersSettings, results: Sequence[Result]) -> Table:
+    rows = []
+    for name in settings.methods:
+        behind = [gain_of(result, "ours", name) for result in results]
+        by_pair = [
+            float(np.mean([gain_of(result, "ours", name) for result in group]))
+            for group in grouped(results, of_values("name", "network")).values()
+        ]
+        rows.append(
+            (
+                name,
+                float(np.mean([rate_of(result, name) for result in results])),
+                clustered([gain_of(result, name, hardest(result, CONTROLS)) for result in results]),
+                *((None, None) if name == "ours" else (clustered(behind), clustered(by_pair))),
+                round(float(np.mean([result.answers["passes"][name] for result in results]))),
+                float(np.mean([result.answers["seconds"][name] for result in results])),
+            )
+        )
+    about = (
+        f"Rates in {settings.n} unseen views per cell, the same for all; differences are paired and count in the "
+        "direction of the goal. Intervals are bootstraps over cells (object, network and seed) and, in the column by "
+        "pair, over objects before networks with all their seeds: seeds of a pair are alike. n counts them; fewer "
+        "than 5 get none. A pass is a picture that the network sees in training or selection; seconds are of one core."
+    )
+    head = ("method", "rate", "gain over best control", "ours minus it", "by pair", "passes", "seconds")
+    return Table("pooled", "Ours and its peers, for as many passes", head, tuple(rows), about)
+
+
+def _by_cell(settings: PeersSettings, results: Sequence[Result]) -> Table:
+    names = (*CONTROLS, *settings.methods)
+    rows = tuple((*who(result), *(rate_of(result, name) for name in names)) for result in results)
+    return Table("cells", "Rates, cell by cell", ("object", "network", "seed", *names), rows)
+
+
+def figures(settings: PeersSettings, results: Sequence[Result]) -> list[Drawing]:
+    """Ours against each peer by cell, and the designs of each pair's first seed."""
+    firsts = [group[0] for group in grouped(results, of_values("name", "network")).values()]
+    return [
+        Drawing(
+            "scatter", "Ours against each peer, a point per cell", partial(_scatter, settings, results), (4.4, 4.2)
+        ),
+        picture_sheet(
+            "designs",
+            "Designs and how they look on the object: first seed of each object and network",
+            [(first.cell.name, first.file(f"{first.cell.name}.png")) for first in firsts],
+            (1.7 * len(settings.methods), 3.6 * len(firsts) + 0.3),
+            "Above the design's pixels, below the piece in one unseen view.",
+            columns=settings.methods,
+        ),
+    ]
+
+
+def _scatter(settings: PeersSettings, results: Sequence[Result], figure: Figure) -> None:
+    axes = figure.add_subplot()
+    for peer in settings.peers:
+        theirs, ours = ([rate_of(result, name) for result in results] for name in (peer, "ours"))
+        axes.plot(theirs, ours, "o", label=peer, alpha=0.7)
+    axes.plot([0, 1], [0, 1], color="#8a8f98", linewidth=0.8)
+    axes.set_xlabel("rate of the peer")
+    axes.set_ylabel("rate of ours")
+    axes.legend()
+
+
+STUDY = Study("peers", PeersSettings, cells, run, tables, figures)
+
+
+# The benchmark: the same on the demo's scene
+
+
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """Every method's time against its error on the demo's scene; ART where it is installed."""
+    with TemporaryDirectory() as folder:
+        base, peers = Path(folder), PEERS if _has_art() else PEERS_ALWAYS
+        seeds, n = (range(2), _QUICK_VIEWS) if quick else (range(5), 400)
+        settings = PeersSettings(scenes=(demo_scene(base).name,), seeds=tuple(seeds), peers=peers, n=n)
+        results = []
+        for cell in cells(settings, base):
+            if quick:
+                cell = replace(cell, values=with_tables(dict(cell.values), {"optimize": {"steps": _QUICK_STEPS}}))
+            with threads(1):
+                results.append(Result(cell, run(settings, base, cell), base))
+            on_stage("cells", len(results), len(settings.seeds))
+        yield peers_chart(settings, results)
+
+
+def peers_chart(settings: PeersSettings, results: Sequence[Result]) -> Chart:
+    """Seconds of each method, relative to ours, against the share of unseen views that its design loses."""
+    losses = np.array([[1 - rate_of(result, name) for name in settings.methods] for result in results])
+    points = []
+    for name, loss in zip(settings.methods, paired_means(losses), strict=True):
+        seconds = [result.answers["seconds"] for result in results]
+        cost = median([each[name] / each["ours"] for each in seconds])
+        points.append(Point(name, cost, loss, name == "ours"))
+    missing = "" if "art" in settings.peers else ' ART is not installed (`pip install "patchproof[peers]"`): left out.'
+    return Chart(
+        name="demo",
+        title="Ours and its peers on the demo's scene, for as many passes",
+        cost="time of one core, ÷ that of ours",
+        error=f"share of {settings.n} unseen views that are not recognized",
+        series={"methods": points},
+        about=f"{len(results)} seeds. Intervals are for comparing methods: what all share of a seed is taken out. More "
+        f"objects and networks: `patchlab study peers --config FILE.toml`.{missing}",
+        tables=tuple(tables(settings, results)),
+    )
+
+
+def _has_art() -> bool:
+    try:
+        load_art()
+    except Refused:
+        return False
+    return True

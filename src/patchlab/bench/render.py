@@ -1,0 +1,75 @@
+"""How large training's views have to be: a step's time against how far confidences lie from photographs'.
+
+In: the benchmarks' world. Out: one chart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.measure import ratio, timed
+from patchlab.bench.world import design_for_demo
+from patchproof.base.claims import student_mean
+from patchproof.base.output import image_pixels
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import ask
+from patchproof.render.photograph import expose
+from patchproof.render.pixels import PiecePicture
+from patchproof.report.tables import Table
+from patchproof.reprint.hung_sheet import take_photo
+from patchproof.scene.conditions import Conditions
+
+SIDES_PX = (96, 128, 192, 224, 384)  # and the default's
+
+
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """The one chart."""
+    problem, design = design_for_demo(80 if quick else 160, on_stage)
+    yield resolution_chart(problem, design, 6 if quick else 40, 2 if quick else 15, on_stage)
+
+
+def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, on_stage: OnStage) -> Chart:
+    """Sides at which views are rendered against whole photographs of the same conditions, JPEG files and all."""
+    shown = problem.patch.shown(trained)
+    conditions, (classifier,), (indices,) = problem.scene.draw("select", views), problem.classifiers, problem.indices
+
+    def pictures(side: int, picture: PiecePicture, part: Conditions) -> Tensor:
+        return expose(problem.see(picture, part, side), picture)
+
+    def confidence(photos: Tensor) -> np.ndarray:
+        return ask(problem, photos, None).confidence[0]
+
+    def step(side: int) -> None:
+        design = trained.clone().requires_grad_()
+        logits = classifier.logits(pictures(side, problem.patch.shown(design), conditions[:8]))
+        torch.autograd.grad(problem.losses(classifier, logits, indices).mean(), design)
+
+    sides, truth = sorted({*SIDES_PX, problem.training_px}), []
+    with torch.no_grad():
+        for i in range(views):
+            photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
+            truth.append(confidence(from_pixels(photo)[None])[0])
+            on_stage("photographs", i + 1, views)
+    seconds, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
+    for side in sides:
+        with torch.no_grad():
+            off = confidence(pictures(side, shown, conditions)) - truth
+        cost, is_default = ratio(seconds, side, problem.training_px), side == problem.training_px
+        points.append(Point(f"{side} px", cost, student_mean(np.abs(off)), is_default))
+        rows.append((f"{side} px", student_mean(off)))
+    photo_px = problem.scene.settings.camera.photo_px
+    return Chart(
+        name="resolution",
+        title="Side of training views",
+        cost="a whole step (render, classify, gradient), relative to the default",
+        error=f"mean |confidence - photograph's| ({views} views)",
+        series={f"{classifier.name}, input {classifier.input_px} px": points},
+        about=f"Truth: photographs of {photo_px[0]} × {photo_px[1]} px as JPEG files, reduced by the classifier.",
+        tables=(Table("resolution_bias", "Confidence minus photograph's", ("side", "mean difference"), tuple(rows)),),
+    )

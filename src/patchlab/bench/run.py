@@ -1,0 +1,63 @@
+"""Benchmarks: what each knob costs and what it buys, measured on this machine, as charts, tables and a page.
+
+In: the name of a benchmark. Out: a folder with `NAME.json`, `NAME.html`, and a CSV and PNG per chart. A benchmark is a
+generator of `Chart`s. A check that fails is reported, not raised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+
+from patchlab.bench.chart import Chart, OnStage, checks_table, failed_checks, points_table
+from patchlab.bench.draw import drawing
+from patchlab.bench.measure import describe, machine
+from patchproof.base.output import new_folder
+from patchproof.base.strict import Refused, nearest
+from patchproof.report.results import Results, write_results
+
+Bench = Callable[[bool, OnStage], Iterator[Chart]]
+BENCHES = ("render", "train", "effort", "printer", "detect", "evidence", "peers")  # modules with a `charts`
+_OWN = ("*.json", "*.html", "*_*.csv", "*_*.png")
+
+
+def run_bench(
+    name: str = "all",
+    out: str | Path = "patchlab-bench",
+    *,
+    quick: bool = False,
+    overwrite: bool = False,
+    on_stage: OnStage = lambda stage, done, total: None,
+) -> list[Results]:
+    """Run one benchmark, or `all`, into the folder `out`; returns what was written."""
+    if name not in ("all", *BENCHES):
+        raise Refused("the name of a benchmark", f'"{name}"', nearest(name, ("all", *BENCHES)))
+    written = []
+    with new_folder(out, _OWN, overwrite) as folder:
+        for bench in BENCHES if name == "all" else (name,):
+            charts = list(load_bench(bench)(quick, on_stage))
+            written.append(_results(bench, quick, charts))
+            write_results(folder, written[-1])
+    return written
+
+
+def load_bench(name: str) -> Bench:
+    """The generator of a benchmark's charts, imported when asked for."""
+    return import_module(f"patchlab.bench.{name}").charts
+
+
+def _results(name: str, quick: bool, charts: list[Chart]) -> Results:
+    about = machine()
+    tables = [table for chart in charts for table in (points_table(chart), *chart.tables)]
+    return Results(
+        kind="bench",
+        name=name,
+        about="What each setting costs and how far off it is, measured on this machine.",
+        extent=describe(about),
+        settings={"quick": quick},
+        tables=[*tables, checks_table(charts)],
+        figures=[drawing(chart, describe(about)) for chart in charts],
+        failed=failed_checks(charts),
+        more={"machine": about},
+    )

@@ -1,0 +1,105 @@
+"""The knobs of training: views per step, optimizer and step size.
+
+In: the demo's scene. Out: a chart per knob. Designs are compared on conditions of the evaluate stream, which neither
+trains nor selects. The cost of training is counted in views that the network sees, those of the selection set
+included; what one of them takes is `render`'s business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.world import demo_problem
+from patchproof.base.claims import paired_means
+from patchproof.base.settings import OptimizeSettings
+from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import responses
+
+VIEWS, QUICK_VIEWS = (2, 4, 8, 12, 24), (2, 4, 12)
+ADAM, QUICK_ADAM = (0.0075, 0.015, 0.03, 0.06, 0.12), (0.0075, 0.015, 0.03)  # step sizes
+SIGN, QUICK_SIGN = (0.01, 0.03, 0.1), (0.03,)
+
+USUAL = OptimizeSettings()
+Losses = Mapping[tuple[OptimizeSettings, int], Sequence[float]]  # by settings and training views, one per seed
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Training views of a whole run, of which half is charted, too; seeds; views that designs are compared on."""
+
+    views: int
+    seeds: int
+    judged: int
+
+
+def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+    """Every chart of training, one after the other."""
+    effort = Effort(120, 3, 64) if quick else Effort(960, 4, 256)
+    views = {f"{n}": USUAL.changed(views=n) for n in (QUICK_VIEWS if quick else VIEWS)}
+    moves = {f"adam {size:g}": USUAL.changed(step_size=size) for size in (QUICK_ADAM if quick else ADAM)}
+    for size in QUICK_SIGN if quick else SIGN:
+        moves[f"sign {size:g}"] = USUAL.changed(optimizer="sign", step_size=size)
+    losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, on_stage)
+    yield runs_chart("views", "Views per step, for as many views in all", views, losses, effort)
+    yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
+
+
+# Views per step, and how the design moves: quality after as many views
+
+
+def runs_chart(name: str, title: str, runs: Mapping[str, OptimizeSettings], losses: Losses, effort: Effort) -> Chart:
+    """Settings by name, after half of the views and after all, against the loss of what has been trained."""
+    columns = [(setting, run, end) for setting, run in runs.items() for end in ends_of(run, effort)]
+    series: dict[int, list[Point]] = {end: [] for end in sorted({end for _, _, end in columns})}
+    table = np.array([losses[run, end] for _, run, end in columns]).T
+    for (setting, run, end), loss in zip(columns, paired_means(table), strict=True):
+        cost = views_seen(run.changed(steps=end // run.views))
+        series[end].append(Point(setting, cost, loss, run == USUAL and end == effort.views))
+    return Chart(
+        name=name,
+        title=title,
+        cost="views that the network sees, selection included",
+        error=f"loss of the kept design on {effort.judged} new conditions",
+        series={f"trained on {end} views": points for end, points in series.items()},
+        about=f"{effort.seeds} seeds. Intervals are for comparing settings: what all settings of a seed share is taken "
+        f"out. A selection set of {SELECT_VIEWS} views is seen every {SELECT_AFTER} training views.",
+        one_front=True,
+    )
+
+
+def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
+    """Training views after which a run is charted: there the design was tried on the selection set."""
+    whole = run.changed(steps=effort.views // run.views)
+    return [end for end in (effort.views // 2, effort.views) if selects(whole, end // run.views)]
+
+
+def trained_losses(
+    problem: Problem, runs: Collection[OptimizeSettings], effort: Effort, on_stage: OnStage
+) -> dict[tuple[OptimizeSettings, int], list[float]]:
+    """Losses on new conditions, the same for every design."""
+    shown = {}
+    for seed in range(effort.seeds):
+        for i, run in enumerate(runs):
+            ends = ends_of(run, effort)
+            numbers = [end // run.views for end in ends]
+            designs = trained(problem.trained_by(run.changed(steps=numbers[-1]), seed), numbers)
+            shown |= {(run, end, seed): problem.subject.shown(d) for end, d in zip(ends, designs, strict=True)}
+            on_stage("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
+    answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)
+    return {
+        (run, end): [float(answers[run, end, seed].loss.mean()) for seed in range(effort.seeds)]
+        for run, end, _ in shown
+    }
+
+
+def trained(problem: Problem, numbers: Sequence[int]) -> list[Tensor]:
+    """The best design, as printed, after each of these numbers of steps (rising)."""
+    states: dict[int, State] = {step.state.number: step.state for step in steps(problem)}
+    return [from_pixels(as_pixels(states[number].best)) for number in numbers]

@@ -1,0 +1,159 @@
+"""The command `patchlab`: studies, benchmarks, hardened images, and the figures that they left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from typer.core import TyperCommand
+
+from patchproof.app.cli.console import (
+    Cluster,
+    Jobs,
+    Overwrite,
+    Resume,
+    carried_out,
+    names_of,
+    progress,
+    run_command_line,
+    say,
+    say_study,
+    version_option,
+)
+
+
+def harden(
+    images: Annotated[Path, typer.Argument(help="A folder of images.")],
+    labels: Annotated[Path, typer.Option(help="CSV: file name, label.")],
+    model: Annotated[str, typer.Option(help="Comma-separated classifiers to harden for, all together.")],
+    out: Annotated[Path, typer.Option(help="Folder for the PNGs and the tables.")],
+    method: Annotated[Literal["pgd", "fgsm", "adam"], typer.Option(help="How to step.")] = "pgd",
+    eps: Annotated[str, typer.Option(help='Largest change of a value in [0, 1]: 0.03, 8/255 or "none".')] = "8/255",
+    steps: Annotated[int, typer.Option(min=1, help="Steps.")] = 100,
+    step_size: Annotated[float | None, typer.Option(help="In place of the method's own.")] = None,
+    through: Annotated[float | None, typer.Option(help="ε of a PGD that each step goes through.")] = None,
+    judges: Annotated[str | None, typer.Option(help="Comma-separated classifiers that only judge.")] = None,
+    evaluate: Annotated[str, typer.Option(help="Attacks to withstand: fgsm, pgd.")] = "",
+    attack_eps: Annotated[str, typer.Option(help="Their ε.")] = "0.01,0.02,0.04",
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+    cluster: Cluster = None,
+) -> None:
+    """Change labeled images so that classifiers recognize them better, and attack them."""
+    from patchlab.harden.folder import HardenSettings, harden_images
+    from patchlab.study.study import Work
+    from patchproof.base.strict import validated
+
+    given = {
+        "images": str(images),
+        "labels": str(labels),
+        "models": names_of(model),
+        "together": True,
+        "judges": names_of(judges) or (),
+        "methods": (method,),
+        "epsilons": (eps,),
+        "steps": steps,
+        "step_size": step_size,
+        "through": through,
+        "attacks": names_of(evaluate),
+        "attack_epsilons": names_of(attack_eps),
+    }
+    with progress() as bar:
+        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("harden", done, total))
+        finished = harden_images(validated(HardenSettings, given, "the options"), out, work)
+    say_study(finished)
+    say(f"images: {out}, tables: {out / 'harden.html'}")
+    raise typer.Exit(0 if finished.results else 1)
+
+
+class ListsStudies(TyperCommand):
+    """A command whose help ends with all studies."""
+
+    def format_help(self, ctx, formatter) -> None:
+        """The usual help, then a line per study."""
+        from patchlab.study.study import STUDIES, first_line
+
+        super().format_help(ctx, formatter)
+        say("Studies (all keys of a config: patchlab keys NAME):")
+        say(*(f"  {name:<10} {first_line(module)}" for name, module in STUDIES.items()))
+
+
+def study(
+    name: Annotated[str, typer.Argument(help="One of the studies below.")],
+    config: Annotated[Path | None, typer.Option(help="What to vary: a TOML file.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for tables, figures and the page.")] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="Print its keys, as patchlab keys NAME does.")] = False,
+    example: Annotated[bool, typer.Option("--example", help="Print a config to start from.")] = False,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+    cluster: Cluster = None,
+) -> None:
+    """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
+    from patchlab.keys import documents, example_config
+    from patchlab.study.study import Work, run_study
+    from patchproof.app.cli.keys import keys_page
+
+    if keys or example:
+        print(keys_page(documents(), name) if keys else example_config(name), end="")
+        return
+    if config is None or out is None:
+        missing = "--config" if config is None else "--out"
+        raise typer.BadParameter("missing; a config to start from: --example", param_hint=missing)
+    with progress() as bar:
+        work = Work(resume, overwrite, jobs or 1, cluster, lambda done, total: bar("cells", done, total))
+        finished = run_study(name, config, out, work)
+    say_study(finished)
+    say(f"page: {out / name}.html")
+    raise typer.Exit(0 if finished.results else 1)
+
+
+def keys(name: Annotated[str | None, typer.Argument(help="A study; without one, all.")] = None) -> None:
+    """All keys of studies' configs: range, unit, default and meaning, as Markdown."""
+    from patchlab.keys import HEAD, documents
+    from patchproof.app.cli.keys import keys_page
+
+    print(keys_page(documents(), name, HEAD), end="")
+
+
+def table(name: Annotated[str | None, typer.Argument(help="A word of the heading; without one, all.")] = None) -> None:
+    """The current figures with their dates, commands and stored data, as Markdown."""
+    from patchlab.results.figures import figures_page
+
+    print(figures_page(name), end="")
+
+
+def bench(
+    name: Annotated[
+        str, typer.Argument(help="A benchmark: render, train, effort, printer, detect, evidence, peers, or all.")
+    ] = "all",
+    quick: Annotated[bool, typer.Option("--quick", help="Three minutes: fewer views, rounds and sizes.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for charts, tables and pages.")] = Path("patchlab-bench"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Speed against accuracy of each knob on this machine: charts, tables and a page."""
+    from patchlab.bench.run import run_bench
+
+    with progress() as bar:
+        written = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)
+    for results in written:
+        say_study(results)
+        say(f"page: {out / results.name}.html")
+
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Studies and benchmarks that produce the figures which patchproof's documents quote.",
+)
+app.command(cls=ListsStudies)(carried_out(study))
+for _verb in (bench, harden, table, keys):
+    app.command()(carried_out(_verb))
+app.callback()(version_option)
+
+
+def main() -> None:
+    """Run the command line."""
+    run_command_line(app)

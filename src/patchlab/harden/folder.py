@@ -1,0 +1,245 @@
+"""Photographs changed so that networks recognize them better, and what attacks leave of that.
+
+In: images, a CSV of file names and labels, networks. Out: PNGs under the images' names at their own sizes, and tables:
+accuracy clean and attacked, hardened beside original on the same photographs, per network, with 95 % intervals; how far
+the images moved. What is judged are the 8-bit PNGs as a reader of the file gets them. A cell of the table where a
+stronger attack leaves more than a weaker one is flagged: there the attack failed, not the network held.
+
+`harden_images` is the command's one setting; the study `harden` varies networks, methods and ε, and then its PNGs lie
+in `images/`. Originals are judged in cells of their own, once per network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from patchlab.harden.attacks import ATTACKS, right
+from patchlab.harden.harden import Epsilon, Method, epsilon_words, harden, moved, squares
+from patchlab.harden.labeled import in_blocks, labeled_files, read_large_enough
+from patchlab.study.grid import Count, Names, short_name
+from patchlab.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
+from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.output import image_bytes, write_whole
+from patchproof.base.strict import Positive, Refused, Share, Strict, expand
+from patchproof.classifier.labels import find_labels
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
+from patchproof.photo.cannot import CannotJudge
+from patchproof.report.tables import Table
+
+Attack = Literal["fgsm", "pgd"]
+Condition = tuple[str, float]  # an attack and its ε
+CLEAN: Condition = ("clean", 0.0)
+_RANKS = {"clean": 0, "fgsm": 1, "pgd": 2}
+
+
+class HardenSettings(Strict):
+    """Every method with every ε, for each network alone or for all of them together."""
+
+    images: str  # a folder of images
+    labels: str  # CSV: file name, label
+    models: Names  # hardened for, each alone
+    together: bool = False  # against the mean of the networks' losses
+    judges: tuple[str, ...] = ()  # networks that only judge
+    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("pgd",)  # how to step
+    # Largest change of a value in [0, 1]: 0.03, "8/255", or "none".
+    epsilons: Annotated[tuple[Epsilon, ...], Field(min_length=1)] = (8 / 255, 0.1, None)
+    steps: Count = 100  # of hardening
+    step_size: Positive | None = None  # in place of the method's own
+    # ε of the PGD that each step goes through: for images that withstand it, at eight times the passes.
+    through: Annotated[Share, Field(gt=0)] | None = None
+    attacks: tuple[Attack, ...] = ("fgsm", "pgd")  # that are to be withstood
+    attack_epsilons: tuple[Annotated[Share, Field(gt=0)], ...] = (0.01, 0.02, 0.04)  # the attacks' largest change
+
+
+def harden_images(settings: HardenSettings, out: str | Path, work: Work = HERE) -> Finished:
+    """Harden into the folder `out`: PNGs and labels.csv, which is again a labeled folder of images, and the tables."""
+    out, base = Path(out), Path.cwd()
+    if out.resolve() == Path(expand(settings.images, base)).resolve():
+        raise Refused("another folder for hardened images than the originals'", str(out), "choose another --out")
+    # PNGs beside the tables are this command's own only where its JSON says so
+    own = (*STUDY.own_files, "labels.csv", "*.png") if (out / "harden.json").is_file() else STUDY.own_files
+    finished = carry_out(replace(STUDY, own_files=own), settings, base, out, work)
+    lines = [f'{photo["png"]},"{photo["label"]}"\n' for photo in _photos(finished.results, _variants(settings)[0])]
+    write_whole(out / "labels.csv", lambda path: path.write_text("file,label\n" + "".join(lines), "utf-8"))
+    return finished
+
+
+def cells(settings: HardenSettings, base: Path) -> list[Cell]:
+    """Originals by network, and every variant, in blocks of photographs; networks and labels are checked here."""
+    folder = Path(expand(settings.images, base))
+    rows = labeled_files(folder, Path(expand(settings.labels, base)))
+    names = tuple(dict.fromkeys((*settings.models, *settings.judges)))
+    for name in names:
+        _truth(name, base, [label for _, _, label in rows])
+    variants, work = _variants(settings), []
+    for number, block in enumerate(in_blocks(folder, rows), 1):
+        photos = [{"file": file, "png": png, "label": label} for file, png, label in block]
+        for at, name in enumerate(names, 1):
+            work.append(Cell(f"original{at}_{number:04d}", {"photos": photos, "judges": [name]}))
+        for at, variant in enumerate(variants, 1):
+            words = f"{at:02d}_{variant['method']}_{epsilon_words(variant['epsilon']).replace('/', '-')}"
+            judges = list(dict.fromkeys((*variant["models"], *settings.judges)))
+            into = "" if len(variants) == 1 else f"images/{words}/"
+            values = {"photos": photos, "judges": judges, "variant": variant, "folder": into}
+            work.append(Cell(f"hardened{at}_{number:04d}", values))
+    return work
+
+
+def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """One block: hardened if it has a variant, then judged."""
+    values, folder = cell.values, Path(expand(settings.images, base))
+    photos, originals, unread = [], [], []
+    for photo in values["photos"]:
+        try:
+            originals.append(read_large_enough(folder / photo["file"]))
+            photos.append(photo | {"right": {}})
+        except CannotJudge as cannot:
+            unread.append({"file": photo["file"], "reason": cannot.advice})
+    labels, pictures, files = [photo["label"] for photo in photos], originals, {}
+    if photos and "variant" in values:
+        names, how = values["variant"]["models"], (values["variant"]["method"], values["variant"]["epsilon"])
+        networks, truth = [_classifier(name, base) for name in names], [_truth(name, base, labels) for name in names]
+        steps = settings.steps, settings.step_size, settings.through
+        pictures = harden(originals, truth, networks, *how, *steps)
+        for photo, original, picture in zip(photos, originals, pictures, strict=True):
+            files[values["folder"] + photo["png"]] = image_bytes(picture, "PNG")
+            photo["rms"], photo["ssim"] = moved(original, picture)
+    for name in values["judges"] if photos else ():
+        truth = torch.tensor(_truth(name, base, labels))
+        outcomes = _judged(settings, _classifier(name, base), pictures, truth)
+        for i, photo in enumerate(photos):
+            photo["right"][name] = [bool(outcome[i]) for outcome in outcomes]
+    return {"photos": photos, "unread": unread} | files
+
+
+def _judged(
+    settings: HardenSettings, classifier: Classifier, pictures: Sequence[np.ndarray], truth: torch.Tensor
+) -> list[torch.Tensor]:
+    """Under each condition, whether the network is right about the photographs."""
+    views, network = squares(pictures, classifier), classifier.network
+    with torch.no_grad():
+        outcomes = [right(network(views), truth)]
+    _, *attacks = _conditions(settings).values()
+    return outcomes + [ATTACKS[attack](network, views, truth, epsilon) for attack, epsilon in attacks]
+
+
+def tables(settings: HardenSettings, results: Sequence[Result]) -> list[Table]:
+    """Accuracy with intervals and flags, how far images moved, and what could not be read."""
+    rows, distances = [], []
+    for variant in _variants(settings):
+        for name in dict.fromkeys((*variant["models"], *settings.judges)):
+            rows += _accuracy_rows(settings, results, variant, name)
+        if photos := list(_photos(results, variant)):
+            rms, ssim = ([photo[kind] for photo in photos] for kind in ("rms", "ssim"))
+            row = (len(photos), float(np.mean(rms)), max(rms), float(np.mean(ssim)), min(ssim))
+            distances.append((*_words(variant), *row))
+    head = ("network", "hardened for", "method", "epsilon", "attack")
+    head = (*head, "original", "hardened", "gain", "gain by class", "flag")
+    about = (
+        "Share of photographs recognized (top-1), on the same photographs; an attacked one counts where it withstands "
+        "both a cross-entropy and a margin loss. By class: the mean of the classes' gains, its interval over classes."
+        " Flagged: a stronger attack leaves more than a weaker one."
+    )
+    moved_head = ("hardened for", "method", "epsilon", "photographs", "RMS", "largest RMS", "SSIM", "least SSIM")
+    all_tables = [
+        Table("accuracy", "Accuracy, hardened beside original", head, tuple(rows), about),
+        Table("moved", "How far the images moved", moved_head, tuple(distances), "RMS of values in [0, 1]."),
+    ]
+    if unread := {(photo["file"], photo["reason"]) for result in results for photo in result.answers["unread"]}:
+        all_tables.append(Table("unread", "What could not be read", ("file", "reason"), tuple(sorted(unread))))
+    return all_tables
+
+
+def _accuracy_rows(
+    settings: HardenSettings, results: Sequence[Result], variant: Mapping[str, Any], name: str
+) -> list[tuple]:
+    before, after = _outcomes(results, None, name), _outcomes(results, variant, name)
+    if not (files := [file for file in after if file in before]):
+        return []
+    conditions = _conditions(settings)
+    pairs = {
+        condition: [[some[file][i] for file in files] for some in (before, after)]
+        for i, condition in enumerate(conditions.values())
+    }
+    left = {
+        word: {condition: sum(pair[side]) for condition, pair in pairs.items()}
+        for side, word in enumerate(("original", "hardened"))
+    }
+    label = {photo["file"]: photo["label"] for photo in _photos(results, variant)}
+    classes = [[i for i, file in enumerate(files) if label[file] == each] for each in dict.fromkeys(label.values())]
+    group, *how = _words(variant)
+    start = (short_name(name), "itself" if variant["models"] == [name] else group, *how)
+    return [
+        (
+            *(*start, words, rate(old), rate(new), difference(new, old)),
+            clustered([float(np.mean([new[i] - old[i] for i in rows])) for rows in classes if rows]),
+            ", ".join(word for word, survivors in left.items() if too_strong(condition, survivors)),
+        )
+        for (words, condition), (old, new) in zip(conditions.items(), pairs.values(), strict=True)
+    ]
+
+
+def too_strong(condition: Condition, survivors: Mapping[Condition, int]) -> bool:
+    """Whether more survive this attack than some weaker one: nothing, a smaller ε, or FGSM against PGD."""
+    attack, epsilon = condition
+    return any(
+        survivors[condition] > count
+        for (other, smaller), count in survivors.items()
+        if _RANKS[other] <= _RANKS[attack] and smaller <= epsilon
+    )
+
+
+STUDY = Study("harden", HardenSettings, cells, run, tables, files=".", own_files=("images",))
+
+
+def _variants(settings: HardenSettings) -> list[dict[str, Any]]:
+    groups = [settings.models] if settings.together else [(name,) for name in settings.models]
+    return [
+        {"models": list(group), "method": method, "epsilon": epsilon}
+        for group in groups
+        for method in settings.methods
+        for epsilon in settings.epsilons
+    ]
+
+
+def _conditions(settings: HardenSettings) -> dict[str, Condition]:
+    """By what tables call it: clean, then each attack with each ε."""
+    attacks = [(attack, epsilon) for attack in settings.attacks for epsilon in settings.attack_epsilons]
+    return {"clean": CLEAN, **{f"{attack} {epsilon:g}": (attack, epsilon) for attack, epsilon in attacks}}
+
+
+def _words(variant: Mapping[str, Any]) -> tuple[str, str, str]:
+    return ", ".join(map(short_name, variant["models"])), variant["method"], epsilon_words(variant["epsilon"])
+
+
+@lru_cache(maxsize=4)  # a process works through one study: its networks stay loaded
+def _classifier(name: str, base: Path) -> Classifier:
+    return load_classifier(name, base)
+
+
+def _truth(name: str, base: Path, labels: Sequence[str]) -> list[int]:
+    """A network's indices of labels; refused where it does not have one."""
+    known = _classifier(name, base).labels
+    index = {label: find_labels(known, int(label) if label.isdigit() else label)[0] for label in dict.fromkeys(labels)}
+    return [index[label] for label in labels]
+
+
+def _photos(results: Sequence[Result], variant: Mapping[str, Any] | None) -> Iterator[Mapping[str, Any]]:
+    """The photographs of a variant, or the originals."""
+    for result in results:
+        if result.cell.values.get("variant") == variant:
+            yield from result.answers["photos"]
+
+
+def _outcomes(results: Sequence[Result], variant: Mapping[str, Any] | None, name: str) -> dict[str, Sequence[bool]]:
+    """By file, whether the network is right under each condition."""
+    return {photo["file"]: photo["right"][name] for photo in _photos(results, variant) if name in photo["right"]}

@@ -1,0 +1,68 @@
+"""A folder of labeled photographs, in blocks that fit into memory.
+
+In: a folder and a CSV of file names and labels. Out: rows with the name of each photograph's PNG; a head line is left
+out, files that are missing or named twice are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from patchproof.base.input import is_file, readable_formats
+from patchproof.base.strict import Refused
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.read import read_photo
+from patchproof.scene.image_scene import label_rows
+
+BLOCK_PHOTOS, BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
+SMALLEST_PX = 8  # of a photograph's shorter side
+_HEADS = {"file", "filename", "file_name", "image", "name"}
+
+
+def labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
+    """(file, its PNG's name, label) of every line; two files of one stem keep their suffixes in the PNG's name."""
+    rows = label_rows(table)
+    if rows and rows[0][0].casefold() in _HEADS and not is_file(folder / rows[0][0]):
+        rows = rows[1:]
+    missing = [file for file, _ in rows if not is_file(folder / file)]
+    if missing or not rows:
+        got = f"{len(missing)} missing ({missing[0]})" if missing else "none"
+        raise Refused(f"the images that {table.name} names in {folder}", got, "copy them there, or mend the table")
+    twice = next((file for file in (f for f, _ in rows) if [f for f, _ in rows].count(file) > 1), None)
+    if twice:
+        raise Refused(f"each file once in {table}", f"{twice} twice", "remove a line")
+    stems = [Path(file).with_suffix("").as_posix() for file, _ in rows]
+    return [
+        (file, (stem if stems.count(stem) == 1 else file) + ".png", label)
+        for (file, label), stem in zip(rows, stems, strict=True)
+    ]
+
+
+def in_blocks(folder: Path, rows) -> Iterator[list]:
+    """Rows in their order, in blocks that fit into memory; sizes from the files' heads."""
+    block, pixels = [], 0
+    for row in rows:
+        try:
+            with Image.open(folder / row[0], formats=readable_formats()) as image:
+                size = image.width * image.height
+        except Exception:  # what is no image is reported when it is read
+            size = 0
+        if block and (len(block) == BLOCK_PHOTOS or pixels + size > BLOCK_PX):
+            yield block
+            block, pixels = [], 0
+        block.append(row)
+        pixels += size
+    yield block
+
+
+def read_large_enough(path: Path) -> np.ndarray:
+    """A photograph as uint8 H×W×3; `CannotJudge` where it is no picture or a few pixels only."""
+    srgb = read_photo(path).srgb
+    if min(srgb.shape[:2]) < SMALLEST_PX:
+        shape = "×".join(map(str, srgb.shape[1::-1]))
+        raise CannotJudge("too_small", min(srgb.shape[:2]), SMALLEST_PX, f"{shape} px are too few: use a larger one")
+    return srgb

@@ -1,0 +1,58 @@
+"""Every key of studies' configs as one Markdown page, and a config of each to start from."""
+
+from __future__ import annotations
+
+from typing import get_type_hints
+
+from patchlab.study.study import STUDIES, load_study
+from patchproof.app.cli.keys import Documents, default_text, meanings, models_in, tables, toml_text
+
+HEAD = """# Keys of studies
+
+Printed by `patchlab keys`; for scenes and pages see `patchproof keys`.
+"""
+
+
+def documents() -> Documents:
+    """By name what a study's config is for, and its settings."""
+    studies = {name: load_study(name) for name in STUDIES}
+    return {
+        name: (f"`patchlab study {name} --config FILE.toml`: {study.about}", study.settings)
+        for name, study in studies.items()
+    }
+
+
+# what an example has where a key, or one of several, is required: files that a user has, or could make
+_EXAMPLES = {
+    "scenes": ("scene.toml",),
+    "scene": "scene.toml",
+    "runs": ("run",),
+    "run": "run",
+    "networks": ("builtin",),
+    "models": ("builtin",),
+    "classes": ("mug", "carton"),
+    "renders": ("scene.toml",),  # or images with labels
+    "images": "images",
+    "labels": "labels.csv",
+    "photos": ("photos",),
+    "kind": "charuco",
+}
+
+
+def example_config(name: str) -> str:
+    """A study's config to start from: what it requires, and all else at its default, commented out."""
+    study = load_study(name)
+    lines = [f"# {study.about}", f"# patchlab study {name} --config {name}.toml --out {name}"]
+    for path, model in tables(study.settings):
+        required = not path or study.settings.model_fields[path.strip("[]").partition(".")[0]].is_required()
+        if path:
+            lines += ["", f"{'' if required else '# '}{path.replace(']', '.mine]') if required else path}"]
+        for key, field in model.model_fields.items():
+            if any(True for _ in models_in(get_type_hints(model)[key])):
+                continue  # a table of its own
+            live = required and (field.is_required() or (key == "renders" and field.default == ()))
+            meaning = meanings(model).get(key, "")
+            value = toml_text(_EXAMPLES[key]) if live else default_text(field).strip("`")
+            value = value if value not in ("none", "required") else "..."
+            lines.append(f"{'' if live else '# '}{key} = {value}{'  # ' if meaning else ''}{meaning}")
+    return "\n".join(lines) + "\n"

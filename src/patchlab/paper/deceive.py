@@ -1,0 +1,105 @@
+"""Textures that hide an object from networks, beside gray, noise and shuffled controls.
+
+In: scenes that the networks read well, networks, seeds, and ways (by default a free texture and one within 8/255 of the
+original). Out: rates of the design, the original object and gray, noise and shuffled controls on the same conditions;
+the design minus each control, paired; contact sheets. The controls are the point: often plain gray alone hides an
+object, and only what a texture does beyond that is owed to its training. Controls ignore the ball.
+
+Source: Pestana et al., supplement, deceptive textures. For measuring the robustness of networks on objects that are
+yours to test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from patchlab.paper.sides import sides
+from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import grouped, of_values, problem_of, short_name
+from patchlab.study.pictures import contact_sheet, photographs
+from patchlab.study.record import Record, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained import TrainedSettings, Way, Word, tested_in, trained_cells, trained_on
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
+from patchproof.report.tables import Drawing, Table
+
+CONTROLS = ("bare", "gray", "noise", "shuffled")
+_KINDS = ("design", *CONTROLS)
+_SHEET_PX, _SHEET_VIEWS = 160, 4
+
+
+class DeceiveSettings(TrainedSettings):
+    """As in all studies of trained designs; each network trains alone and all of them test."""
+
+    # By name: tables of the scene file with the keys that change.
+    ways: dict[Word, Way] = Field(
+        {"free": {"patch": {"kind": "texture"}}, "within_8": {"patch": {"kind": "texture", "epsilon": 8 / 255}}},
+        min_length=1,
+    )
+
+
+def cells(settings: DeceiveSettings, base: Path) -> list[Cell]:
+    """One per scene, way, network and seed; the goal is `deceive` whatever the scene file says."""
+    return trained_cells(settings, base, variants=[({"target": {"goal": "deceive"}}, {})])
+
+
+def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Train against one network, show design and controls to all."""
+    problem = problem_of(base, cell.values)
+    design = best_design(trained_on(problem, cell))
+    things = shown_with_controls(problem, design, CONTROLS)
+    suffix, content = problem.subject.file(design)
+    views = sides(problem, _SHEET_VIEWS)
+    sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
+    return {
+        **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),
+        f"{cell.name}.sheet.png": sheet,
+        f"{cell.name}.{suffix}": content,
+    }
+
+
+def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:
+    """Rates of everything shown, and the design minus each control."""
+    rates, differences = [], []
+    for design, of_design in grouped(results, of_values("name", "way", "row")).items():
+        records = {kind: Record(of_design, kind) for kind in _KINDS}
+        for network in tested_in(of_design):
+            start = (*design, short_name(network))
+            levels = [record.level(network) for record in records.values()]
+            rates.append((*start, *(level[0] for level in levels), levels[0][1]))
+            differences.append((*start, *(records["design"].gain(records[kind], network)[0] for kind in CONTROLS)))
+    head, n = ("scene", "way", "trained on", "tested on"), f"{settings.n} unseen conditions per seed"
+    return [
+        Table("rates", "Rates", (*head, *_KINDS, "confidence"), tuple(rates), f"Over {n}."),
+        Table(
+            "differences",
+            "The design minus each control",
+            (*head, *(f"minus {kind}" for kind in CONTROLS)),
+            tuple(differences),
+            f"Of rates, paired over {n}: below zero hides the object better than what was not trained to.",
+        ),
+    ]
+
+
+def figures(settings: DeceiveSettings, results: Sequence[Result]) -> list[Drawing]:
+    """One contact sheet per scene, way and network: the design, then the controls."""
+    return [
+        picture_sheet(
+            f"sheet_{scene}_{way}_{row}",
+            f"{scene}, {way}, trained on {row}",
+            [("", of_design[0].file(f"{of_design[0].cell.name}.sheet.png"))],
+            (1.2 * _SHEET_VIEWS + 0.8, 1.2 * len(_KINDS)),
+            "In even light; the first seed.",
+            rows=_KINDS,
+        )
+        for (scene, way, row), of_design in grouped(results, of_values("name", "way", "row")).items()
+    ]
+
+
+STUDY = Study("deceive", DeceiveSettings, cells, run, tables, figures)

@@ -1,0 +1,158 @@
+"""Images by class for 2D patches: photographs named in a CSV, or renders of an object where none exist.
+
+In: a folder with its CSV, scenes with meshes, how a patch is pasted. Out: the classes and their scenes; a folder of
+PNGs with `labels.csv`, as a scene of images reads them. The bare object is rendered over its scene's backgrounds from
+training views, in training light and without camera effects, which the scene of images adds itself; light beyond sRGB
+white is clipped. Views that anything is measured on in 3D are never among them.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from pydantic import Field, model_validator
+
+from patchlab.study.grid import Values, scene_of
+from patchproof.base.color import srgb_from_linear
+from patchproof.base.settings import (
+    BackgroundSettings,
+    CameraSettings,
+    ObjectSettings,
+    OptimizeSettings,
+    PatchSettings,
+    PrinterSettings,
+    SceneSettings,
+    TargetSettings,
+    ViewSettings,
+)
+from patchproof.base.strict import Positive, PositiveRange, Range, Refused, Share, Strict, expand
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.pixels import as_pixels
+from patchproof.optimizer.responses import in_parts
+from patchproof.render.photograph import shade
+from patchproof.render.stage import Stage, set_stage
+from patchproof.render.views import see
+from patchproof.report.images import png
+from patchproof.scene.image_scene import ImageScene, labels_of, largest_share, load_image_scene
+from patchproof.sheets.piece import Piece
+
+_RENDER_PX = 384
+
+
+class PastedSettings(Strict):
+    """Images by class, and how a patch lies in them."""
+
+    images: str | None = None  # a folder of images
+    labels: str | None = None  # CSV: file name, label
+    renders: tuple[str, ...] = ()  # scenes with meshes: each is one more class, its target's
+    renders_each: Annotated[int, Field(ge=2)] = 64  # renders of each scene
+    made_px: Annotated[int, Field(ge=8, le=512)] = 60  # the patch's side in texels
+    shown_px: Positive = 30.0  # and in pixels of the network's own size
+    scale: PositiveRange = (0.8, 1.25)  # random, times shown_px
+    roll_deg: Range = (-22.5, 22.5)  # as in Brown et al.'s published program
+    erasing: Share = 0.5  # chance of Random Erasing in training
+    printer: PrinterSettings = PrinterSettings()  # as in a scene
+    camera: CameraSettings = CameraSettings()  # as in a scene
+    optimize: OptimizeSettings = OptimizeSettings()  # as in a scene
+
+    @model_validator(mode="after")
+    def _has_images(self):
+        if (self.images is None) != (self.labels is None):
+            raise ValueError("takes images and labels together")
+        if self.images is None and not self.renders:
+            raise ValueError("takes images and labels, or renders, or both")
+        return self
+
+
+@dataclass(frozen=True)
+class ImageClass:
+    """Images of one class: photographs named in a CSV, or renders of an object's scene."""
+
+    label: str | int
+    accept: tuple[str | int, ...] = ()
+    scene: Values | None = None  # of which they are renders
+
+
+def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], base: Path) -> list[ImageClass]:
+    """Every class that there are images of: a folder's by its CSV of labels, then one per scene to render."""
+    classes = []
+    if images is not None and table is not None:
+        for label in labels_of(Path(expand(images, base)), Path(expand(table, base))):
+            classes.append(ImageClass(int(label) if label.isdecimal() else label))
+    for values in scenes:
+        if values["scene"]["object"]["mesh"] is None:
+            do = "name photographs of it in the CSV of labels instead"
+            raise Refused("a scene with a mesh to render", values["file"], do)
+        target = values["scene"]["target"]
+        classes.append(ImageClass(target["label"], tuple(target["accept"]), values))
+    return classes
+
+
+def class_scene(
+    settings: PastedSettings, base: Path, images_of: ImageClass, classifier: Classifier, seed: int, folder: Path
+) -> ImageScene:
+    """A scene of one class's images, in which the patch has no frame; renders are written to `folder`."""
+    images, table = settings.images or "", settings.labels or ""
+    if images_of.scene is not None:
+        images, table = _render_class(images_of.label, images_of.scene, base, seed, settings.renders_each, folder)
+    scene = load_image_scene(scene_settings(settings, images_of, classifier, images, table), base, seed)
+    side = float(settings.made_px)
+    return replace(scene, piece=Piece((side, side), (), 1.0), sheet_id=f"patch2d:{seed}")
+
+
+def scene_settings(
+    settings: PastedSettings, images_of: ImageClass, classifier: Classifier, images: str, table: str
+) -> SceneSettings:
+    """A millimeter of the patch is one of its texels; its size in pictures follows from the network's own."""
+    side = settings.made_px
+    low, high = (settings.shown_px * factor / classifier.input_px for factor in settings.scale)
+    largest = largest_share(settings.roll_deg)
+    if high > largest:
+        raise Refused(
+            f"a patch of at most {largest * classifier.input_px:.0f} pixels before a network of {classifier.input_px}",
+            f"shown_px = {settings.shown_px:g} times {settings.scale[1]:g}",
+            "show it smaller",
+        )
+    return SceneSettings(
+        object=ObjectSettings(images=images, labels=table),
+        patch=PatchSettings(width_mm=side, height_mm=side),
+        target=TargetSettings(label=images_of.label, accept=images_of.accept, models=(classifier.name,)),
+        view=ViewSettings(patch_share=(low, high), roll_deg=settings.roll_deg),
+        background=BackgroundSettings(erasing=settings.erasing),
+        printer=settings.printer,
+        camera=settings.camera,
+        optimize=settings.optimize,
+    )
+
+
+def _render_class(label: str | int, values: Values, base: Path, seed: int, n: int, folder: Path) -> tuple[str, str]:
+    """Write n renders of a scene and their labels into a new folder in `folder`; the paths of both."""
+    own = folder / str(len(list(folder.iterdir())))
+    own.mkdir()
+    names = write_renders(set_stage(scene_of(base, values | {"seed": seed})), n, _RENDER_PX, own)
+    return str(own), str(write_labels([(name, label) for name in names], own))
+
+
+def write_renders(stage: Stage, n: int, side_px: int, folder: Path) -> list[str]:
+    """Write n square renders of the stage's bare object as PNGs; their names in `folder`."""
+    names = []
+    for part in in_parts(stage.scene.draw("train", n)):
+        with torch.no_grad():
+            light = shade(see(stage, None, part, (side_px, side_px)), None)
+        for picture in srgb_from_linear(light.clamp(0, 1)):
+            names.append(f"{stage.scene.sheet_id}_{len(names):04d}.png")
+            (folder / names[-1]).write_bytes(png(as_pixels(picture)))
+    return names
+
+
+def write_labels(rows: list[tuple[str, str | int]], folder: Path) -> Path:
+    """Write `labels.csv` of (file name, label) into `folder`."""
+    path = folder / "labels.csv"
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([("file", "label"), *rows])
+    return path

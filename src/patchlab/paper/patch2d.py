@@ -1,0 +1,249 @@
+"""The classic 2D patch with the assistive goal: its gain on its class, its harm on every other.
+
+In: labeled images, scenes whose clean object is rendered where no photographs of a class exist, or both; networks,
+seeds. A cell is a target, a network and a seed: a patch of `made_px` texels a side is optimized on images of the target
+alone, at random places, sizes and angles, with Random Erasing of the picture below it, and shown `shown_px` wide at the
+network's own size. Out: recognition with and without it, paired on the same images and places, for the target, and for
+each other class by *its* labels, with how often the patch has it called the target: an assistive patch must not become
+an adversarial one. Gray and noise of the same size are the controls.
+
+Unlike a printed piece this patch has no frame of markers. With fewer than `SPLIT_FROM` images of a class it is measured
+on those it was made with, and the table says so.
+Sources: Pestana et al., supplement, algorithm 2; Brown et al., Adversarial Patch, 2017; Zhong et al., Random Erasing,
+AAAI 2020.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, classes_of
+from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
+from patchlab.study.pictures import contact_sheet, enlarged, photographs
+from patchlab.study.record import hits_of, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.strict import Refused, expand, nearest
+from patchproof.channel.printer import load_printer
+from patchproof.classifier.labels import find_labels
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import responses
+from patchproof.render.photograph import Shown
+from patchproof.render.stage import set_stage
+from patchproof.report.tables import Drawing, Table
+from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
+from patchproof.scene.scene import Scene
+
+KINDS = ("bare", "gray", "noise", "patch")
+OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target
+_TILE_PX = 192
+
+
+class Patch2dSettings(PastedSettings):
+    """Targets × networks × seeds."""
+
+    targets: tuple[str | int, ...] = ()  # classes that patches are made for; without any, every class
+    networks: Names  # each trains alone
+    seeds: Seeds = (0,)  # of draws
+    n: Count = 200  # conditions per class and cell
+
+
+def cells(settings: Patch2dSettings, base: Path) -> list[Cell]:
+    """Targets × networks × seeds; all targets with the first seed come first."""
+    renders = [scene_values(file, base) for file in settings.renders]
+    known = [each.label for each in classes_of(settings.images, settings.labels, renders, base)]
+    targets = settings.targets or tuple(dict.fromkeys(known))
+    for target in targets:
+        if target not in known:
+            raise Refused("a target that there are images of", f'"{target}"', nearest(str(target), map(str, known)))
+    cells = []
+    for seed, (i, target), network in itertools.product(settings.seeds, enumerate(targets), settings.networks):
+        name = short_name(network)
+        values = {"name": f"target{i}", "target": target, "networks": [network], "network": name, "renders": renders}
+        cells.append(cell_of(values, seed, name))
+    return cells
+
+
+def run(settings: Patch2dSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """One patch, and every class with and without it."""
+    values, seed = cell.values, cell.values["seed"]
+    classifier = load_classifier(expand(values["networks"][0], base), base)
+    classes = classes_of(settings.images, settings.labels, values["renders"], base)
+    target = [each.label for each in classes].index(values["target"])
+    with tempfile.TemporaryDirectory() as folder:
+        scenes = [class_scene(settings, base, each, classifier, seed, Path(folder)) for each in classes]
+    problem = flat_problem(settings, base, scenes[target], classifier, classes[target])
+    design = best_design(problem)
+    shown = shown_by_kind(problem, design)
+    pairs = zip(classes, scenes, strict=True)
+    return {
+        "classes": [_answers(problem, each, scene, shown, settings.n) for each, scene in pairs],
+        "target": target,
+        f"{cell.name}.png": _picture(problem, scenes, design, shown["patch"]),
+    }
+
+
+def flat_problem(
+    settings: Patch2dSettings, base: Path, scene: ImageScene, classifier: Classifier, images_of: ImageClass
+) -> Problem:
+    """A patch on images of its class."""
+    stage, printer = set_stage(scene), load_printer(settings.printer.profile, base)
+    subject = Patch(scene, printer, (settings.made_px, settings.made_px), stage.device)
+    return Problem(scene, stage, printer, (classifier,), (_indices(classifier, images_of),), subject, None)
+
+
+def shown_by_kind(problem: Problem, design: np.ndarray) -> dict[str, Shown]:
+    """What is pasted, by `KINDS`; controls have no markers of their own."""
+    shown: dict[str, Shown] = {"bare": None}
+    with torch.no_grad():
+        for kind in KINDS[1:]:
+            pixels = design if kind == "patch" else problem.subject.control(kind, design)
+            shown[kind] = problem.subject.shown(from_pixels(pixels))
+    return shown
+
+
+def _on(problem: Problem, scene: Scene) -> Problem:
+    """The patch on other images."""
+    return replace(problem, scene=scene, stage=set_stage(scene))
+
+
+def _answers(
+    problem: Problem, images_of: ImageClass, scene: ImageScene, shown: Mapping[str, Shown], n: int
+) -> dict[str, Any]:
+    """Per kind and condition: recognized by the class's own labels, and called the patch's target."""
+    (classifier,), (target,) = problem.classifiers, problem.indices
+    own = _indices(classifier, images_of)
+    judged = replace(_on(problem, scene), classifiers=(classifier, classifier), indices=(own, target))
+    return {
+        "name": classifier.labels[own[0]].partition(",")[0] + (" (renders)" if images_of.scene else ""),
+        "images": len(scene.images),
+        "same": bool(set(own) & set(target)),  # the target itself, or a class that its labels include
+        "hits": recorded(responses(judged, shown, scene.draw("evaluate", n)))["hits"],
+    }
+
+
+def _indices(classifier: Classifier, images_of: ImageClass) -> tuple[int, ...]:
+    return find_labels(classifier.labels, images_of.label, images_of.accept)
+
+
+def _picture(problem: Problem, scenes: Sequence[ImageScene], design: np.ndarray, shown: Shown) -> bytes:
+    """Side by side: the patch, an image of its class with it, and up to three of other classes."""
+    worlds = (problem, *(_on(problem, scene) for scene in scenes if scene is not problem.scene))[:4]
+    tiles = [photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0] for world in worlds]
+    return contact_sheet([[enlarged(design, _TILE_PX), *tiles]])
+
+
+Class = Mapping[str, Any]  # what a cell found of one class
+
+
+def tables(settings: Patch2dSettings, results: Sequence[Result]) -> list[Table]:
+    """Gain on targets, harm on other classes, and both over all cells."""
+    return [_pooled(results), _gains(results), _harm(results)]
+
+
+def _gains(results: Sequence[Result]) -> Table:
+    rows = []
+    for (_, network), group in _by_target(results).items():
+        own = [_target(result) for result in group]
+        hits = {kind: _hits(own, kind, OWN) for kind in KINDS}
+        start = (own[0]["name"], network, own[0]["images"], own[0]["images"] >= SPLIT_FROM)
+        gains = (difference(hits["patch"], hits[control]) for control in ("bare", "gray"))
+        rows.append((*start, *(rate(hits[kind]) for kind in KINDS), *gains))
+    about = (
+        "Recognition of images of the patch's own class, seeds together. Where images are not held out, these are the"
+        " images that the patch was made with, at new places. Classes marked as renders show renders of an object over"
+        " backgrounds, since there are no photographs of it."
+    )
+    head = ("target", "network", "images", "held out", *KINDS, "patch minus bare", "patch minus gray")
+    return Table("gain", "Gain on the target", head, tuple(rows), about)
+
+
+def _harm(results: Sequence[Result]) -> Table:
+    rows = []
+    for (_, network), group in _by_target(results).items():
+        for i, other in enumerate(group[0].answers["classes"]):
+            if other["same"]:
+                continue
+            of_class = [result.answers["classes"][i] for result in group]
+            own = {kind: _hits(of_class, kind, OWN) for kind in KINDS}
+            called, usual = (_hits(of_class, kind, TARGET) for kind in ("patch", "bare"))
+            rates = (rate(own[kind]) for kind in ("bare", "gray", "patch"))
+            harm = (difference(own["patch"], own[control]) for control in ("bare", "gray"))
+            start = (_target(group[0])["name"], network, other["name"])
+            rows.append((*start, *rates, *harm, rate(called), difference(called, usual)))
+    about = (
+        "Images of another class with the same patch. Recognized means its own labels; a negative difference is harm."
+        " Called the target: the patch has made an adversarial example of it."
+    )
+    head = ("target", "network", "images of", "bare", "gray", "patch", "patch minus bare", "patch minus gray")
+    head += ("called the target", "more than bare")
+    return Table("harm", "Harm on each other class", head, tuple(rows), about)
+
+
+def _pooled(results: Sequence[Result]) -> Table:
+    groups = _by_target(results).values()
+    own = [[_target(result) for result in group] for group in groups]
+    others = [[each for result in group for each in result.answers["classes"] if not each["same"]] for group in groups]
+    rows = []
+    for name, clusters, which in (
+        ("target recognized", own, OWN),
+        ("other classes recognized", others, OWN),
+        ("other classes called the target", others, TARGET),
+    ):
+        controls = ([_effect(some, which, control) for some in clusters if some] for control in KINDS[:3])
+        rows.append((name, *map(clustered, controls)))
+    about = (
+        "Mean differences of rates over targets and networks; the interval is a bootstrap over these clusters, each"
+        " with all its seeds, images and other classes; n counts clusters, and fewer than 5 get none."
+    )
+    head = ("rate", "patch minus bare", "patch minus gray", "patch minus noise")
+    return Table("pooled", "Over all targets and networks", head, tuple(rows), about)
+
+
+def figures(settings: Patch2dSettings, results: Sequence[Result]) -> list[Drawing]:
+    """What was made."""
+    firsts = [group[0] for group in grouped(results, of_values("target")).values()]
+    files = [(_target(first)["name"], first.file(f"{first.cell.name}.png")) for first in firsts]
+    return [
+        picture_sheet(
+            "patches",
+            "Patches, and images with them",
+            files,
+            (7.0, 1.6 * len(firsts) + 0.3),
+            "The patch, its own class, and other classes; first network and seed of each target.",
+        ),
+    ]
+
+
+def _by_target(results: Sequence[Result]) -> dict[tuple, list[Result]]:
+    """Seeds together: results by (target, network)."""
+    return grouped(results, of_values("target", "network"))
+
+
+def _target(result: Result) -> Class:
+    return result.answers["classes"][result.answers["target"]]
+
+
+def _hits(classes: Sequence[Class], kind: str, which: int) -> list[bool]:
+    return [hit for each in classes for hit in hits_of(each["hits"][kind][which])]
+
+
+def _effect(classes: Sequence[Class], which: int, control: str) -> float:
+    return float(np.mean(_hits(classes, "patch", which)) - np.mean(_hits(classes, control, which)))
+
+
+STUDY = Study("patch2d", Patch2dSettings, cells, run, tables, figures)

@@ -1,0 +1,253 @@
+"""Patches optimized in 3D and in 2D, both on the object, under the same conditions.
+
+In: scene files with meshes, networks, seeds. A cell is one of each: the scene's patch is optimized in 3D, as `optimize`
+does, and once more as the classic 2D patch: pasted flat at a random place, size and angle into renders of the same
+clean object over the same backgrounds (renders, since photographs of most objects do not exist), with Random Erasing.
+Same design grid, same frame, printer and camera; sizes in pixels from the 3D views; the same number of classifier
+passes. Then both hang on the object, under conditions of the evaluate stream, beside the bare object, gray and noise.
+Out: paired differences per condition, pooled, by mesh, and by network and view (where the camera stands).
+
+Left out on purpose: the 2D patch knows neither light nor place, since images say nothing of them. Whether it is weak in
+its own world, too, is measured: both designs are shown in held-out images as well.
+Sources: Pestana et al., algorithm "Masked Textures and 3D Patches" and the table of 2D and 3D patches by model and
+view, supplement algorithm 2 (2D patch); Brown et al., Adversarial Patch, 2017.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from patchlab.paper.image_classes import write_labels, write_renders
+from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
+from patchlab.study.pictures import contact_sheet, enlarged, photographs
+from patchlab.study.record import Record, hits_of, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
+from patchproof.base.strict import Range, Refused, Share
+from patchproof.optimizer.loop import best_design, views_seen
+from patchproof.optimizer.patch import Patch
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
+from patchproof.render.photograph import Shown
+from patchproof.render.stage import set_stage
+from patchproof.report.images import png
+from patchproof.report.tables import Drawing, Table
+from patchproof.scene.image_scene import largest_share, load_image_scene
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.scene import needs_patch
+
+KINDS = ("bare", "gray", "noise", "2d", "3d")
+HARD = 0.2  # clean rate up to which an object counts as misread
+_TILE_PX = 192
+_SIZES = (0.05, 0.95)  # quantiles of the design's size over the 3D views that bound its size in 2D
+
+
+class Patch3dSettings(GridSettings):
+    """How patches are trained stands in each scene's [optimize]."""
+
+    seeds: Seeds = (0, 1, 2)  # of the scenes' draws
+    n: Count = 200  # conditions per cell, of the evaluate stream
+    renders: Annotated[int, Field(ge=2)] = 64  # images of the clean object; from 20 on, half of them are held out
+    roll_deg: Range = (-22.5, 22.5)  # of the 2D patch, as in Brown et al.'s published program
+    erasing: Share = 0.5  # chance of Random Erasing in 2D training
+    # Azimuths in degrees by name; without any, thirds of each scene's own range.
+    views: dict[str, Range] = Field(default_factory=dict)
+
+
+def cells(settings: Patch3dSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network and seed."""
+    return patch_cells(settings, base)
+
+
+def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network and seed; refused of scenes without a mesh or a printed patch. All objects with the
+    first seed come first: an unfinished study says something of each.
+    """
+    scenes = list(pairs(settings, base))
+    for values in scenes:
+        if values["scene"]["object"]["mesh"] is None or values["scene"]["patch"]["kind"] != "patch":
+            do = 'give object.mesh and patch.kind = "patch"'
+            raise Refused("a scene with a mesh and a printed patch", values["file"], do)
+    return [cell_of(values, seed, values["network"]) for seed in settings.seeds for values in scenes]
+
+
+def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """One object, network and seed: optimize in both worlds, measure in both."""
+    problem = problem_of(base, cell.values)
+    with tempfile.TemporaryDirectory() as folder:
+        twin = flat_twin(problem, settings, Path(folder))
+    designs = {"3d": best_design(problem), "2d": best_design(twin)}
+    conditions, in_images = (world.scene.draw("evaluate", settings.n) for world in (problem, twin))
+    return {
+        **recorded(responses(problem, things_of(problem, designs), conditions)),
+        "in_images": recorded(responses(twin, things_of(twin, designs), in_images)),
+        "azimuth_deg": conditions.pose.azimuth_deg.tolist(),
+        "azimuth_range_deg": problem.scene.settings.view.azimuth_deg,
+        "passes": {name: views_seen(world.scene.settings.optimize) for name, world in (("3d", problem), ("2d", twin))},
+        "share": twin.scene.settings.view.patch_share,
+        "warnings": list(problem.scene.warnings),
+        f"{cell.name}.png": picture_of(problem, twin, designs),
+        f"{cell.name}-2d.png": png(designs["2d"]),
+        f"{cell.name}-3d.png": png(designs["3d"]),
+    }
+
+
+def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Problem:
+    """The same patch as a classic 2D one: its scene is made of renders that are written to `folder`."""
+    scene = needs_patch(problem.scene, "a printed patch on a mesh")
+    names = write_renders(problem.stage, settings.renders, problem.training_px, folder)
+    write_labels([(name, scene.settings.target.label) for name in names], folder)
+    flat = load_image_scene(flat_settings(scene, settings), folder, scene.seed)
+    pasted = Patch(flat, problem.printer, problem.patch.design_px, problem.device)
+    return replace(problem, scene=flat, stage=set_stage(flat, problem.device), subject=pasted)
+
+
+def flat_settings(scene: PatchScene, settings: Patch3dSettings) -> SceneSettings:
+    """A scene of images with the patch, printer, camera and optimizer of a scene with a mesh, and as large in it."""
+    width, height = scene.piece.size_mm
+    patch = PatchSettings(width_mm=width, height_mm=height)
+    low, high = np.quantile(design_shares(scene), _SIZES)
+    largest = largest_share(settings.roll_deg)
+    share = (float(min(low, largest)), float(min(high, largest)))
+    return scene.settings.changed(
+        object=ObjectSettings(images=".", labels="labels.csv"),
+        patch=patch,
+        view=ViewSettings(patch_share=share, roll_deg=settings.roll_deg),
+        background={"erasing": settings.erasing},
+        camera={"file": None},
+    )
+
+
+def design_shares(scene: PatchScene, views: int = 256) -> np.ndarray:
+    """The piece's longer side over the picture's shorter one, in training views that see its face."""
+    conditions, photo_px = scene.draw("train", views), scene.settings.camera.photo_px
+    scales = scene.piece_scales(conditions[scene.facing(conditions)], photo_px)
+    return scales * max(scene.piece.size_mm) / min(photo_px)
+
+
+def things_of(problem: Problem, designs: Mapping[str, np.ndarray]) -> dict[str, Shown]:
+    """What hangs on the object, by `KINDS`."""
+    things = shown_with_controls(problem, designs["3d"], KINDS[:3])
+    things |= {"2d": problem.subject.shown(from_pixels(designs["2d"], problem.device)), "3d": things["design"]}
+    return {kind: things[kind] for kind in KINDS}
+
+
+def picture_of(problem: Problem, twin: Problem, designs: Mapping[str, np.ndarray]) -> bytes:
+    """Side by side: the 2D design, an image with it, the object with it; the 3D design, the object with it."""
+    tiles = []
+    for kind, worlds in (("2d", (twin, problem)), ("3d", (problem,))):
+        tiles.append(enlarged(designs[kind], _TILE_PX))
+        for world in worlds:
+            shown = world.subject.shown(from_pixels(designs[kind], world.device))
+            tiles.append(photographs(world, shown, world.scene.draw("evaluate", 1), _TILE_PX)[0])
+    return contact_sheet([tiles])
+
+
+def tables(settings: Patch3dSettings, results: Sequence[Result]) -> list[Table]:
+    """Pooled, by mesh, by network and view, in the flat images, and cell by cell."""
+    objects, images = _by_object(results, ("3d", "2d"), None), _by_object(results, ("2d", "gray"), "in_images")
+    about = "Networks and seeds together; the difference is paired (Newcombe), as if all conditions were independent."
+    in_images = (
+        "The same designs in the 2D patch's own world: pasted at random places, sizes and angles into renders of the"
+        " object over its backgrounds, held out from training where there are at least 20. These are renders, not"
+        " photographs."
+    )
+    return [
+        _pooled(results),
+        Table("meshes", "By object", ("object", *KINDS, "3d minus 2d"), objects, about),
+        _by_view(settings, results),
+        Table("images", "Pasted into images", ("object", *KINDS, "2d minus gray"), images, in_images),
+        _by_cell(results),
+    ]
+
+
+def _pooled(results: Sequence[Result]) -> Table:
+    groups = grouped(results, of_values("name", "network"))
+    hard = {key: group for key, group in groups.items() if _mean(group, "bare") <= HARD}
+    rows = []
+    for a, b in (("3d", "2d"), ("3d", "gray"), ("3d", "noise"), ("2d", "gray"), ("2d", "noise"), ("3d", "bare")):
+        gains = [[_mean(group, a) - _mean(group, b) for group in some.values()] for some in (groups, hard)]
+        rows.append((f"{a} minus {b}", *map(clustered, gains)))
+    about = (
+        "Differences of the rate on the same conditions. The interval is a bootstrap over clusters, a cluster being an"
+        " object before a network with all its seeds; n counts clusters, and fewer than 5 get none."
+    )
+    head = ("difference", "all clusters", f"clean rate up to {HARD:g}")
+    return Table("pooled", "Pooled over objects, networks and seeds", head, tuple(rows), about)
+
+
+def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | None) -> tuple[tuple, ...]:
+    """Rows of rates by object, and the difference of a pair."""
+    rows = []
+    for (name,), group in grouped(results, of_values("name")).items():
+        records = {kind: Record(group, kind, where) for kind in KINDS}
+        rates = (record.level()[0] for record in records.values())
+        rows.append((name, *rates, records[pair[0]].gain(records[pair[1]])[0]))
+    return tuple(rows)
+
+
+def _by_view(settings: Patch3dSettings, results: Sequence[Result]) -> Table:
+    groups: dict[tuple[str, str], dict[str, list[bool]]] = {}
+    for result in results:
+        for view, (low, high) in _views(settings, result).items():
+            group = groups.setdefault((result.cell.values["network"], view), {kind: [] for kind in KINDS})
+            for kind in KINDS:
+                hits = zip(hits_of(result.answers["hits"][kind][0]), result.answers["azimuth_deg"], strict=True)
+                group[kind] += [hit for hit, azimuth in hits if low <= azimuth <= high]
+    rows = tuple(
+        (*key, *(rate(group[kind]) for kind in KINDS), difference(group["3d"], group["2d"]))
+        for key, group in groups.items()
+    )
+    about = "All objects and seeds; a view is a range of the camera's azimuth, right of the patch's side positive."
+    return Table("views", "By network and view", ("network", "view", *KINDS, "3d minus 2d"), rows, about)
+
+
+def _by_cell(results: Sequence[Result]) -> Table:
+    rows = []
+    for result in results:
+        gain = Record([result], "3d").gain(Record([result], "2d"))[0]
+        passes = result.answers["passes"]
+        rows.append((*who(result), *(_mean([result], kind) for kind in KINDS), gain, passes["3d"], passes["2d"]))
+    head = ("object", "network", "seed", *KINDS, "3d minus 2d", "passes 3d", "passes 2d")
+    return Table("cells", "Cell by cell", head, tuple(rows), "Passes are views that the network saw in training.")
+
+
+def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawing]:
+    """What was optimized."""
+    firsts = [group[0] for group in grouped(results, of_values("name")).values()]
+    return [
+        picture_sheet(
+            "designs",
+            "What was optimized: first network and seed of each object",
+            [(first.cell.name, first.file(f"{first.cell.name}.png")) for first in firsts],
+            (7.0, 1.3 * len(firsts) + 0.4),
+            "2D design, pasted into an image, on the object; 3D design, on the object in the same view.",
+        ),
+    ]
+
+
+def _views(settings: Patch3dSettings, result: Result) -> dict[str, tuple[float, float]]:
+    if settings.views:
+        return dict(settings.views)
+    first, last = result.answers["azimuth_range_deg"]
+    edges = np.linspace(first, last, 4).tolist()
+    return dict(zip(("left", "middle", "right"), itertools.pairwise(edges), strict=True))
+
+
+def _mean(results: Sequence[Result], kind: str) -> float:
+    return float(np.mean(Record(results, kind).hits()))
+
+
+STUDY = Study("patch3d", Patch3dSettings, cells, run, tables, figures)

@@ -1,0 +1,158 @@
+"""Free textures from gray: what networks ask for when an object should be read as a class.
+
+In: scenes, classes (labels), networks and seeds. Every texture is free and starts from gray, so that whatever color and
+pattern it has, a network asked for. Out: rates on all networks beside the untrained gray, the mean color per class
+(which color is preferred), and a contact sheet.
+
+Source: Pestana et al., robust designs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from patchlab.paper.sides import mean_color, sides
+from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import grouped, of_values, problem_of, short_name
+from patchlab.study.pictures import contact_sheet, photographs
+from patchlab.study.record import Record, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained import (
+    TrainedSettings,
+    Way,
+    Word,
+    tested_in,
+    trained_cells,
+    trained_on,
+    verdict,
+)
+from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.responses import responses
+from patchproof.report.tables import Drawing, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SHEET_PX, _TURN_VIEWS, _SIDES = 160, 8, 3
+_KINDS = ("start", "design")
+
+
+class RobustSettings(TrainedSettings):
+    """Each network trains alone for each class, and all of them test."""
+
+    classes: Annotated[tuple[str | int, ...], Field(min_length=1)]  # in place of the scene's label
+    # By name: tables of the scene file with the keys that change.
+    ways: dict[Word, Way] = Field({"free": {"patch": {"kind": "texture", "start": "gray"}}}, min_length=1)
+
+
+def cells(settings: RobustSettings, base: Path) -> list[Cell]:
+    """One per scene, way, class, network and seed."""
+    variants = [
+        ({"target": {"label": label, "accept": [], "goal": "assist"}}, {"class": str(label)})
+        for label in settings.classes
+    ]
+    return trained_cells(settings, base, variants=variants)
+
+
+def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Train for one class on one network; rates on all, pictures, mean color."""
+    problem = problem_of(base, cell.values)
+    subject, views = problem.subject, sides(problem, _SIDES)
+    design = best_design(trained_on(problem, cell))
+    pixels = (subject.start(), from_pixels(design, problem.device))
+    things = {kind: subject.shown(each) for kind, each in zip(_KINDS, pixels, strict=True)}
+    suffix, content = subject.file(design)
+    sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
+    return {
+        **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),
+        "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
+        f"{cell.name}.sheet.png": sheet,
+        f"{cell.name}.{suffix}": content,
+    }
+
+
+Key = tuple  # scene, way, class, trained on
+_HEAD = ("scene", "way", "class", "trained on")
+
+
+def _by_design(results: Sequence[Result]) -> Mapping[Key, Sequence[Result]]:
+    return grouped(results, of_values("name", "way", "class", "row"))
+
+
+def tables(settings: RobustSettings, results: Sequence[Result]) -> list[Table]:
+    """Rates on all networks beside gray; the mean color of each class."""
+    rates, colors = [], []
+    for key, of_key in _by_design(results).items():
+        design, begun = Record(of_key, "design"), Record(of_key, "start")
+        for network in tested_in(of_key):
+            gain = design.gain(begun, network)[0]
+            levels = begun.level(network)[0], *design.level(network)
+            rates.append((*key, short_name(network), *levels, gain, verdict(gain)))
+        codes = _mean_codes(of_key)
+        colors.append((*key, _hex(codes), *codes))
+    about = f"Over {settings.n} unseen conditions per seed, paired with the untrained start."
+    of_colors = "Mean light of the object's pixels over a full turn in even white light, as sRGB codes."
+    head = (*_HEAD, "tested on", "gray", "design", "confidence", "gain", "shows")
+    named = (*_HEAD, "mean color", "red", "green", "blue")
+    return [
+        Table("rates", "Rates", head, tuple(rates), about),
+        Table("colors", "Mean colors", named, tuple(colors), of_colors),
+    ]
+
+
+def _mean_codes(results: Sequence[Result]) -> tuple[int, int, int]:
+    """The mean over designs, in light."""
+    light = linear_from_srgb(np.array([result.answers["color"] for result in results]) / 255).mean(0)
+    red, green, blue = (int(code) for code in np.rint(srgb_from_linear(light) * 255))
+    return red, green, blue
+
+
+def _hex(codes: tuple[int, int, int]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*codes)
+
+
+def figures(settings: RobustSettings, results: Sequence[Result]) -> list[Drawing]:
+    """Colors of all classes, and per scene and way what the designs look like."""
+    by_design = _by_design(results)
+    rows, networks = list(dict.fromkeys(key[:3] for key in by_design)), list(dict.fromkeys(key[3] for key in by_design))
+    drawings = [
+        Drawing(
+            "colors",
+            "Preferred colors",
+            lambda figure: _color_grid(figure, by_design, rows, networks),
+            (2.0 + 1.3 * len(networks), 1.0 + 0.5 * len(rows)),
+            "Mean color of free textures that started from gray: classes by training network.",
+        )
+    ]
+    for scene, way in dict.fromkeys(row[:2] for row in rows):
+        firsts = {f"{key[2]}, {key[3]}": some[0] for key, some in by_design.items() if key[:2] == (scene, way)}
+        files = [(label, first.file(f"{first.cell.name}.sheet.png")) for label, first in firsts.items()]
+        about = "Above the start, below the design, in even light; the first seed."
+        title = f"Designs: {scene}, {way}"
+        drawings.append(picture_sheet(f"sheet_{scene}_{way}", title, files, (3.6, 2.7 * len(files)), about))
+    return drawings
+
+
+def _color_grid(
+    figure: Figure, by_design: Mapping[Key, Sequence[Result]], rows: Sequence[tuple], networks: Sequence[str]
+) -> None:
+    picture, axes = np.ones((len(rows), len(networks), 3)), figure.add_subplot()
+    for key, of_key in by_design.items():
+        y, x, codes = rows.index(key[:3]), networks.index(key[3]), _mean_codes(of_key)
+        picture[y, x] = np.array(codes) / 255
+        ink = "white" if sum(codes) < 380 else "black"
+        axes.text(x, y, _hex(codes), ha="center", va="center", fontsize=7, color=ink)
+    axes.imshow(picture, aspect="auto")
+    axes.set_xticks(range(len(networks)), networks, rotation=20, ha="right")
+    several = len({row[:2] for row in rows}) > 1
+    axes.set_yticks(range(len(rows)), [", ".join(row) if several else row[2] for row in rows])
+
+
+STUDY = Study("robust", RobustSettings, cells, run, tables, figures)

@@ -1,0 +1,299 @@
+"""Where the clean object fails: black squares, maps of pose × light, worst pose and worst light.
+
+In: scenes with a mesh, networks, seeds. Out, per cell: a black square over every position of the picture; maps of pose
+× light; the worst pose and the worst light that a random search finds that closes in round by round, each with the
+condition found and its confidence. Whatever was chosen for being worst is measured again on draws of the evaluate
+stream that the choice never saw: the same draws flatter a choice. Cells of a map where the object is recognized no more
+often than the background alone are said to show no effect: a network may answer the label of anything.
+
+Sources: occlusion and maps as in Pestana et al., figures 1 and 2 (occlusion maps: Zeiler and Fergus, ECCV 2014); search
+for poses that fail: Alcorn et al., Strike (with) a Pose, CVPR 2019, its random search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+from torch import Tensor
+
+from patchlab.paper.stress_map import (
+    LIGHT,
+    POSE,
+    MapSettings,
+    Place,
+    axes_of,
+    axes_values,
+    clean,
+    each_before_all,
+    heat_map,
+    in_cells,
+    map_of,
+    map_ticks,
+    mesh_cells,
+    words_of,
+    worst_cells,
+)
+from patchlab.study.figures import picture_sheet
+from patchlab.study.grid import Count, GridSettings, problem_of, who
+from patchlab.study.pictures import contact_sheet, photographs
+from patchlab.study.record import bits, hits_of
+from patchlab.study.study import Cell, Result, Study
+from patchproof.base.claims import difference, paired_difference, rate
+from patchproof.base.strict import Share, Strict
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import Answers, ask, in_parts, joined
+from patchproof.report.tables import Drawing, Table
+from patchproof.scene.conditions import Conditions, fields_of, with_values
+
+_MAP_HEAD = (
+    *("pose", "from", "to", "light", "from ", "to "),
+    *("rate", "background alone", "difference", "effect", "confidence"),
+)
+_PARTS = ("typical", "worst pose", "worst light", "worst occlusion")
+_MEASURING = 3_000_001  # added to a seed: the evaluate stream's draws that measure what was chosen
+
+
+class OcclusionSettings(Strict):
+    """A black square, everywhere in the picture."""
+
+    share: Annotated[Share, Field(gt=0)] = 0.3  # its side, as a share of the picture's
+    positions: Annotated[int, Field(ge=2)] = 7  # places from edge to edge, across and down
+    n: Count = 32  # draws at each place
+
+
+class SearchSettings(Strict):
+    """A search from coarse to fine."""
+
+    tries: Count = 48  # poses (or lights) in each round
+    rounds: Count = 4  # the reach round the best halves from one to the next
+    draws: Count = 4  # of everything else, the same for all tries
+    n: Count = 64  # draws that measure what was found
+
+
+class StressSettings(GridSettings):
+    """What is tried."""
+
+    maps: tuple[MapSettings, ...] = (MapSettings(),)  # of pose × light
+    occlusion: OcclusionSettings = OcclusionSettings()  # the black square
+    search: SearchSettings = SearchSettings()  # for the worst pose and light
+
+
+def cells(settings: StressSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network and seed."""
+    return mesh_cells(settings, base)
+
+
+def run(settings: StressSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """All tests of one scene before one network."""
+    problem, seed = problem_of(base, cell.values), cell.values["seed"]
+    (pose, of_pose), (light, of_light) = (worst_case(problem, names, settings.search, seed) for names in (POSE, LIGHT))
+    occlusion, hidden = occluded(problem, settings.occlusion, seed)
+    typical = problem.scene.draw("select", 1, seed)
+    views = [_photographs(problem, with_values(typical, **changed))[0] for changed in ({}, pose, light)]
+    return {
+        "maps": [_mapped(problem, asked, seed) for asked in settings.maps],
+        "occlusion": occlusion,
+        "pose": of_pose,
+        "light": of_light,
+        f"{cell.name}.png": contact_sheet([[*views, hidden]]),
+    }
+
+
+def _photographs(problem: Problem, conditions: Conditions) -> Tensor:
+    """The clean object's."""
+    return photographs(problem, None, conditions, problem.figure_px)
+
+
+def _again(problem: Problem, there: Conditions, anywhere: Conditions) -> dict[str, Any]:
+    """The clean object where it was found to do worst, and under the same draws without."""
+    worst, usual = clean(problem, there), clean(problem, anywhere)
+    return {
+        "hits": bits(worst.recognized[0]),
+        "confidence": float(worst.confidence.mean()),
+        "hits_anywhere": bits(usual.recognized[0]),
+        "confidence_anywhere": float(usual.confidence.mean()),
+    }
+
+
+def _mapped(problem: Problem, asked: MapSettings, seed: int) -> dict[str, Any]:
+    axes = axes_of(problem.scene.settings, asked)
+    hits, confidence, alone = map_of(problem, axes, problem.scene.draw("select", asked.n, seed))
+    worst = worst_cells(hits, confidence, problem.scene.settings.target.goal)
+    fresh = problem.scene.draw("evaluate", asked.n * len(worst), seed + _MEASURING)
+    return {
+        "axes": axes_values(axes),
+        "hits": [[bits(place) for place in column] for column in hits],
+        "alone": [[bits(place) for place in column] for column in alone],
+        "confidence": confidence.mean(2).tolist(),
+        "worst": [list(place) for place in worst],
+        "again": _again(problem, in_cells(fresh, axes, worst), fresh),
+    }
+
+
+def occluded(problem: Problem, settings: OcclusionSettings, seed: int) -> tuple[dict[str, Any], Tensor]:
+    """Hits per position (row by row), the worst position's on fresh draws, and a picture of it."""
+    side = problem.figure_px
+    square = max(round(settings.share * side), 1)
+    corners = np.linspace(0, side - square, settings.positions).round().astype(int).tolist()
+    boxes = [(x, y, x + square, y + square) for y in corners for x in corners]
+    answers = _under(problem, problem.scene.draw("select", settings.n, seed), boxes)
+    sign = problem.scene.settings.target.goal.sign
+    hits, sure = (
+        np.array([getattr(answers[box], name).mean() for box in boxes]) for name in ("recognized", "confidence")
+    )
+    worst = int(np.lexsort((sign * sure, sign * hits))[0])
+    fresh = problem.scene.draw("evaluate", settings.n, seed + _MEASURING)
+    again = _under(problem, fresh, [None, boxes[worst]])
+    picture = _photographs(problem, problem.scene.draw("select", 1, seed))
+    answers_by_place = {
+        "hits": [bits(answers[box].recognized[0]) for box in boxes],
+        "worst": [worst % settings.positions, worst // settings.positions],
+        "clean_again": bits(again[None].recognized[0]),
+        "worst_again": bits(again[boxes[worst]].recognized[0]),
+    }
+    return answers_by_place, _blackened(picture, boxes[worst])[0]
+
+
+Box = tuple[int, int, int, int]  # first column and row, and those after the last
+
+
+def _under(problem: Problem, conditions: Conditions, boxes: Sequence[Box | None]) -> dict[Box | None, Answers]:
+    """The answers to the clean object under each box."""
+    parts = []
+    for part in in_parts(conditions):
+        pictures = _photographs(problem, part)
+        around = problem.boxes(part)
+        parts.append({box: ask(problem, _blackened(pictures, box), around) for box in boxes})
+    return joined(parts)
+
+
+def _blackened(pictures: Tensor, box: Box | None) -> Tensor:
+    if box is None:
+        return pictures
+    x0, y0, x1, y1 = box
+    pictures = pictures.clone()
+    pictures[:, :, y0:y1, x0:x1] = 0
+    return pictures
+
+
+def worst_case(
+    problem: Problem, names: Sequence[str], settings: SearchSettings, seed: int
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The values of the fields `names` under which the clean object does worst: as arrays of one row, and as found.
+
+    Worst is the largest mean loss over `draws` of everything else.
+    """
+    scene, best, best_loss, course = problem.scene, {}, -np.inf, []
+    rest = scene.draw("select", settings.draws, seed)
+    for number in range(settings.rounds):
+        drawn = scene.draw("select", settings.tries, seed, settings.draws + number * settings.tries)
+        # between two points of a box all lies within it
+        fields = fields_of(drawn)
+        drawn = with_values(drawn, **{n: v + 0.5**number * (fields[n] - v) for n, v in best.items()})
+        losses = clean(problem, each_before_all(drawn, rest, names), problem.training_px).loss.mean(0)
+        losses = losses.reshape(settings.tries, settings.draws).mean(1)
+        if losses.max() > best_loss:
+            best_loss, row = float(losses.max()), int(losses.argmax())
+            best = {name: fields_of(drawn)[name][row : row + 1] for name in names}
+        course.append(best_loss)
+    fresh = scene.draw("evaluate", settings.n, seed + _MEASURING)
+    condition = {name: float(best[name][0]) for name in _varied(scene.draw("select", 64, seed), names)}
+    return best, {"condition": condition, "losses": course} | _again(problem, with_values(fresh, **best), fresh)
+
+
+def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
+    """Fields of one figure whose range is more than a value; a lamp's only where there are lamps."""
+    lamps, fields = drawn.light.point.max() > 0, fields_of(drawn)
+    figures = {name: fields[name] for name in names if lamps or not name.startswith("point")}
+    return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
+
+
+def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, ...]:
+    """What was worst, measured anew; and every cell of the maps."""
+    start = ("scene", "network", "seed")
+    return (
+        Table(
+            "worst",
+            "Worst cases of the clean object, measured on draws that did not choose them",
+            (*start, "test", "found at", "rate", "rate anywhere", "difference", "confidence"),
+            tuple(row for result in results for row in _worst_rows(result)),
+            "Differences are paired by condition: the same draws with pose, light or square as found, and without.",
+        ),
+        Table(
+            "maps",
+            "Maps of pose × light",
+            (*start, *_MAP_HEAD),
+            tuple(row for result in results for map_ in result.answers["maps"] for row in _map_rows(result, map_)),
+            "The clean object in every cell, beside the background without it; all cells of a map share their other "
+            "draws. “no effect”: the 95 % interval of the paired difference does not lie above 0.",
+        ),
+    )
+
+
+def _worst_rows(result: Result) -> Iterator[tuple]:
+    def row(test: str, where: str, worst: str, usual: str, confidence: float | None) -> tuple:
+        there, anywhere = hits_of(worst), hits_of(usual)
+        return (*who(result), test, where, rate(there), rate(anywhere), difference(there, anywhere), confidence)
+
+    for test in ("pose", "light"):
+        of_test = result.answers[test]
+        where = ", ".join(f"{words_of(name)} {value:.4g}" for name, value in of_test["condition"].items())
+        yield row(f"worst {test}", where, of_test["hits"], of_test["hits_anywhere"], of_test["confidence"])
+    hidden = result.answers["occlusion"]
+    where = "column {}, row {} of the grid".format(*(number + 1 for number in hidden["worst"]))
+    yield row("black square", where, hidden["worst_again"], hidden["clean_again"], None)
+    for map_ in result.answers["maps"]:
+        where = f"{len(map_['worst'])} worst cells of {' × '.join(map(words_of, map_['axes']['names']))}"
+        again = map_["again"]
+        yield row("map", where, again["hits"], again["hits_anywhere"], again["confidence"])
+
+
+def _map_rows(result: Result, map_: Mapping[str, Any]) -> Iterator[tuple]:
+    (pose, light), (poses, lights) = map_["axes"]["names"], map_["axes"]["edges"]
+    empty = _empty_cells(map_)
+    for i, column in enumerate(map_["hits"]):
+        for j, hits in enumerate(map(hits_of, column)):
+            place = (pose, poses[i], poses[i + 1], light, lights[j], lights[j + 1])
+            alone, effect = hits_of(map_["alone"][i][j]), "no effect" if (i, j) in empty else "seen"
+            beside = rate(alone), difference(hits, alone), effect
+            yield (*who(result), *place, rate(hits), *beside, map_["confidence"][i][j])
+
+
+def _empty_cells(map_: Mapping[str, Any]) -> list[Place]:
+    """Where the object is not shown to be recognized more often than the background alone."""
+    return [
+        (i, j)
+        for i, columns in enumerate(zip(map_["hits"], map_["alone"], strict=True))
+        for j, (hits, alone) in enumerate(zip(*columns, strict=True))
+        if paired_difference(hits_of(hits), hits_of(alone))[1][0] <= 0
+    ]
+
+
+def figures(settings: StressSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
+    """Per cell of the study: its maps, the map of positions, and what the worst cases look like."""
+    return tuple(drawing for result in results for drawing in _figures(settings, result))
+
+
+def _figures(settings: StressSettings, result: Result) -> Iterator[Drawing]:
+    name, title = result.cell.name, "{}, {}, seed {}: clean object".format(*who(result))
+    for number, (map_, asked) in enumerate(zip(result.answers["maps"], settings.maps, strict=True)):
+        rates = [[float(np.mean(hits_of(hits))) for hits in column] for column in map_["hits"]]
+        caption = f"rate, n = {asked.n} draws per cell; framed: the worst tenth\ngray: no effect over background alone"
+        ticks, empty = map_ticks(map_["axes"]), _empty_cells(map_)
+        yield heat_map(f"map{number}_{name}", (title, caption), rates, map_["worst"], ticks, empty=empty)
+    hidden, asked = result.answers["occlusion"], settings.occlusion
+    grid = np.reshape([np.mean(hits_of(hits)) for hits in hidden["hits"]], (asked.positions, asked.positions)).T
+    middles = [f"{asked.share / 2 + (1 - asked.share) * i / (asked.positions - 1):.0%}" for i in range(asked.positions)]
+    labels = ("middle of the square, from the left", "from the top")
+    ticks = [(label, range(asked.positions), middles) for label in labels]
+    caption = f"black square, {asked.share:.0%} of the side; n = {asked.n}"
+    yield heat_map(f"occlusion_{name}", (title, caption), grid.tolist(), [hidden["worst"]], ticks, upward=False)
+    files = [("", result.file(f"{name}.png"))]
+    yield picture_sheet(f"views_{name}", title, files, (2.1 * len(_PARTS), 2.4), columns=_PARTS)
+
+
+STUDY = Study("stress", StressSettings, cells, run, tables, figures)

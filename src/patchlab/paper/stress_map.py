@@ -1,0 +1,202 @@
+"""Maps of stress tests: cells of pose × light, what a network answers to the clean object there, and how that is drawn.
+
+In: a scene with a mesh before one network, and draws of its streams. Out: draws whose pose and light lie in one cell of
+a map while everything else stays as drawn; recognized and confidence per draw, and what the network answers to the
+background alone; the worst tenth of a map's cells; and `Drawing`s, which share one scale from 0 to 1. All cells of a
+map share the same draws of background, camera and whatever is no axis, so that cells differ in pose and light alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+
+from patchlab.study.figures import number_grid
+from patchlab.study.grid import Count, GridSettings, cell_of, pairs
+from patchlab.study.study import Cell
+from patchproof.base.goal import Goal
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Refused, Strict
+from patchproof.channel.effects import EFFECT, EFFECTS
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import Answers, ask, in_parts, joined, responses
+from patchproof.render.photograph import expose
+from patchproof.report.tables import Drawing
+from patchproof.scene.conditions import Conditions, fields_of, of_fields, with_values
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
+LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
+# What of a draw is the pose and the light; the rest is background, print and camera.
+POSE = EFFECT["viewpoint"].fields
+_LIGHT = ("ambient light", "directional light", "exposure", "lamp", "uneven ambient")
+LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
+WORST_SHARE = 0.1
+
+
+class MapSettings(Strict):
+    """A map's axes, each cut into equal cells of the scene's own range."""
+
+    pose: PoseAxis = "azimuth_deg"  # the axis across
+    light: LightAxis = "light_azimuth_deg"  # the axis upwards
+    pose_cells: Count = 10  # cells of equal width across the scene's own range
+    light_cells: Count = 6  # likewise
+    n: Count = 32  # draws in each cell
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of a map: a field of the conditions and the edges of its cells."""
+
+    name: str
+    edges: tuple[float, ...]
+
+    def __len__(self) -> int:
+        return len(self.edges) - 1
+
+
+Ticks = tuple[str, Sequence[float], Sequence[str]]  # an axis's label, where its ticks are, and what they say
+_UNITS = {"deg": "°", "mm": "mm", "ev": "EV"}
+Place = tuple[int, int]  # a map's cell: which of the poses, which of the lights
+
+
+def mesh_cells(settings: GridSettings, base: Path) -> list[Cell]:
+    """A cell per scene, network and seed; refused where pose and light cannot be set."""
+    cells = []
+    for values in pairs(settings, base):
+        if values["scene"]["object"]["mesh"] is None:
+            got = values["file"]
+            raise Refused("scenes with a mesh, whose pose and light can be set", got, "name object.mesh in it")
+        cells += [cell_of(values, seed, values["network"]) for seed in settings.seeds]
+    return cells
+
+
+def axes_of(settings: SceneSettings, asked: MapSettings) -> tuple[Axis, Axis]:
+    """The map's axes, pose and light, over the scene's ranges; refused where a range is a single value."""
+
+    def axis(name: str, count: int) -> Axis:
+        low, high = next(effect.range(settings, name) for effect in EFFECTS if name in effect.columns)
+        if low == high:
+            do = "widen it, or choose another axis"
+            raise Refused(f"a range of {name} that a map can be cut from", f"[{low:g}, {high:g}]", do)
+        return Axis(name, tuple(np.linspace(low, high, count + 1).tolist()))
+
+    return axis(asked.pose, asked.pose_cells), axis(asked.light, asked.light_cells)
+
+
+def axes_values(axes: tuple[Axis, Axis]) -> dict[str, Any]:
+    """The axes as JSON values."""
+    return {"names": [axis.name for axis in axes], "edges": [list(axis.edges) for axis in axes]}
+
+
+def in_cell(conditions: Conditions, axes: tuple[Axis, Axis], place: Place) -> Conditions:
+    """`conditions` with pose and light moved into a cell, each as far in as it lay in its range."""
+    changed, fields = {}, fields_of(conditions)
+    for axis, number in zip(axes, place, strict=True):
+        first, last, low, high = axis.edges[0], axis.edges[-1], axis.edges[number], axis.edges[number + 1]
+        share = (fields[axis.name] - first) / (last - first)
+        changed[axis.name] = low + (high - low) * share
+    return with_values(conditions, **changed)
+
+
+def in_cells(conditions: Conditions, axes: tuple[Axis, Axis], places: Sequence[Place]) -> Conditions:
+    """`conditions` moved into cells, an equal share of the rows into each, in order; no draw serves two cells."""
+    n = len(conditions) // len(places)
+    parts = [fields_of(in_cell(conditions[i * n : (i + 1) * n], axes, place)) for i, place in enumerate(places)]
+    return of_fields({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def each_before_all(tried: Conditions, rest: Conditions, names: Sequence[str]) -> Conditions:
+    """The fields `names` of each row of `tried`, with all else from each row of `rest`: row by row of `tried`."""
+    rows = np.tile(np.arange(len(rest)), len(tried))
+    fields = fields_of(tried)
+    return with_values(rest[rows], **{name: fields[name].repeat(len(rest), 0) for name in names})
+
+
+def clean(problem: Problem, conditions: Conditions, side_px: int | None = None) -> Answers:
+    """The networks' answers to the clean object (bare, or with its own texture)."""
+    return responses(problem, {"clean": None}, conditions, side_px)["clean"]
+
+
+def with_and_without(problem: Problem, conditions: Conditions) -> tuple[Answers, Answers]:
+    """The networks' answers to the clean object, and to the background alone through the same camera."""
+    parts: list[dict[str, Answers]] = []
+    with torch.no_grad():
+        for part in in_parts(conditions):
+            views = problem.see(None, part, problem.figure_px)
+            shown = {"clean": views, "alone": replace(views, object=None)}
+            parts.append({name: ask(problem, expose(each, None), problem.boxes(part)) for name, each in shown.items()})
+    answers = joined(parts)
+    return answers["clean"], answers["alone"]
+
+
+def map_of(problem: Problem, axes: tuple[Axis, Axis], drawn: Conditions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The clean object's hits (bool) and confidence, and the hits of the background alone, each P×L×N: poses, lights,
+    draws.
+    """
+    shape = (len(axes[0]), len(axes[1]), len(drawn))
+    answers = [with_and_without(problem, in_cell(drawn, axes, place)) for place in np.ndindex(*shape[:2])]
+    hits, confidence = ([getattr(own, name)[0] for own, _ in answers] for name in ("recognized", "confidence"))
+    alone = [background.recognized[0] for _, background in answers]
+    return np.reshape(hits, shape), np.reshape(confidence, shape), np.reshape(alone, shape)
+
+
+def worst_cells(hits: np.ndarray, confidence: np.ndarray, goal: Goal = Goal.assist) -> list[Place]:
+    """The worst tenth of a map's cells, at least one: by rate, among equals by mean confidence, then in their order."""
+    rate, sure = goal.sign * hits.mean(2).ravel(), goal.sign * confidence.mean(2).ravel()
+    order = np.lexsort((np.arange(rate.size), sure, rate))[: math.ceil(WORST_SHARE * rate.size)]
+    return [(int(i), int(j)) for i, j in zip(*np.unravel_index(order, hits.shape[:2]), strict=True)]
+
+
+def heat_map(
+    name: str,
+    titles: tuple[str, str],
+    rates: Sequence[Sequence[float]],
+    framed: Sequence[Sequence[int]],
+    ticks: Sequence[Ticks],
+    upward: bool = True,
+    empty: Sequence[Place] = (),
+) -> Drawing:
+    """Rates over two axes, the second one upward or down; `titles` are the drawing's and the plot's own. `empty` cells,
+    whose rates say nothing, are gray.
+    """
+
+    def draw(figure: Figure) -> None:
+        plot, values = figure.add_subplot(), np.array(rates).T
+        texts = [[f"{value:.2f}" for value in row] for row in values]
+        gray = [(y, x) for x, y in empty]
+        image = number_grid(plot, values, texts, [(y, x) for x, y in framed], fontsize=8, empty=gray)
+        figure.colorbar(image, ax=plot, label="rate")
+        for axis, (label, places, words) in zip((plot.xaxis, plot.yaxis), ticks, strict=True):
+            axis.set_ticks(places, words)
+            axis.set_label_text(label)
+        if upward:
+            plot.invert_yaxis()
+        plot.set_title(titles[1])
+
+    size = max(2.2 + 0.6 * len(rates), 5.5), max(1.6 + 0.42 * len(rates[0]), 3.2)
+    return Drawing(name, titles[0], draw, size)
+
+
+def map_ticks(axes: Mapping[str, Any]) -> list[Ticks]:
+    """Of a map's axes (`names`, and the `edges` of their cells)."""
+    return [
+        (words_of(name), [i - 0.5 for i in range(len(edges))], [f"{value:.4g}" for value in edges])
+        for name, edges in zip(axes["names"], axes["edges"], strict=True)
+    ]
+
+
+def words_of(name: str) -> str:
+    """A condition's field as people read it: "azimuth (°)" for azimuth_deg."""
+    words, unit = name.split("_"), ""
+    if words[-1] in _UNITS:
+        unit = f" ({_UNITS[words.pop()]})"
+    return " ".join(words) + unit

@@ -1,0 +1,280 @@
+"""Designs trained on each network and on ensembles, tested on every network, beside the original object.
+
+In: scenes, ways (full texture, masked, many or few signed steps, patches, ...), networks and seeds. Out: the matrix of
+rates and confidences with intervals, each beside the *original* object's on the same conditions; what a network gains
+from designs that never saw it; three fixed views in changed light; heat maps and contact sheets; each design as a GLB
+that opens elsewhere. A nil transfer is said, with its interval. Where networks are given families, ensembles leave out
+whole ones, and gains are also said from family to family.
+
+Source: Pestana et al., algorithm "Full Texture" and table "Transferability". Their ε is the signed step, here
+`optimize.step_size`; a ball round the start is `patch.epsilon`. Intervals are over conditions, of the designs that were
+trained: another seed's design may do better or worse. Only those over objects are of one figure per object and seed:
+conditions of one object are no evidence of another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from patchlab.paper.sides import sides, three_views
+from patchlab.study.figures import number_grid, picture_sheet
+from patchlab.study.grid import Count, Names, grouped, of_values, problem_of, short_name
+from patchlab.study.pictures import contact_sheet, photographs
+from patchlab.study.record import Record, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchlab.study.trained import (
+    ORIGINAL,
+    TrainedSettings,
+    Word,
+    alone,
+    tested_in,
+    trained_cells,
+    trained_on,
+    verdict,
+)
+from patchproof.base.claims import mean, rate
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
+from patchproof.render.photograph import Shown
+from patchproof.report.tables import Drawing, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_ALL, _WITHOUT = "all", "without_"
+_SHEET_PX = 224
+
+
+class TransferSettings(TrainedSettings):
+    """As in all studies of trained designs."""
+
+    ensembles: bool = True  # also trained on all networks but one, each in turn, and on all
+    # By name: networks of one family, all of `networks` in one or another. Ensembles leave out a whole family; {}: each
+    # network is one of its own.
+    families: dict[Word, Names] = Field({})
+    lights: Count = 20  # lights in each of three fixed views
+
+    @model_validator(mode="after")
+    def _know_every_family(self):
+        members = [name for family in self.families.values() for name in family]
+        if self.families and sorted(members) != sorted(self.networks):
+            raise ValueError("takes families in which each of networks is once, and nothing else")
+        return self
+
+    def family_of(self, network: str) -> str:
+        """The name of the family that a network is in."""
+        return next((name for name, family in self.families.items() if network in family), short_name(network))
+
+
+def cells(settings: TransferSettings, base: Path) -> list[Cell]:
+    """The original and every training set, per scene, way and seed."""
+
+    def rows(networks: Sequence[str]) -> dict[str, Sequence[str]]:
+        ensembles: dict[str, Sequence[str]] = {}
+        if settings.ensembles and len(networks) > 1:
+            for family in dict.fromkeys(map(settings.family_of, networks)):
+                rest = [name for name in networks if settings.family_of(name) != family]
+                if len(rest) > 1:  # else one network is left, which is a row already
+                    ensembles[_WITHOUT + family] = rest
+            ensembles[_ALL] = networks
+        return {ORIGINAL: (), **alone(networks), **ensembles}
+
+    return trained_cells(settings, base, rows)
+
+
+def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Train where the cell says so, and test."""
+    problem = problem_of(base, cell.values)
+    answers: dict[str, Any] = {}
+    things: dict[str, Shown] = {"design": None}
+    if cell.values["trained"]:
+        design = best_design(trained_on(problem, cell))
+        things = shown_with_controls(problem, design, ())
+        suffix, content = problem.subject.file(design)
+        answers[f"{cell.name}.{suffix}"] = content
+    answers |= recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n)))
+    views = photographs(problem, things["design"], sides(problem, 3), _SHEET_PX)
+    answers[f"{cell.name}.sheet.png"] = contact_sheet([views])
+    if problem.scene.HAS_OBJECT:
+        fixed = three_views(problem, settings.lights)
+        answers["views"] = recorded(responses(problem, things, fixed))
+        answers["azimuths"] = fixed.pose.azimuth_deg[:: settings.lights].tolist()
+    return answers
+
+
+def tables(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
+    """The matrix, the same over objects, networks left out, and fixed views."""
+    rows = _rows(results)
+    left_out = _left_out(settings, results, rows)
+    return [_matrix(settings, rows), *_over_objects(settings, results), *left_out, *_views(settings, rows)]
+
+
+Rows = Mapping[tuple, Mapping[str, Sequence[Result]]]  # results by (scene, way), then by row
+
+
+def _rows(results: Sequence[Result]) -> Rows:
+    groups = grouped(results, of_values("name", "way"))
+    return {key: grouped(group, lambda result: result.cell.values["row"]) for key, group in groups.items()}
+
+
+def _matrix(settings: TransferSettings, groups: Rows) -> Table:
+    rows = []
+    for key, by_row in groups.items():
+        original = Record(by_row.get(ORIGINAL, ()), "design")
+        for row, of_row in by_row.items():
+            record = Record(of_row, "design")
+            for network in tested_in(of_row):
+                (level, sure), (gain, surer) = record.level(network), record.gain(original, network)
+                trained = network in of_row[0].cell.values["trained"]
+                start = (*key, row, short_name(network))
+                if row == ORIGINAL:
+                    rows.append((*start, "", level, None, "", sure, None))
+                else:
+                    rows.append((*start, "yes" if trained else "no", level, gain, verdict(gain), sure, surer))
+    head = ("scene", "way", "trained on", "tested on", "seen", "rate", "gain in rate", "shows")
+    about = (
+        f"Rates and mean confidences of the target over {settings.n} unseen conditions per seed"
+        f" ({len(settings.seeds)} of them); gains are over the original on the same conditions, paired."
+    )
+    head = (*head, "confidence", "gain in confidence")
+    return Table("matrix", "Trained on one, tested on another", head, tuple(rows), about)
+
+
+def _over_objects(settings: TransferSettings, results: Sequence[Result]) -> list[Table]:
+    """Mean gains over objects and seeds: network by network and, where families are given, family by family."""
+
+    def family_of_row(result: Result) -> str:
+        trained = result.cell.values["trained"]
+        return settings.family_of(trained[0]) if len(trained) == 1 else result.cell.values["row"]
+
+    title = "Gains over objects"
+    if len({(result.cell.values["name"], result.cell.values["seed"]) for result in results}) < 2:
+        return []
+    tables = [_gains(results, "objects", title, lambda result: result.cell.values["row"], short_name)]
+    if settings.families:
+        tables.append(_gains(results, "families", f"{title}, by family", family_of_row, settings.family_of))
+    return tables
+
+
+def _gains(
+    results: Sequence[Result], name: str, title: str, trainer: Callable[[Result], str], tester: Callable[[str], str]
+) -> Table:
+    """One figure of each object and seed: the mean over rows and networks that are called the same."""
+    place = of_values("way", "name", "seed")
+    originals = {place(result): Record([result], "design") for result in results if not result.cell.values["trained"]}
+    figures: dict[tuple, dict[tuple, list[tuple[float, float]]]] = {}
+    for result, network in product(results, tested_in(results)):
+        trained, here = result.cell.values["trained"], place(result)
+        if trained and here in originals:
+            start = (here[0], trainer(result), tester(network), "yes" if network in trained else "no")
+            before, after = (np.mean(of.hits(network)) for of in (originals[here], Record([result], "design")))
+            figures.setdefault(start, {}).setdefault(here, []).append((float(before), float(after)))
+    rows = []
+    for start, by_place in figures.items():
+        before, after = np.array([np.mean(rates, 0) for rates in by_place.values()]).T
+        gain = mean((after - before).tolist())
+        rows.append((*start, float(before.mean()), float(after.mean()), gain, verdict(gain)))
+    head = ("way", "trained on", "tested on", "seen", "original", "rate", "gain in rate", "shows")
+    about = "Means of one figure per object and seed, with Student's interval over these."
+    return Table(name, title, head, tuple(rows), about)
+
+
+def _left_out(settings: TransferSettings, results: Sequence[Result], groups: Rows) -> list[Table]:
+    rows = []
+    for key, by_row in groups.items():
+        original = Record(by_row.get(ORIGINAL, ()), "design")
+        for network in tested_in(results):
+            if (without := by_row.get(_WITHOUT + settings.family_of(network))) is None:
+                continue
+            record = Record(without, "design")
+            gain, confidence = record.gain(original, network)
+            before, after = original.level(network)[0], record.level(network)[0]
+            single = _from_others(settings, by_row, network)
+            rows.append((*key, short_name(network), before, after, gain, confidence, single, verdict(gain)))
+    head = ("scene", "way", "left out", "original", "ensemble of the others", "gain", "gain in confidence")
+    head = (*head, "mean rate of one other", "shows")
+    about = (
+        "Each network judges a design that was trained on all others together, but for those of its family; beside it,"
+        " those trained on one of these."
+    )
+    return [Table("left_out", "Networks left out", head, tuple(rows), about)] if rows else []
+
+
+def _from_others(settings: TransferSettings, by_row: Mapping[str, Sequence[Result]], network: str) -> float | None:
+    """The mean rate on a network of the designs trained on one of another family."""
+    family = settings.family_of(network)
+    rates = [
+        np.mean(Record(results, "design").hits(network))
+        for results in by_row.values()
+        if len(trained := results[0].cell.values["trained"]) == 1 and settings.family_of(trained[0]) != family
+    ]
+    return float(np.mean(rates)) if rates else None
+
+
+def _views(settings: TransferSettings, groups: Rows) -> list[Table]:
+    rows = []
+    for key, by_row in groups.items():
+        for row, of_row in by_row.items():
+            for network in of_row[0].cell.values["trained"] if "views" in of_row[0].answers else ():
+                records = (Record(some, "design", "views") for some in (by_row.get(ORIGINAL, ()), of_row))
+                before, after = (np.reshape(record.hits(network), (-1, 3, settings.lights)) for record in records)
+                for i, azimuth in enumerate(of_row[0].answers["azimuths"]):
+                    rates = (rate(hits[:, i].ravel().tolist()) for hits in (before, after))
+                    rows.append((*key, row, short_name(network), azimuth, *rates))
+    head = ("scene", "way", "trained on", "tested on", "azimuth (deg)", "original", "design")
+    about = f"Three fixed views, {settings.lights} drawn lights, backgrounds and cameras each, on training networks."
+    return [Table("views", "Three views in changed light", head, tuple(rows), about)] if rows else []
+
+
+def figures(settings: TransferSettings, results: Sequence[Result]) -> list[Drawing]:
+    """A heat map and a contact sheet per scene and way."""
+    networks, drawings = tested_in(results), []
+    for (scene, way), by_row in _rows(results).items():
+        drawings += [
+            Drawing(
+                f"heat_{scene}_{way}",
+                f"Transfer: {scene}, {way}",
+                lambda figure, by_row=by_row: _heat_map(figure, by_row, networks),
+                (3.0 + 1.9 * len(networks), 2.1 + 0.33 * len(by_row)),
+                "Rows: trained on. Columns: tested on. Below each rate, its gain over the original.",
+            ),
+            picture_sheet(
+                f"sheet_{scene}_{way}",
+                f"Designs: {scene}, {way}",
+                [(row, of_row[0].file(f"{of_row[0].cell.name}.sheet.png")) for row, of_row in by_row.items()],
+                (6.5, 1.75 * len(by_row)),
+                "Three views in even light; the first seed.",
+            ),
+        ]
+    return drawings
+
+
+def _heat_map(figure: Figure, by_row: Mapping[str, Sequence[Result]], networks: Sequence[str]) -> None:
+    original = Record(by_row.get(ORIGINAL, ()), "design")
+    records = {row: Record(of_row, "design") for row, of_row in by_row.items()}
+    panels = figure.subplots(1, 2, sharey=True)
+    for which, (axes, title) in enumerate(zip(panels, ("rate", "mean confidence"), strict=True)):
+        values, texts = np.full((len(records), len(networks)), np.nan), []
+        for y, (row, record) in enumerate(records.items()):
+            texts.append([])
+            for x, network in enumerate(networks):
+                level, gain = record.level(network)[which], record.gain(original, network)[which]
+                values[y, x] = np.nan if level is None else level.value
+                texts[y].append(
+                    f"{values[y, x]:.2f}" + ("" if row == ORIGINAL or gain is None else f"\n{gain.value:+.2f}")
+                )
+        number_grid(axes, values, texts, fontsize=6)
+        axes.set_xticks(range(len(networks)), [short_name(name) for name in networks], rotation=25, ha="right")
+        axes.set_yticks(range(len(records)), list(records))
+        axes.set_title(title)
+    panels[0].set_ylabel("trained on")
+
+
+STUDY = Study("transfer", TransferSettings, cells, run, tables, figures)

@@ -1,0 +1,67 @@
+"""What networks in half precision change in a promise: what it takes, and what is answered.
+
+In: scene files. Out: `half.csv`, by scene and thing shown (a design, and the bare object in half of its views): answers
+in bfloat16 (`torch.autocast`) beside those in float32 under the same conditions, as mean and root mean square of the
+difference in confidence, views that change sides, and rates; and the share of the processor time that all views took,
+the median of rounds in turn on one thread. One design each. Run in this folder: python half.py SCENE [SCENE ...]
+"""
+
+import csv
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import patchproof as pp
+from patchproof.base.workers import keep_freed_memory
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, _with_controls, shown_with_controls
+from patchproof.optimizer.responses import responses
+
+ROUNDS = 3
+asked = Classifier._asked
+
+
+def rounded(self, squares, windows):
+    """What a network says in half precision."""
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        return asked(self, squares, windows).float()
+
+
+def measured(path: str) -> list[dict]:
+    """The lines of one scene."""
+    problem = set_problem(pp.load_scene(path))
+    shown = shown_with_controls(problem, best_design(problem), CONTROLS)
+    conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=PER_SESSION)
+    beside = _with_controls(PROMISE_VIEWS, PER_SESSION)
+    told, shares = {}, []
+    for _ in range(ROUNDS + 1):
+        seconds = []
+        for way in (asked, rounded):
+            Classifier._asked, begin = way, time.process_time()
+            told[way] = responses(problem, shown, conditions, beside=beside)
+            seconds.append(time.process_time() - begin)
+        shares.append(seconds[1] / seconds[0])
+    Classifier._asked, rows = asked, []
+    for thing in ("design", "bare"):
+        whole, half = told[asked][thing], told[rounded][thing]
+        off, other = (half.confidence - whole.confidence)[0], (half.recognized != whole.recognized)[0]
+        row = {"scene": Path(path).stem, "thing": thing, "n": len(off), "share": f"{statistics.median(shares[1:]):.3f}"}
+        row |= {"mean": f"{off.mean():.5f}", "rms": f"{np.sqrt((off**2).mean()):.5f}", "other": int(other.sum())}
+        rows.append(row | {"rate": f"{whole.recognized.mean():.4f}", "half_rate": f"{half.recognized.mean():.4f}"})
+    return rows
+
+
+if __name__ == "__main__":
+    keep_freed_memory()
+    torch.set_num_threads(1)
+    rows = [row for path in sys.argv[1:] for row in measured(path)]
+    with open("half.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,108 @@
+"""A step of the optimizer beside its network's own work: the share that is ours.
+
+In: `suv.toml` and `effects.toml`, the same with every effect on. Out: `step.csv`, in milliseconds: a step of four
+views, selections apart, where poses are seen for the first time and where they come round again, both as often as in a
+run of default length (a quarter and three), and the network's forward and backward pass of four such pictures in the
+same rounds; so many processes share the views, so many threads the pass. Means of all steps, as a process sees the
+views of several steps in one of them; of passes the medians of each round. Freed memory is kept as the command line
+keeps it, by the pass, too. Run in this folder, idle: python step.py
+"""
+
+import csv
+import statistics
+import time
+from dataclasses import replace
+
+import torch
+from torch import nn
+
+import patchproof as pp
+from patchproof.base.workers import keep_freed_memory
+from patchproof.optimizer import loop
+from patchproof.optimizer.problem import set_problem
+
+ROUNDS, STEPS = 16, 4  # the first is to warm up
+NEW = ROUNDS // 4
+NAMES = [f"label {i}" for i in range(999)] + ["jeep"]
+
+
+class Block(nn.Module):
+    """A bottleneck of He et al. (CVPR 2016)."""
+
+    def __init__(self, into: int, width: int, stride: int):
+        super().__init__()
+        sizes = ((into, width, 1, 1), (width, width, 3, stride), (width, 4 * width, 1, 1))
+        layers = [(nn.Conv2d(a, b, k, s, k // 2, bias=False), nn.BatchNorm2d(b), nn.ReLU()) for a, b, k, s in sizes]
+        self.path = nn.Sequential(*[layer for three in layers for layer in three][:-1])
+        skip = nn.Sequential(nn.Conv2d(into, 4 * width, 1, stride, bias=False), nn.BatchNorm2d(4 * width))
+        self.skip = nn.Identity() if into == 4 * width and stride == 1 else skip
+
+    def forward(self, x):
+        """N×C×H×W in, out with four times the width's channels."""
+        return torch.relu(self.path(x) + self.skip(x))
+
+
+def resnet50() -> pp.Classifier:
+    """One of the shape of ResNet-50 with random weights."""
+    torch.manual_seed(0)
+    blocks, into = [], 64
+    for width, count, stride in ((64, 3, 1), (128, 4, 2), (256, 6, 2), (512, 3, 2)):
+        for number in range(count):
+            blocks.append(Block(into, width, stride if number == 0 else 1))
+            into = 4 * width
+    stem = [nn.Conv2d(3, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)]
+    net = nn.Sequential(*stem, *blocks, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(into, 1000))
+    return pp.classifier_of(net.to(memory_format=torch.channels_last), 224, NAMES, "python:resnet50")
+
+
+def pass_ms(problem, pictures, indices) -> float:
+    """Of one forward and backward pass of the network, each picture's loss to its pixels."""
+    leaf, (classifier,) = pictures.clone().requires_grad_(), problem.classifiers
+    start = time.perf_counter()
+    loss = problem.losses(classifier, classifier.logits(leaf), indices).mean()
+    torch.autograd.grad(loss, leaf)
+    return 1000 * (time.perf_counter() - start)
+
+
+def measured(name: str, scene: str, processes: int) -> dict:
+    """A line of the table."""
+    models = [resnet50()] if name == "resnet50" else [f"file:${{PATCHPROOF_DATA}}/models/{name}.pt2"]
+    asked = pp.load_scene(f"{scene}.toml").settings.changed(optimize={"steps": ROUNDS * STEPS})
+    scene = pp.make_scene(asked)
+    problem = replace(set_problem(scene, models=models), jobs=processes)
+    loop.POSES = 0  # a quarter of the views
+    pictures = torch.rand(4, 3, problem.training_px, problem.training_px)
+    problem.see(None, scene.draw("train", 256), 16)  # makes the places that training knows, once
+    running, rounds = loop.steps(problem), []
+    for _ in range(ROUNDS):
+        torch.set_num_threads(processes)  # which sharing views takes away
+        passes = [pass_ms(problem, pictures, problem.indices[0]) for _ in range(STEPS)]
+        torch.set_num_threads(1)
+        steps = []
+        for _ in range(STEPS):
+            start = time.perf_counter()
+            step = next(running)
+            if not loop.selects(scene.settings.optimize, step.state.number):
+                steps.append(1000 * (time.perf_counter() - start))
+        rounds.append((statistics.mean(steps), statistics.median(passes)))
+    running.close()
+    new, again = (
+        [statistics.mean(values) for values in zip(*some, strict=True)] for some in (rounds[1:NEW], rounds[NEW:])
+    )
+    step_ms, own_ms = ((first + 3 * later) / 4 for first, later in zip(new, again, strict=True))
+    times = {"new_ms": new[0], "again_ms": again[0], "step_ms": step_ms, "pass_ms": own_ms}
+    return {name: round(value, 1) for name, value in times.items()} | {"ratio": round(step_ms / own_ms, 3)}
+
+
+if __name__ == "__main__":
+    keep_freed_memory()
+    kinds = [(n, "suv") for n in ("mobilenet_v2_1.0_224", "squeezenet1.1_224", "resnet50")]
+    with open("step.csv", "w", newline="") as file:
+        times = ("new_ms", "again_ms", "step_ms", "pass_ms", "ratio")
+        writer = csv.DictWriter(file, ("network", "scene", "processes", *times))
+        writer.writeheader()
+        for name, scene in (*kinds, ("mobilenet_v2_1.0_224", "effects")):
+            for processes in (1, 2):
+                about = {"network": name, "scene": scene, "processes": processes}
+                writer.writerow(about | measured(name, scene, processes))
+                file.flush()

@@ -1,0 +1,100 @@
+"""Gradients in windows, and answers to pictures that differ in them, beside whole ones: what they take, how far off.
+
+In: networks of DATA. Out: `windows.csv`: for windows of some shares of the picture's side, the medians of forward and
+backward passes of two pictures and of forward passes of four beside four others, in turn with whole passes and on one
+thread, with freed memory kept; and the largest differences, of gradients in the windows as a share of the largest
+gradient, of logits as they are. Run in this folder, idle: python windows.py
+"""
+
+import csv
+import os
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from patchproof.base.workers import keep_freed_memory
+from patchproof.classifier import load_classifier
+from patchproof.networks.windows import Windows
+
+NETWORKS = ("mobilenet_v2_1.0_224", "squeezenet1.1_224", "mobilenet_v1_0.75_192", "mobilenet_v1_0.25_128")
+SHARES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8)
+ROUNDS = 30
+
+
+def gradient(network, photos, windows):
+    """Of a weighted sum of the answers, at the pictures; and the milliseconds that it took."""
+    leaf, start = photos.clone().requires_grad_(), time.perf_counter()
+    answers = network(leaf, windows)
+    weights = torch.linspace(-1, 1, answers.numel()).view(answers.shape)
+    (found,) = torch.autograd.grad((answers * weights).sum(), leaf)
+    return found, 1000 * (time.perf_counter() - start)
+
+
+def placed(size: int, share: float, count: int) -> np.ndarray:
+    """Windows of that share of the side, anywhere."""
+    side = round(share * size)
+    starts = np.random.default_rng(0).integers(0, size - side, (count, 2), endpoint=True)
+    return np.hstack([starts, starts + side])
+
+
+def parts(photos, windows):
+    """What each picture shows in its window."""
+    edges = windows.tolist()
+    return [one[:, top:bottom, left:right] for one, (left, top, right, bottom) in zip(photos, edges, strict=True)]
+
+
+def asked_for_gradients(network, size: int, share: float) -> dict:
+    """Of two pictures, in the windows only and of all of them."""
+    windows, photos = placed(size, share, 2), torch.rand(2, 3, size, size)
+    times = {"whole": [], "windows": []}
+    for _ in range(ROUNDS + 2):
+        (whole, whole_ms), (some, windows_ms) = (gradient(network, photos, w) for w in (None, Windows(windows)))
+        times["whole"].append(whole_ms)
+        times["windows"].append(windows_ms)
+    largest = float(whole.abs().max())
+    pairs = zip(parts(some, windows), parts(whole, windows), strict=True)
+    difference = max(float((one - same).abs().max()) for one, same in pairs) / largest
+    whole_ms, windows_ms = (statistics.median(values[2:]) for values in times.values())  # the first are to warm up
+    row = {"whole_ms": round(whole_ms, 2), "windows_ms": round(windows_ms, 2)}
+    return row | {"ratio": round(windows_ms / whole_ms, 3), "difference": f"{difference:.1e}"}
+
+
+@torch.no_grad()
+def asked_beside_others(network, size: int, share: float) -> dict:
+    """Four pictures that differ in windows only from four others, whose answers are known."""
+    windows, photos = placed(size, share, 4), torch.rand(4, 3, size, size)
+    others, kept, times, difference = photos.clone(), {}, {"whole": [], "beside": []}, 0.0
+    for part in parts(others, windows):
+        part.uniform_()
+    network(photos, Windows(windows, kept))
+    for _ in range(ROUNDS + 2):
+        told = {}
+        for name, known in (("whole", None), ("beside", Windows(windows, kept))):
+            start = time.perf_counter()
+            told[name] = network(others, known)
+            times[name].append(1000 * (time.perf_counter() - start))
+        difference = max(difference, float((told["whole"] - told["beside"]).abs().max()))
+    whole_ms, beside_ms = (statistics.median(values[2:]) for values in times.values())
+    row = {"forward_ms": round(whole_ms, 2), "beside_ms": round(beside_ms, 2)}
+    return row | {"beside_ratio": round(beside_ms / whole_ms, 3), "beside_difference": f"{difference:.1e}"}
+
+
+def measured(name: str, share: float) -> dict:
+    """A line of the table."""
+    classifier = load_classifier(f"file:{os.environ['PATCHPROOF_DATA']}/models/{name}.pt2", Path())
+    asked = classifier.network, classifier.input_px, share
+    return {"network": name, "share": share, **asked_for_gradients(*asked), **asked_beside_others(*asked)}
+
+
+if __name__ == "__main__":
+    keep_freed_memory()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    rows = [measured(name, share) for name in NETWORKS for share in SHARES]
+    with open("windows.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)

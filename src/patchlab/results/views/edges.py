@@ -1,0 +1,53 @@
+"""What outlines cost: photographs of the bare object, its outlines jagged and smooth, beside 3×3 samples to a pixel.
+
+In: scene files of `../promises`. Out: a line of `edges.csv` per scene: confidence less that of the samples, means over
+the conditions with 95 % intervals (Student's). Run in this folder: python edges.py suv pickup light postbox mug carton
+"""
+
+import csv
+import sys
+from dataclasses import replace
+
+import torch
+from torch.nn.functional import avg_pool2d
+
+import patchproof as pp
+from patchproof.base.claims import student_mean
+from patchproof.channel.camera import develop
+from patchproof.optimizer.problem import set_problem
+from patchproof.render.photograph import expose, shade
+from patchproof.render.views import see
+
+N, SEED, SAMPLES = 60, 78, 3
+NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.pt2"
+
+
+def measured(name: str) -> dict:
+    """The line of one scene."""
+    problem = set_problem(pp.load_scene(f"../promises/{name}.toml"), models=[NETWORK])
+    conditions, size_px = problem.scene.draw("evaluate", N, SEED), problem.scene.settings.camera.photo_px
+    classifier, sure = problem.classifiers[0], []
+    for one in (conditions[i : i + 1] for i in range(N)):
+        with torch.no_grad():
+            views = see(problem.stage, None, one, size_px)
+            light = shade(see(problem.stage, None, one, tuple(SAMPLES * side for side in size_px)), None)
+            pictures = [
+                expose(replace(views, outlines=None), None, jpeg=False),
+                expose(views, None, jpeg=False),
+                develop(avg_pool2d(light, SAMPLES), one.sensor, 1.0, jpeg=False),
+            ]
+            sure.append(classifier.confidence(classifier.logits(torch.cat(pictures)), problem.indices[0]))
+    jagged, smooth, samples = torch.stack(sure, 1).double().numpy()
+    row = {"scene": name, "n": N, "confidence": samples.mean()}
+    for kind, values in (("jagged", jagged), ("smooth", smooth)):
+        off = student_mean(values - samples)
+        row |= {f"{kind}_off": off.value, f"{kind}_low": off.low, f"{kind}_high": off.high}
+    return {key: round(value, 5) if isinstance(value, float) else value for key, value in row.items()}
+
+
+if __name__ == "__main__":
+    rows = [measured(name) for name in sys.argv[1:]]
+    with open("edges.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)

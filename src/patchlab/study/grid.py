@@ -1,0 +1,120 @@
+"""The grid that most studies walk: every scene file with every network and seed, and whatever a study varies besides.
+
+In: a study's settings, with paths relative to the config's folder. Out: cells whose values carry the whole scene, so
+that a changed scene file is done again; from a cell's values the scene and its problem; results in groups.
+
+A study may change keys of tables of the scene file (`patch`, `optimize`, ...), so that one scene serves for patches,
+full and masked textures, bounded or free. Changes are checked like the file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import Field, model_validator
+
+from patchlab.study.study import Cell, Result
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Strict, expand, read_toml, validated
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.scene.scene import Scene, build_scene
+
+Values = dict[str, Any]  # of a cell: JSON values
+Tables = Mapping[str, Mapping[str, Any]]  # tables of a scene file with the keys that change
+Count = Annotated[int, Field(ge=1)]
+Names = Annotated[tuple[str, ...], Field(min_length=1)]
+Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+Key = TypeVar("Key", bound=Hashable)
+
+
+class GridSettings(Strict):
+    """Every scene file with every network and seed; paths are relative to the config's folder."""
+
+    scenes: Names  # scene files
+    networks: tuple[str, ...] = ()  # in place of each scene's own
+    seeds: Seeds = (0,)  # of the optimizer and the draws
+
+    @model_validator(mode="after")
+    def _have_different_names(self):
+        for key in ("scenes", "networks", "seeds"):
+            names = [short_name(str(name)) for name in getattr(self, key)]
+            if len(set(names)) < len(names):
+                raise ValueError(f"takes {key} with different names")
+        return self
+
+
+def short_name(name: str) -> str:
+    """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
+    word = name.rpartition(":")[2]
+    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
+
+
+def scene_values(file: str, base: Path, tables: Tables | None = None, where: str = "") -> Values:
+    """The values of a cell that say its scene: name, file, and all settings with keys of some tables changed."""
+    path = Path(expand(file, base))
+    scene = _changed(read_toml(path), tables or {}, path.name + where)
+    return {"name": short_name(file), "file": file, "scene": scene}
+
+
+def with_tables(values: Values, tables: Tables) -> Values:
+    """The values with keys of some of the scene's tables changed."""
+    return values | {"scene": _changed(values["scene"], tables, values["file"])}
+
+
+def pairs(settings: GridSettings, base: Path) -> Iterator[Values]:
+    """The values of every scene before every single network, whose name tables say, but for the seed."""
+    for file in settings.scenes:
+        values: Values = scene_values(file, base) | {"of_scene": not settings.networks}
+        for network in settings.networks or values["scene"]["target"]["models"]:
+            yield values | {"networks": [network], "network": short_name(network)}
+
+
+def cell_of(values: Values, seed: int, *words: str) -> Cell:
+    """A cell named after its scene, what the words say, and the seed."""
+    name = ".".join((values["name"][:30], *words, str(seed)))
+    return Cell(re.sub(r"[^\w=+.,-]+", "-", name), {**values, "seed": seed})
+
+
+def scene_of(base: Path, values: Mapping[str, Any]) -> Scene:
+    """The scene that a cell's values hold, its paths relative to the scene file's folder."""
+    settings = validated(SceneSettings, values["scene"], values["file"])
+    return build_scene(settings, _folder(base, values), values["seed"])
+
+
+def networks_at(base: Path, values: Mapping[str, Any]) -> tuple[str, ...]:
+    """The values' networks, their paths relative to the config or, where it names none, to the scene."""
+    folder = _folder(base, values) if values["of_scene"] else base
+    return tuple(expand(name, folder) for name in values["networks"])
+
+
+def problem_of(base: Path, values: Mapping[str, Any]) -> Problem:
+    """The values' scene before their networks."""
+    return set_problem(scene_of(base, values), models=networks_at(base, values))
+
+
+def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
+    """Results by key, keys in the order they come."""
+    groups: dict[Key, list[Result]] = {}
+    for result in results:
+        groups.setdefault(key(result), []).append(result)
+    return groups
+
+
+def of_values(*names: str) -> Callable[[Result], tuple]:
+    """A key to group by: these values of a result's cell."""
+    return lambda result: tuple(result.cell.values[name] for name in names)
+
+
+who = of_values("name", "network", "seed")  # scene, network and seed, as tables begin
+
+
+def _changed(data: Mapping[str, Any], tables: Tables, where: str) -> dict[str, Any]:
+    whole = {**data, **{name: {**data.get(name, {}), **keys} for name, keys in tables.items()}}
+    return validated(SceneSettings, whole, where).model_dump(mode="json")
+
+
+def _folder(base: Path, values: Mapping[str, Any]) -> Path:
+    return Path(expand(values["file"], base)).resolve().parent

@@ -1,0 +1,94 @@
+"""What cells record of networks' answers: short as JSON, and paired across cells.
+
+In: answers by what was shown. Out: per thing and network a text of 0 and 1, and confidences to five digits; from
+results the rates, mean confidences and paired differences of tables. Cells of one scene, its networks and a seed are
+measured on the same draws of the evaluate stream, which training and selection never see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from patchlab.study.study import Result
+from patchproof.base.claims import Estimate, difference, mean, rate
+from patchproof.base.goal import Goal
+from patchproof.optimizer.responses import Answers
+
+
+def recorded(answers: Mapping[str, Answers]) -> dict[str, Any]:
+    """Hits and confidences as JSON values, each per shown thing and network."""
+    return {
+        "hits": {thing: [bits(row) for row in answer.recognized] for thing, answer in answers.items()},
+        "confidence": {thing: np.round(answer.confidence, 5).tolist() for thing, answer in answers.items()},
+    }
+
+
+def bits(hits: Sequence[bool] | np.ndarray) -> str:
+    """Hits as a text of 0 and 1."""
+    return "".join("01"[int(hit)] for hit in hits)
+
+
+def hits_of(text: str) -> list[bool]:
+    """The hits of `bits`."""
+    return [digit == "1" for digit in text]
+
+
+def rate_of(result: Result, thing: str) -> float:
+    """The rate of a shown thing before the first of its cell's networks."""
+    return float(np.mean(hits_of(result.answers["hits"][thing][0])))
+
+
+def gain_of(result: Result, thing: str, other: str) -> float:
+    """The rate of a thing over another's, in the direction of the goal of its cell's scene."""
+    return Goal(result.cell.values["scene"]["target"]["goal"]).sign * (rate_of(result, thing) - rate_of(result, other))
+
+
+def hardest(result: Result, controls: Sequence[str]) -> str:
+    """The control that is hardest to beat."""
+    return max(controls, key=lambda name: gain_of(result, name, controls[0]))
+
+
+class Record:
+    """What results recorded of one shown thing, one cell after the other; in `where` of their answers, if given.
+
+    A network may be left out where cells have one only.
+    """
+
+    def __init__(self, results: Iterable[Result], thing: str, where: str | None = None):
+        self._cells: dict[Hashable, tuple[Sequence[str], Mapping[str, Any]]] = {}
+        for result in results:
+            values, answers = result.cell.values, result.answers if where is None else result.answers[where]
+            key = (values["name"], values["seed"], *values["networks"])
+            self._cells[key] = values["networks"], {kind: answers[kind][thing] for kind in ("hits", "confidence")}
+
+    def hits(self, network: str | None = None, among: Iterable[Hashable] | None = None) -> list[bool]:
+        """Recognized or not, per condition."""
+        return [hit for text in self._rows("hits", network, among) for hit in hits_of(text)]
+
+    def confidences(self, network: str | None = None, among: Iterable[Hashable] | None = None) -> list[float]:
+        """The target's confidence, per condition."""
+        return [value for row in self._rows("confidence", network, among) for value in row]
+
+    def level(self, network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
+        """(rate, mean confidence)."""
+        return rate(self.hits(network)), mean(self.confidences(network))
+
+    def gain(self, other: Record, network: str | None = None) -> tuple[Estimate | None, Estimate | None]:
+        """(rate, mean confidence) over those of `other`, paired by condition in the cells that both have."""
+        shared = [key for key in self._cells if key in other._cells]
+        pairs = zip(self.confidences(network, shared), other.confidences(network, shared), strict=True)
+        return (
+            difference(self.hits(network, shared), other.hits(network, shared)),
+            mean([own - others for own, others in pairs]),
+        )
+
+    def _rows(self, kind: str, network: str | None, among: Iterable[Hashable] | None) -> list[Any]:
+        chosen = (self._cells[key] for key in (self._cells if among is None else among))
+        return [
+            answers[kind][0 if network is None else networks.index(network)]
+            for networks, answers in chosen
+            if network is None or network in networks
+        ]

@@ -1,0 +1,73 @@
+"""What the studies of trained designs share: train a scene on some networks, then measure it on all of them.
+
+In: a grid with ways to vary each scene, and networks. Out: cells of which each says who trains and who looks; tables
+that group by what was trained. Left out on purpose: promises, which belong to runs that get printed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from patchlab.study.grid import GridSettings, Names, Tables, cell_of, scene_values, short_name, with_tables
+from patchlab.study.study import Cell, Result
+from patchproof.base.claims import Estimate
+from patchproof.optimizer.problem import Problem
+
+Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
+Word = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
+ORIGINAL = "original"  # the row of the object as it came
+
+
+class TrainedSettings(GridSettings):
+    """Every scene in every way, before networks that train and test."""
+
+    networks: Names = Field(...)  # to train on and to test
+    # By name: tables of the scene file with the keys that change.
+    ways: dict[Word, Way] = Field({"as_is": {}}, min_length=1)
+    n: Annotated[int, Field(ge=2)] = 400  # unseen conditions that measure
+
+
+def alone(networks: Sequence[str]) -> dict[str, Sequence[str]]:
+    """Rows in which each network trains alone."""
+    return {short_name(name): (name,) for name in networks}
+
+
+def trained_cells(
+    settings: TrainedSettings,
+    base: Path,
+    rows: Callable[[Sequence[str]], Mapping[str, Sequence[str]]] = alone,
+    variants: Sequence[tuple[Tables, Mapping[str, str]]] = (({}, {}),),
+) -> list[Cell]:
+    """A cell per scene, way, variant, row and seed; all networks test. `rows` names those that train (none: the
+    original); a variant is tables of the scene to change, and what of it cells should say.
+    """
+    networks, cells = settings.networks, []
+    for file, (way, changed), (tables, more) in product(settings.scenes, settings.ways.items(), variants):
+        values = with_tables(scene_values(file, base, changed, f", way {way}"), tables)
+        for (row, trained), seed in product(rows(networks).items(), settings.seeds):
+            who, words = {"way": way, **more, "row": row}, (way, *(text[:24] for text in more.values()), row)
+            networks_of_cell = {"trained": list(trained), "networks": list(networks), "of_scene": False}
+            cells.append(cell_of(values | who | networks_of_cell, seed, *words))
+    return cells
+
+
+def trained_on(problem: Problem, cell: Cell) -> Problem:
+    """The same problem before the networks that train."""
+    return problem.before([cell.values["networks"].index(name) for name in cell.values["trained"]])
+
+
+def tested_in(results: Sequence[Result]) -> list[str]:
+    """All networks that some cell was tested on."""
+    return list(dict.fromkeys(name for result in results for name in result.cell.values["networks"]))
+
+
+def verdict(gain: Estimate | None) -> str:
+    """What an interval of a difference allows one to say."""
+    if gain is None:
+        return "not measured"
+    return "gain" if gain.low > 0 else "loss" if gain.high < 0 else "none shown"

@@ -1,0 +1,68 @@
+"""What is stored of a trained network: weights as float16 or a program, and a card that says how it was made and how
+good it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import platform
+import shlex
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from patchlab.training.fit import Recipe, Seconds
+from patchproof.mesh import primitives
+
+HELD_OUT = "renders of other shapes, textures, backgrounds and conditions of the same kinds; nothing real"
+
+
+def class_names() -> list[str]:
+    """The labels of the procedural objects, as people write them."""
+    return [name.replace("_", " ") for name in primitives.names()]
+
+
+def stored(network: nn.Module, path: Path) -> int:
+    """Write the weights as float16 and give the network what was stored; how many they are."""
+    from safetensors.torch import save_file
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    weights = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
+    save_file(weights, path)
+    network.load_state_dict({name: tensor.float() for name, tensor in weights.items()})
+    return sum(tensor.numel() for tensor in weights.values())
+
+
+def exported(network: nn.Module, path: Path, input_px: int) -> int:
+    """Write the network as a program for any number of pictures; how many weights it has."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    batches = {0: torch.export.Dim("n", min=1, max=4096)}
+    photos = torch.rand(2, 3, input_px, input_px)
+    torch.export.save(torch.export.export(network.eval(), (photos,), dynamic_shapes=(batches,)), path)
+    return sum(weights.numel() for weights in network.parameters())
+
+
+def write_card(path: Path, figures: dict[str, Any], module: str, recipe: Recipe, seconds: Seconds) -> None:
+    """The labels, the figures and how to make the network again."""
+    changed = [field for field in dataclasses.fields(recipe) if getattr(recipe, field.name) != field.default]
+    options = [f"--{field.name.replace('_', '-')} {shlex.quote(str(getattr(recipe, field.name)))}" for field in changed]
+    card = {
+        "labels": class_names(),
+        **figures,
+        "held_out": HELD_OUT,
+        "command": " ".join([f"python -m patchlab.training.{module} --out DIR", *options]),
+        "recipe": dataclasses.asdict(recipe),
+        "seconds": seconds._asdict(),
+        "date": datetime.date.today().isoformat(),
+        "machine": f"{platform.machine()}, torch {torch.__version__}, {recipe.threads} thread(s)",
+    }
+    path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def by_class(figures: Any) -> dict[str, float]:
+    """A figure of each class, rounded."""
+    return {name: round(float(figure), 4) for name, figure in zip(class_names(), figures, strict=True)}

@@ -1,0 +1,115 @@
+"""One training on rendered pictures, from the command line to the files: what all networks of this package share.
+
+In: a recipe, and of each network what it is, how it learns from a batch, how it is judged and what is written. Out: one
+step after the other, and printed lines. Rendered pictures can be kept in a folder, for trainings that follow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from patchlab.training.pictures import HELD_OUT, Pictures, kept, pictures
+from patchproof.scene import patterns
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides the weights, but for the machine's rounding."""
+
+    seed: int = 0
+    pictures_per_class: int = 1500
+    held_out_per_class: int = 200
+    epochs: int = 20
+    batch: int = 64
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.02
+    pasted: float = 0.3  # share of training pictures with a card pasted on
+    threads: int = 1
+
+
+R = TypeVar("R", bound=Recipe)
+Epochs = Iterator[tuple[int, float, nn.Module]]  # after each epoch: its number, its mean loss, the network as it is
+
+
+class Seconds(NamedTuple):
+    """How long the parts of a training took."""
+
+    render: int
+    train: int
+
+
+def run(
+    make: type[R],
+    about: str,
+    input_px: int,
+    train: Callable[[Pictures, R], Epochs],
+    score: Callable[[nn.Module, Pictures], np.ndarray],
+    write: Callable[[Path, nn.Module, R, Pictures, Seconds], None],
+    seen: Callable[[Pictures, R], Pictures] = lambda shown, recipe: shown,
+) -> None:
+    """The command: render at `input_px`, train, judge every fourth epoch by the mean of `score`, and write the network;
+    `seen` makes of rendered pictures those that the recipe's network takes.
+    """
+    out, folder, recipe = _asked(make, about)
+    torch.set_num_threads(recipe.threads)
+    started = time.time()
+    render = pictures if folder is None else lambda *what: kept(folder, *what)
+    held_out = seen(render(recipe.held_out_per_class, recipe.seed + HELD_OUT, input_px), recipe)
+    training = seen(render(recipe.pictures_per_class, recipe.seed, input_px), recipe)
+    rendered = time.time()
+    for epoch, loss, network in train(training, recipe):
+        shown = f", held out {score(network, held_out).mean():.3f}" if epoch % 4 == 3 else ""
+        print(
+            f"epoch {epoch + 1} of {recipe.epochs}: loss {loss:.3f}{shown}, {time.time() - started:.0f} s", flush=True
+        )
+        if epoch + 1 == recipe.epochs:
+            seconds = Seconds(round(rendered - started), round(time.time() - rendered))
+            write(out, network.eval(), recipe, held_out, seconds)
+
+
+def _asked(make: type[R], about: str) -> tuple[Path, Path | None, R]:
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their card")
+    parser.add_argument("--pictures", type=Path, help="folder that keeps the rendered pictures for further trainings")
+    for field in dataclasses.fields(make):
+        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
+    options = vars(parser.parse_args())
+    return options.pop("out"), options.pop("pictures"), make(**options)
+
+
+def epochs(
+    make: Callable[[], nn.Module],
+    shown: Pictures,
+    recipe: Recipe,
+    loss_of: Callable[[nn.Module, Tensor, Tensor, np.random.Generator], Tensor],
+) -> Epochs:
+    """Learn by `loss_of(network, rows of the pictures, cards to paste on, generator)`, batch after batch."""
+    torch.manual_seed(recipe.seed)
+    rng = np.random.default_rng([recipe.seed, 1])
+    network = make().train()
+    # a quarter faster on a CPU; torch's stubs do not know that a module takes this alone
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    steps = recipe.epochs * (len(shown.images) // recipe.batch)
+    optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
+    cards = torch.from_numpy(np.stack([patterns.card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
+    for epoch in range(recipe.epochs):
+        losses, order = [], torch.randperm(len(shown.images))
+        for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
+            loss = loss_of(network, rows, cards, rng)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            losses.append(loss.item())
+        yield epoch, float(np.mean(losses)), network

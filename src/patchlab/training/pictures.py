@@ -1,0 +1,184 @@
+"""The pictures that the built-in networks learn from: renders of our own procedural objects.
+
+In: nothing but seeds. Out: pictures, labels and boxes. Our own renderer shows objects with drawn shapes, colors,
+textures, poses, lights, cameras and backgrounds. Half of the pictures are rendered at the network's size, as in
+training a patch, half at twice the size and then reduced, as a photograph is.
+Left out on purpose: anything real. The networks serve demos and tests and say nothing of photographs of real objects.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.base.color import codes_of
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import validated
+from patchproof.classifier.network import center_square
+from patchproof.mesh import primitives
+from patchproof.mesh.mesh import Mesh
+from patchproof.render.photograph import photograph
+from patchproof.render.stage import set_stage
+from patchproof.scene import patterns
+from patchproof.scene.backgrounds import Backgrounds
+from patchproof.scene.mesh_scene import bare_scene
+
+LENGTH_MM = 300.0
+VIEWS_PER_SHAPE = 10
+HELD_OUT = 1_000_000  # seeds from here on are never trained on
+
+
+class Pictures(NamedTuple):
+    """uint8 N×3×S×S, each picture's label N, and its object's box N×4 as shares of the side."""
+
+    images: Tensor
+    labels: Tensor
+    boxes: Tensor
+
+
+def pictures(per_class: int, seed: int, size_px: int) -> Pictures:
+    """Every shape is seen from VIEWS_PER_SHAPE drawn conditions."""
+    images, labels, boxes = [], [], []
+    for label, name in enumerate(primitives.names()):
+        for shape in range(-(-per_class // VIEWS_PER_SHAPE)):
+            rng = np.random.default_rng([seed, label, shape])
+            seen, around = _views(name, seed + shape, rng, size_px)
+            images.append(seen)
+            boxes.append(around)
+            labels += [label] * VIEWS_PER_SHAPE
+    return Pictures(torch.cat(images), torch.tensor(labels), torch.cat(boxes))
+
+
+def kept(folder: Path, per_class: int, seed: int, size_px: int) -> Pictures:
+    """The same from a file of the folder, where an earlier call left them, by whatever code."""
+    from safetensors.torch import load_file, save_file
+
+    file = folder / f"{per_class}_{seed}_{size_px}.safetensors"
+    if file.is_file():
+        return Pictures(**load_file(file))
+    rendered = pictures(per_class, seed, size_px)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_file(rendered._asdict(), file)
+    return rendered
+
+
+def reduced(shown: Pictures, size_px: int) -> Pictures:
+    """The same pictures, smaller."""
+    parts = shown.images.split(1024)
+    return shown._replace(images=torch.cat([codes_of(center_square(part.float() / 255, size_px)) for part in parts]))
+
+
+def _views(name: str, seed: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
+    """VIEWS_PER_SHAPE pictures and boxes of one shape with one set of materials."""
+    return views_of(dressed(primitives.build(name, seed), rng), VIEWS_PER_SHAPE, rng, size_px)
+
+
+def views_of(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> tuple[Tensor, Tensor]:
+    """`count` pictures uint8 and boxes of a mesh, which is made LENGTH_MM long; half of them, rounded down, rendered at
+    `size_px`.
+    """
+    scale = LENGTH_MM / np.ptp(mesh.vertices, axis=0).max()
+    mesh = dataclasses.replace(mesh, vertices=mesh.vertices * scale)
+    behind = Backgrounds(tuple(patterns.background(rng) for _ in range(count)))
+    scene = bare_scene(_settings(rng, 2 * size_px), mesh, behind)
+    stage, conditions = set_stage(scene), scene.draw("evaluate", count, int(rng.integers(1 << 30)))
+    half = count // 2
+    seen = [center_square(photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px)), size_px)]
+    if half:
+        seen.insert(0, photograph(stage, None, conditions[:half], (size_px, size_px)))
+    return codes_of(torch.cat(seen)), torch.as_tensor(scene.boxes(conditions), dtype=torch.float32)
+
+
+def _settings(rng: np.random.Generator, photo_px: int) -> SceneSettings:
+    """Ranges for one shape: the object fills a quarter to nine tenths of the picture, seen from all round."""
+    fov_deg = rng.uniform(25, 65)
+    share = np.exp(rng.uniform(np.log(0.3), np.log(0.85)))
+    distance = LENGTH_MM / (2 * np.tan(np.radians(fov_deg) / 2) * share)
+    nearest = max(0.85 * distance, 1.05 * LENGTH_MM)  # nearer than that, the camera could be in the object
+    return validated(
+        SceneSettings,
+        {
+            "object": {"mesh": "primitive:mug", "length_mm": LENGTH_MM},
+            "patch": {"width_mm": 10, "height_mm": 10, "side": str(rng.choice(["+x", "-x", "+z", "-z"]))},
+            "target": {"label": 0, "models": ["builtin"]},
+            "view": {
+                "azimuth_deg": [-180, 180],
+                "elevation_deg": [-10, 60],
+                "roll_deg": [-10, 10],
+                "distance_mm": [nearest, max(1.2 * distance, nearest)],
+                "fov_deg": fov_deg,
+                "look_at_jitter": 0.1,
+            },
+            "light": {"ambient": [0.2, 0.8], "directional": [0.1, 0.9]},
+            "camera": {
+                "photo_px": [photo_px, photo_px],
+                "exposure_ev": [-0.8, 0.6],
+                "white_balance": 0.15,
+                "blur_px": [0, 1.5],
+                "noise": [0, 0.04],
+                "jpeg": [40, 95],
+            },
+        },
+        "the training recipe",
+    )
+
+
+def dressed(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """The mesh with its own colors (half of the time), with worn ones, or with drawn colors and textures."""
+    kind = rng.choice(["own", "worn", "mixed", "drawn"], p=[0.5, 0.2, 0.2, 0.1])
+    materials = []
+    for material in mesh.materials:
+        if kind == "worn":
+            worn = np.clip(0.8 + 0.25 * (patterns.texture(rng).mean(2, keepdims=True) - 0.5), 0, 1).repeat(3, 2)
+            material = dataclasses.replace(material, texture_srgb=codes_of(worn))
+        if kind == "drawn" or (kind == "mixed" and rng.random() < 0.4):
+            plain = rng.random() < 0.4
+            color = tuple(rng.uniform(0.02, 0.9, 3)) if plain else (1.0, 1.0, 1.0)
+            drawn = None if plain else codes_of(patterns.texture(rng))
+            material = dataclasses.replace(material, base_color_linear=color, texture_srgb=drawn)
+        materials.append(material)
+    return dataclasses.replace(mesh, materials=tuple(materials))
+
+
+def augmented(
+    images: Tensor, boxes: Tensor, cards: Tensor, rng: np.random.Generator, pasted: float, widest: float = 1.1
+) -> tuple[Tensor, Tensor]:
+    """uint8 pictures as [0, 1] floats and their boxes: mirrored, shifted, scaled (up to `widest` of a picture shows)
+    and tinted, and some with a card pasted on.
+    """
+    n, size_px = len(images), images.shape[-1]
+    x = images.float() / 255
+    side = rng.uniform(0.75, widest, n)
+    shift = rng.uniform(-1, 1, (2, n)) * np.maximum(1 - side, 0.05)
+    matrix = np.zeros((n, 2, 3), np.float32)
+    matrix[:, 0, 0], matrix[:, 1, 1] = side * rng.choice([-1, 1], n), side
+    matrix[:, :, 2] = shift.T
+    grid = torch.nn.functional.affine_grid(torch.from_numpy(matrix), list(x.shape), align_corners=False)
+    x = torch.nn.functional.grid_sample(x, grid, padding_mode="border", align_corners=False)
+    boxes = _moved(boxes, torch.from_numpy(matrix))
+    gain = torch.from_numpy(np.exp(rng.normal(0, [[0.25], [0.07], [0.07], [0.07]], (4, n))).astype(np.float32))
+    x = (x - 0.45) * gain[0, :, None, None, None] + 0.45
+    x = (
+        x * gain[1:].T[:, :, None, None] + torch.from_numpy(rng.normal(0, 0.05, (n, 1, 1, 1)).astype(np.float32))
+    ).clamp(0, 1)
+    for i in np.flatnonzero(rng.random(n) < pasted):
+        height, width = (int(v) for v in (rng.integers(12, 44, 2) * size_px) // 96)
+        top, left = int(rng.integers(0, size_px - height)), int(rng.integers(0, size_px - width))
+        card = cards[int(rng.integers(len(cards)))][None]
+        x[i, :, top : top + height, left : left + width] = torch.nn.functional.interpolate(
+            card, (height, width), mode="bilinear", antialias=True
+        )[0] * float(rng.uniform(0.4, 1.0))
+    return x, boxes
+
+
+def _moved(boxes: Tensor, matrix: Tensor) -> Tensor:
+    """Boxes N×4 of pictures that were sampled at matrix N×2×3 times the place in [-1, 1], clipped to the picture."""
+    corners = ((2 * boxes - 1).view(-1, 2, 2) - matrix[:, None, :, 2]) / torch.stack(
+        [matrix[:, 0, 0], matrix[:, 1, 1]], 1
+    )[:, None]
+    return torch.cat([corners.amin(1), corners.amax(1)], 1).add(1).div(2).clamp(0, 1)

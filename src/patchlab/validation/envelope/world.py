@@ -1,0 +1,223 @@
+"""The photographs behind an operating envelope, what a network makes of them, and what the tool measures in them.
+
+In: a run and points (values of axes). Out: per point and condition whether the target was recognized, of the design, of
+the bare object and of a gray piece in its place; and the codes and corner errors of full photographs. Pieces come from
+the PDFs of their sheets, as in `reprint`, and what a point does to the design it does to the gray one. Recognition is
+judged at the promise's resolution, except where JPEG is varied: that is met at full size or not at all. Of a photograph
+that is to be measured only the window around the piece is rendered (see `window`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchlab.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
+from patchlab.validation.envelope.gains import CONTROLS
+from patchlab.validation.envelope.window import Frame, on_plain_ground, window
+from patchproof.base import geometry
+from patchproof.base.output import image_pixels
+from patchproof.channel.printer import Printer, load_printer
+from patchproof.evidence.camera import View
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import PromisedRanges
+from patchproof.evidence.surface import Surface, surface_of
+from patchproof.optimizer.pixels import from_pixels
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.responses import AT_A_TIME, ask
+from patchproof.optimizer.run import Run, load_run
+from patchproof.render.photograph import expose
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import Stage, set_stage
+from patchproof.render.views import Views, relit, see
+from patchproof.reprint.hung_sheet import HungSheet, hang_own, jpeg_of
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.scene import Scene, needs_mesh, needs_piece
+
+_TAPE_SRGB = 0.45  # what hides a corner
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A run with its hung sheet and the gray control's, the sheet's surface, and a printer that was not promised."""
+
+    run: Run
+    problem: Problem
+    sheet: HungSheet
+    gray: HungSheet
+    surface: Surface
+    other: Printer
+
+    @property
+    def scene(self) -> Scene:
+        """The run's scene."""
+        return self.run.scene
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A photograph's status and code, and the largest error of the design's corners in mm where it was measured."""
+
+    status: str
+    code: str | None
+    error_mm: float | None
+
+
+@lru_cache(maxsize=1)
+def open_world(folder: Path, other_printer: str | None) -> World:
+    """A run's world; `other_printer` None stands for uncoated paper, or coated where the run has uncoated."""
+    run = load_run(folder)
+    needs_piece(run.scene, "name the run of a printed patch")
+    profile = run.scene.settings.printer.profile
+    other = other_printer or ("coated" if profile == "uncoated" else "uncoated")
+    sheet, printer = hang_own(run), load_printer(other, run.scene.base)
+    return World(run, set_problem(run.scene), sheet, hang_own(run, "gray"), surface_of(sheet.manifest), printer)
+
+
+def piece_at(world: World, point: Point, first_corner: int, gray: bool = False) -> PiecePicture:
+    """The piece as this point's printer shows it, with quarters hidden beginning at one of its corners."""
+    whole = _printed(world, gray, float(point.get("mismatch", 0.0)))
+    if not point.get("hidden"):
+        return whole
+    srgb, left = whole.srgb.clone(), float(point["hidden"])
+    height, width = srgb.shape[:2]
+    for corner in range(4):
+        side = min(max(left - corner, 0.0), 1.0) ** 0.5  # a part of a corner is a smaller square
+        high, wide = round(side * height / 2), round(side * width / 2)
+        at = (first_corner + corner) % 4
+        rows = slice(0, high) if at in (0, 1) else slice(height - high, height)
+        columns = slice(0, wide) if at in (0, 3) else slice(width - wide, width)
+        srgb[rows, columns] = _TAPE_SRGB
+    return PiecePicture.of(srgb)
+
+
+@lru_cache(maxsize=12)  # both pieces at a sweep's six points
+def _printed(world: World, gray: bool, mismatch: float) -> PiecePicture:
+    """The printed piece with `mismatch` times the difference between the two printers added."""
+    sheet = world.gray if gray else world.sheet
+
+    def seen(sent: Tensor) -> Tensor:
+        promised = sheet.printer.apply(sent)
+        return (promised + mismatch * (world.other.apply(sent) - promised)).clamp(0, 1) if mismatch else promised
+
+    return sheet.printed(seen)
+
+
+def recognized(world: World, points: Sequence[Point], conditions: Conditions) -> dict[str, np.ndarray]:
+    """P×N bool by what is shown, the design and `CONTROLS`: whether the run's first network sees the target."""
+    out = {kind: np.zeros((len(points), len(conditions)), bool) for kind in ("design", *CONTROLS)}
+    as_file = any("jpeg" in point for point in points)
+    side = min(world.scene.settings.camera.photo_px) if as_file else world.problem.figure_px
+    stages, first_network = _Stages(world), world.problem.before([0])
+    with torch.inference_mode():
+        for first in range(4):  # the corner that is hidden first; each goes with a quarter of the conditions
+            every = np.arange(first, len(conditions), 4)
+            size = 1 if as_file else AT_A_TIME
+            for rows in (every[i : i + size] for i in range(0, len(every), size)):
+                boxes = first_network.boxes(conditions[rows])
+                views = _Views(world, conditions[rows], first, lambda point, _: Frame(stages.at(point), (side, side)))
+                for i, kind in product(_by_cost(points), out):
+                    file = views.file(points[i], kind)[0] if as_file else None
+                    pictures = views.at(points[i], kind) if file is None else from_pixels(file)[None]
+                    out[kind][i, rows] = ask(first_network, pictures, boxes).recognized
+    return out
+
+
+def measured(world: World, points: Sequence[Point], conditions: Conditions) -> list[list[Measurement]]:
+    """P×N measurements of photographs as verify would make them."""
+    out: list[list[Measurement]] = [[] for _ in points]
+    stages = _Stages(world)
+    with torch.inference_mode():
+        for n in range(len(conditions)):
+            views = _Views(world, conditions[[n]], n % 4, lambda point, drawn: window(stages.at(point), drawn))
+            for i in _by_cost(points):
+                srgb, origin_px = views.file(points[i])
+                if "curl" in points[i]:  # the middle of the picture says how rolled paper is seen
+                    srgb, origin_px = on_plain_ground(srgb, origin_px, world.scene.settings.camera.photo_px), (0, 0)
+                drawn = conditions_at(world.scene, conditions[[n]], points[i])
+                out[i].append(_measurement(world, stages.at(points[i]).scene, drawn, srgb, origin_px))
+    return out
+
+
+class _Stages:
+    """The stage of each geometry, the last few kept."""
+
+    def __init__(self, world: World):
+        self._world, self._kept = world, {}
+
+    def at(self, point: Point) -> Stage:
+        key = tuple((name, point[name]) for name in ("curl", "gap", "size") if name in point)
+        if key not in self._kept:
+            self._kept[key] = set_stage(placed_at(self._world.scene, point))
+        return self._kept[key]
+
+
+class _Views:
+    """Views of some conditions at one point after another; what consecutive points share is computed once."""
+
+    def __init__(self, world: World, drawn: Conditions, first: int, frame_of: Callable[[Point, Conditions], Frame]):
+        self._world, self._drawn, self._first, self._frame_of = world, drawn, first, frame_of
+        self._kept: tuple[Point, Views] | None = None
+        self._pictures: dict[str, tuple[Point, Tensor]] = {}
+        self._origin_px = (0, 0)
+
+    def at(self, point: Point, kind: str = "design", jpeg: bool = True) -> Tensor:
+        """N×3×H×W pictures of the design, or of a control."""
+        shown = None if kind == "bare" else piece_at(self._world, point, self._first, kind == "gray")
+        return expose(self._views(point), shown, jpeg)
+
+    def file(self, point: Point, kind: str = "design") -> tuple[np.ndarray, tuple[int, int]]:
+        """The only picture as uint8 H×W×3, read back from a JPEG file of its quality, and where its corner lies."""
+        rest = {name: value for name, value in point.items() if name != "jpeg"}
+        if kind not in self._pictures or self._pictures[kind][0] != rest:
+            self._pictures[kind] = rest, self.at(rest, kind, jpeg=False)
+        drawn = conditions_at(self._world.scene, self._drawn, point)
+        return image_pixels(jpeg_of(self._pictures[kind][1], drawn)), self._origin_px
+
+    def _views(self, point: Point) -> Views:
+        """The point's views, in which any piece of the sheet's size can be shown."""
+        if self._kept is None or self._kept[0] != point:
+            conditions = conditions_at(self._world.scene, self._drawn, point)
+            if self._kept is None or _geometry(self._kept[0]) != _geometry(point):
+                frame = self._frame_of(point, conditions)
+                self._origin_px = frame.origin_px
+                views = see(frame.stage, piece_at(self._world, {}, 0), conditions, frame.size_px)
+            else:
+                views = relit(self._kept[1], conditions)
+            self._kept = point, views
+        return self._kept[1]
+
+
+def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.ndarray, origin_px) -> Measurement:
+    """What the tool says of a part of a photograph whose corner lies at `origin_px`."""
+    whole_px = world.scene.settings.camera.photo_px
+    matrix_px = None
+    if scene.HAS_OBJECT:  # of pictures nobody knows the focal length
+        matrix_px = needs_mesh(scene).matrix_px(whole_px).copy()
+        matrix_px[:2, 2] -= origin_px
+    view = View(srgb, matrix_px, calibrated=False)
+    entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
+    error_mm = None
+    if entry.status == "measured" and entry.geometry and entry.geometry.homography_px_from_mm is not None:
+        corners = geometry.rect_corners(world.surface.rect_mm)
+        true_px = needs_piece(scene).piece_px(conditions, corners - world.sheet.manifest.cut_mm[:2]) - origin_px
+        back = geometry.apply_homography(np.linalg.inv(np.array(entry.geometry.homography_px_from_mm)), true_px)
+        error_mm = float(np.linalg.norm(back - corners, axis=1).max())
+    return Measurement(entry.status, entry.code, error_mm)
+
+
+def _geometry(point: Point) -> tuple:
+    return tuple((name, point[name]) for name in GEOMETRY if name in point)
+
+
+def _by_cost(points: Sequence[Point]) -> list[int]:
+    """Points of one geometry together, and among them those that differ in their JPEG alone."""
+    key = lambda i: (_geometry(points[i]), sorted((k, v) for k, v in points[i].items() if k != "jpeg"))  # noqa: E731
+    return sorted(range(len(points)), key=key)

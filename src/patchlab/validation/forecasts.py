@@ -1,0 +1,187 @@
+"""Whether photographs were forecast well, and effects estimated from them are those of photographed controls.
+
+In: as `promises`, and a control. Out: for every session of photographs by a renderer that is not ours, each
+photograph's chance as `verify --run` states it beside what it showed, and the effect as estimated from the photographs
+beside the one with the control really in the piece's place, under the same conditions. Tables by scene: Brier scores,
+calibration and interval widths beside the promise's own; bias and coverage of estimated effects.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from patchlab.study.grid import grouped, networks_at, of_values
+from patchlab.study.record import hits_of
+from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.photographed import (
+    SessionsSettings,
+    cells,
+    printed_run,
+    recorded_promise,
+    recorded_spread,
+    take_photos,
+)
+from patchproof.base.claims import mean, rate, wilson
+from patchproof.evidence.forecast import forecast_of
+from patchproof.report.tables import Drawing, Table
+
+
+class ForecastsSettings(SessionsSettings):
+    """As promises, with a control in the place of each design."""
+
+    control: Literal["mean", "gray", "noise"] | None = "gray"  # photographed, too, under the same conditions
+
+
+def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Forecasts, estimates and what was photographed, by session."""
+    from patchproof.app.verify import verify_photos
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        made = printed_run(base, cell, folder)
+        photos, controls = take_photos(settings, cell, made, folder), None
+        networks = networks_at(base, cell.values)
+        if settings.control is not None:
+            controls = take_photos(settings, cell, made, folder, settings.control)
+        sessions = []
+        for own in sorted(photos.iterdir()):
+            if own.is_dir():
+                beside = None if controls is None else controls / own.name
+                out = folder / "reports" / own.name
+                report = verify_photos(own, folder / "sheet.json", out, models=networks, controls=beside, run=made)
+                sessions.append(_session(report, settings.control))
+    return recorded_promise(made) | {"sessions": sessions}
+
+
+def _session(report: Any, control: str | None) -> dict[str, Any]:
+    """What is kept of a session's report; effects as the patch's rate minus the control's."""
+    (network, *_), summary = report.summary.models, report.summary
+    forecast = [
+        (entry.forecast, entry.predictions[network].recognized)
+        for entry in report.photos
+        if entry.forecast is not None and entry.predictions
+    ]
+    kept: dict[str, Any] = {"forecast": forecast, "agree": None, "estimated": None, "photographed": None}
+    if summary.estimated is not None:
+        kept["agree"] = summary.estimated.agree
+        of_control = [claim for claim in summary.estimated.controls if claim.name == control]
+        kept["estimated"] = [(claim.difference, *claim.difference_interval) for claim in of_control][0:1] or None
+    if report.controls:
+        kept["photographed"] = report.controls[0].difference
+    return kept
+
+
+def tables(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
+    """Forecasts and effects, by scene and in all; every session."""
+    groups = {name[0]: own for name, own in grouped(results, of_values("name")).items()} | {"all": list(results)}
+    about = f"{settings.sessions} sessions of {settings.photos} photographs of each run"
+    head = ("scene", "photographs", "Brier", "Brier of the promise", "calibration slope", "counts held", "width")
+    head = (*head, "the promise's width", "the promise's counts held")
+    of_photos = [(name, *_forecast_row(group)) for name, group in groups.items()]
+    tables_ = [Table("forecasts", "Photographs at their own views", head, tuple(of_photos), about)]
+    if settings.control is not None:
+        head = ("scene", "sessions", "refused", "photographed effect", "estimated minus photographed", "interval held")
+        effects = [(name, *_effect_row(group)) for name, group in groups.items()]
+        about = f"{about}; the patch beside {settings.control}"
+        tables_.append(Table("effects", "Effects estimated and photographed", head, tuple(effects), about))
+    return (*tables_, _each(results))
+
+
+def _forecast_row(group: Sequence[Result]) -> tuple:
+    pairs = [pair for result in group for session in result.answers["sessions"] for pair in session["forecast"]]
+    if not pairs:
+        return (0, *(None,) * 7)
+    chances, hits = np.array(pairs, float).T
+    held, widths, held_promise, widths_promise, promised = [], [], [], [], []
+    for result in group:
+        spread, level = recorded_spread(result), float(np.mean(hits_of(result.answers["promised"])))
+        for session in result.answers["sessions"]:
+            if not session["forecast"]:
+                continue
+            own, answers = zip(*session["forecast"], strict=True)
+            forecast, n = forecast_of(own, answers, level), len(own)
+            low, high = spread.counts((n,))
+            held.append(forecast.interval[0] <= forecast.recognized <= forecast.interval[1])
+            held_promise.append(low <= forecast.recognized <= high)
+            widths.append(np.ptp(forecast.interval) / n)
+            widths_promise.append((high - low) / n)
+            promised += [(level - answer) ** 2 for answer in answers]
+    brier = float(np.mean((chances - hits) ** 2))
+    scores = brier, float(np.mean(promised)), slope(chances, hits)
+    middles = float(np.median(widths)), float(np.median(widths_promise))
+    return (len(pairs), *scores, rate(held), *middles, rate(held_promise))
+
+
+def slope(chances: np.ndarray, hits: np.ndarray) -> float | None:
+    """Of the logistic regression of answers on the chances' log odds (Cox, Biometrika 45 (1958) 562): 1 where they are
+    as sure as they may be, below where they are too sure. None where all answers are the same.
+    """
+    from scipy.optimize import minimize
+
+    if np.ptp(hits) == 0:
+        return None
+    odds = np.log(chances / (1 - chances))
+
+    def loss(at: np.ndarray) -> float:
+        return float(np.mean(np.logaddexp(0, (1 - 2 * hits) * (at[0] + at[1] * odds))))
+
+    return float(minimize(loss, np.array([0.0, 1.0])).x[1])
+
+
+def _effect_row(group: Sequence[Result]) -> tuple:
+    sessions = [session for result in group for session in result.answers["sessions"]]
+    refused = [session["estimated"] is None for session in sessions]
+    both = [
+        (*session["estimated"][0], session["photographed"])
+        for session in sessions
+        if session["estimated"] is not None and session["photographed"] is not None
+    ]
+    if not both:
+        return len(sessions), rate(refused), None, None, None
+    off = [estimated - photographed for estimated, _, _, photographed in both]
+    held = rate([low <= photographed <= high for _, low, high, photographed in both])
+    return len(sessions), rate(refused), mean([photographed for *_, photographed in both]), mean(off), held
+
+
+def _each(results: Sequence[Result]) -> Table:
+    head = ("scene", "network", "seed", "session", "photographs", "expected", "recognized", "agree", "estimated")
+    rows = []
+    for result in results:
+        values = result.cell.values
+        for number, session in enumerate(result.answers["sessions"], 1):
+            chances, hits = zip(*session["forecast"], strict=True) if session["forecast"] else ((), ())
+            estimated = session["estimated"][0] if session["estimated"] else (None,) * 3
+            start = (values["name"], values["network"], values["seed"], number, len(chances), sum(chances), sum(hits))
+            rows.append((*start, session["agree"], *estimated, session["photographed"]))
+    head = (*head, "low", "high", "photographed")
+    return Table("sessions", "Every session", head, tuple(rows), "effects are of the patch minus the control")
+
+
+def figures(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
+    """Reliability: what was recognized by chance."""
+    pairs = [pair for result in results for session in result.answers["sessions"] for pair in session["forecast"]]
+    if not pairs:
+        return ()
+
+    def draw(figure: Any) -> None:
+        chances, hits = np.array(pairs, float).T
+        axes, edges = figure.subplots(), np.linspace(0, 1, 6)
+        number = np.clip(np.digitize(chances, edges) - 1, 0, len(edges) - 2)
+        axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
+        for i in sorted(set(number.tolist())):
+            own = hits[number == i]
+            low, high = wilson(int(own.sum()), len(own))
+            span = [[own.mean() - low], [high - own.mean()]]
+            axes.errorbar([chances[number == i].mean()], [own.mean()], span, fmt="o", color="tab:blue")
+        axes.set(xlabel="chance of the forecast", ylabel="share recognized", xlim=(0, 1), ylim=(0, 1))
+
+    about = f"{len(pairs)} photographs in five groups; bars: 95 %, as if all were independent"
+    return (Drawing("reliability", "Forecast and seen", draw, (5.0, 4.5), about),)
+
+
+STUDY = Study("forecasts", ForecastsSettings, cells, run, tables, figures)

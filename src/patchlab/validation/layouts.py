@@ -1,0 +1,275 @@
+"""What a piece's layout costs in recognition, and what it buys in finding and measuring the sheet.
+
+In: scene files, networks, seeds and layouts: how many markers, how large, with how much white round them, with the
+design all over the piece or in a frame of markers, and whatever else of the scene file changes: the piece's size or
+place, how it is trained. Per cell a design is trained in that layout and shown, beside the controls, under unseen
+conditions; then its sheet is printed, hung up, photographed, found and measured against the renderer's truth. All
+layouts of a scene, network and seed share their draws; intervals are over such groups, since each design has its own
+luck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from patchlab.study.grid import (
+    Count,
+    GridSettings,
+    cell_of,
+    grouped,
+    networks_at,
+    pairs,
+    scene_of,
+    who,
+    with_tables,
+)
+from patchlab.study.record import Record, gain_of, hardest, recorded
+from patchlab.study.study import Cell, Result, Study
+from patchproof.base.claims import Estimate, clustered_median, mean, rate
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.output import image_pixels
+from patchproof.base.strict import Positive, Strict
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.optimizer.loop import best_design
+from patchproof.optimizer.places import choose_place
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import CONTROLS, shown_with_controls
+from patchproof.optimizer.responses import responses
+from patchproof.photo.read import Photo
+from patchproof.report.tables import Drawing, Table, Value
+from patchproof.reprint.hung_sheet import hang_piece
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.scene import PatchScene, needs_patch
+from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
+from patchproof.sheets.rects import RectMm, grown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Layout(Strict):
+    """One way to lay out a piece."""
+
+    markers: Literal[4, 8] = 4  # in the corners; or in the middle of each side, too
+    size: Positive = 1.0  # of the markers that the scene's views ask for
+    quiet: Positive = 1.0  # modules of white between a marker and the design
+    framed: bool = False  # the design inside a frame of markers, all of which is white
+    scene: dict[str, dict[str, Any]] = Field(default_factory=dict)  # tables of the scene file, keys that change with it
+
+
+_LAYOUTS = {
+    "whole": Layout(),
+    "eight markers": Layout(markers=8),
+    "markers × 0.7": Layout(size=0.7),
+    "half the white": Layout(quiet=0.5),
+    "twice the white": Layout(quiet=2.0),
+    "framed": Layout(markers=8, framed=True),
+}
+
+
+class LayoutsSettings(GridSettings):
+    """A design for each scene, network, seed and layout."""
+
+    layouts: dict[str, Layout] = Field(_LAYOUTS, min_length=1)  # by name; the others are compared with the first
+    n: Count = 400  # unseen conditions that measure
+    photos: Annotated[int, Field(ge=0)] = 40  # of each design's sheet
+
+
+@dataclass(frozen=True)
+class LaidOut(Piece):
+    """A piece that reserves other pixels for its markers."""
+
+    quiet: float = 1.0
+    framed: bool = False
+
+    @property
+    def reserved_mm(self) -> tuple[RectMm, ...]:
+        """The white round each marker; the four sides of a frame."""
+        if not self.framed:
+            wider = (self.quiet - 1) * self.module_mm
+            rects = (grown(rect, wider) for rect in super().reserved_mm)
+            return tuple(_within(rect, self.size_mm) for rect in rects)
+        (width, height), frame = self.size_mm, self.marker_mm + 2 * self.module_mm + SCISSORS_MM
+        sides = ((0.0, 0.0, width, frame), (0.0, height - frame, width, frame))
+        return (*sides, (0.0, 0.0, frame, height), (width - frame, 0.0, frame, height))
+
+
+def _within(rect: RectMm, size_mm: tuple[float, float]) -> RectMm:
+    low = [max(v, 0.0) for v in rect[:2]]
+    high = [min(v + side, whole) for v, side, whole in zip(rect[:2], rect[2:], size_mm, strict=True)]
+    return low[0], low[1], high[0] - low[0], high[1] - low[1]
+
+
+def laid_out(scene: PatchScene, layout: Layout) -> PatchScene:
+    """The scene with its piece in another layout."""
+    piece = scene.piece
+    other = lay_out_piece(piece.size_mm, layout.size * piece.marker_mm, scene.sheet_id, "design", layout.markers == 8)
+    plain = {field.name: getattr(other, field.name) for field in fields(other)}
+    return replace(scene, piece=LaidOut(**plain, quiet=layout.quiet, framed=layout.framed))
+
+
+def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
+    """For each scene, network and seed a cell per layout."""
+    return [
+        cell_of(
+            with_tables(values, layout.scene) | {"layout": name, "how": layout.model_dump()},
+            seed,
+            values["network"],
+            name,
+        )
+        for values in pairs(settings, base)
+        for seed in settings.seeds
+        for name, layout in settings.layouts.items()
+    ]
+
+
+def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Train, at a place that is searched where the scene asks for it; show and photograph."""
+    problem = _problem(base, cell)
+    scene = laid_out(needs_patch(problem.scene), Layout(**cell.values["how"]))
+    patch = replace(problem.patch, scene=scene)
+    problem = replace(problem, scene=scene, stage=replace(problem.stage, scene=scene), subject=patch)
+    design = best_design(problem)
+    shown = shown_with_controls(problem, design, CONTROLS)
+    answers = responses(problem, shown, scene.draw("evaluate", settings.n))
+    return (
+        recorded(answers) | {"free": _free_share(scene.piece)} | _photographed(problem, scene, design, settings.photos)
+    )
+
+
+def _problem(base: Path, cell: Cell) -> Problem:
+    scene, networks = scene_of(base, cell.values), networks_at(base, cell.values)
+    if isinstance(scene, OpenScene):
+        place = choose_place(scene, models=networks)
+        scene = scene.at(place.at, place.spin_deg)
+    return set_problem(scene, models=networks)
+
+
+def _free_share(piece: Piece) -> float:
+    """The share of the piece that is the design's."""
+    scale = 4  # samples per millimeter
+    mask = np.ones([int(side * scale) for side in piece.size_mm], bool)
+    for x, y, w, h in piece.reserved_mm:
+        mask[int(x * scale) : int((x + w) * scale), int(y * scale) : int((y + h) * scale)] = False
+    return float(mask.mean())
+
+
+def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count: int) -> dict[str, Any]:
+    """What `verify` makes of photographs of the design's sheet, and how far it is off, by photograph."""
+    sheet = hang_piece(problem.stage, PrintedPiece(scene.piece, scene.sheet_id, "design", design))
+    manifest = sheet.manifest
+    surface = surface_of(manifest)
+    promised, drawn = promised_of(manifest, surface, sheet.printer), scene.draw("reprint", count)
+    out: dict[str, list] = {"status": [], "error_mm": [], "uncertainty_mm": [], "delta_e00": []}
+    for i in range(count):
+        conditions = drawn[i : i + 1]
+        photo = Photo(image_pixels(sheet.photograph(conditions)), float(scene.matrix_px(scene.photo_px)[0, 0]))
+        entry = measure(view_of(photo, None), "photo.jpg", surface, promised, promised_ranges(())).entry
+        geometry, error = entry.geometry, None
+        if geometry is not None and geometry.homography_px_from_mm is not None and scene.is_flat:
+            corners = rect_corners(manifest.cut_mm)
+            seen = np.linalg.inv(np.array(geometry.homography_px_from_mm)) @ sheet.px_from_page(conditions)
+            error = float(np.linalg.norm(apply_homography(seen, corners) - corners, axis=1).max())
+        out["status"].append(entry.status)
+        out["error_mm"].append(error)
+        out["uncertainty_mm"].append(geometry and geometry.corner_uncertainty_mm)
+        out["delta_e00"].append(entry.color and entry.color.delta_e00_mean)
+    return out
+
+
+def _gain(result: Result) -> float:
+    """The design's rate over that of its best control."""
+    return gain_of(result, "design", hardest(result, CONTROLS))
+
+
+def tables(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Table]:
+    """Costs and gains by layout, and every cell."""
+    by_layout = grouped(results, lambda result: result.cell.values["layout"])
+    first = {who(result): _gain(result) for result in next(iter(by_layout.values()))}
+    rows = [(name, *_figures(group, first)) for name, group in by_layout.items()]
+    head = ("layout", "share for the design", "gain over the best control", "beside the first layout")
+    head = (*head, "identified", "measured", "corner error, mm", "uncertainty holds", "ΔE00")
+    about = (
+        f"{settings.n} unseen conditions and {settings.photos} photographs of each design; corner errors are medians "
+    )
+    about += "of the worst of the piece's four; gains are over scenes, networks and seeds"
+    every = [
+        (
+            *who(r),
+            r.cell.values["layout"],
+            _gain(r),
+            *(Record([r], thing).level()[0] for thing in ("design", *CONTROLS)),
+        )
+        for r in results
+    ]
+    return (
+        Table("layouts", "What layouts cost and buy", head, tuple(rows), about),
+        Table(
+            "cells", "Every design", ("scene", "network", "seed", "layout", "gain", "design", *CONTROLS), tuple(every)
+        ),
+    )
+
+
+def _figures(group: Sequence[Result], first: dict) -> tuple:
+    status = [word for result in group for word in result.answers["status"]]
+    measured = [
+        {key: result.answers[key][i] for key in ("error_mm", "uncertainty_mm", "delta_e00")}
+        for result in group
+        for i, word in enumerate(result.answers["status"])
+        if word == "measured"
+    ]
+    errors = [(m["error_mm"], m["uncertainty_mm"]) for m in measured if m["error_mm"] is not None]
+    beside = [_gain(result) - first[who(result)] for result in group if who(result) in first]
+    return (
+        float(np.mean([result.answers["free"] for result in group])),
+        _mean_or_single([_gain(result) for result in group]),
+        _mean_or_single(beside),
+        rate([word != "rejected" for word in status]),
+        rate([word == "measured" for word in status]),
+        clustered_median(np.array([[error] for error, _ in errors])) if errors else None,
+        rate([error <= stated for error, stated in errors]),
+        mean([m["delta_e00"] for m in measured if m["delta_e00"] is not None]),
+    )
+
+
+def _mean_or_single(values: Sequence[float]) -> Estimate | float | None:
+    """The mean with its interval; a single value has none."""
+    return values[0] if len(values) == 1 else mean(values)
+
+
+def figures(settings: LayoutsSettings, results: Sequence[Result]) -> Sequence[Drawing]:
+    """Recognition against measured photographs, where there are any."""
+    table = tables(settings, results)[0]
+    if not settings.photos:
+        return []
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for name, _, gain, _, _, measured, *_ in table.rows:
+            (x, x_span), (y, y_span) = _with_span(measured), _with_span(gain)
+            axes.errorbar([x], [y], y_span, x_span, "o", label=name)
+        axes.set_xlabel("photographs measured")
+        axes.set_ylabel("gain over the best control")
+        axes.legend(fontsize=8)
+
+    return (Drawing("layouts", "What layouts cost and buy", draw, (7.0, 4.5), table.about),)
+
+
+def _with_span(value: Value) -> tuple[float, list[list[float]] | None]:
+    """A figure and how far its interval reaches down and up, as matplotlib takes it."""
+    if isinstance(value, Estimate):
+        return value.value, [[value.value - value.low], [value.high - value.value]]
+    return float(value or 0), None
+
+
+STUDY = Study("layouts", LayoutsSettings, cells, run, tables, figures)

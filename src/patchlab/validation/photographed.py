@@ -1,0 +1,102 @@
+"""What studies of promises share: a run for each combination, its sheet, and sessions of photographs of the print.
+
+In: scene files, networks, printers, seeds. Out: cells, and for one of them the design (optimized, or a picture that is
+imported), the page, the photographs; what answers keep of the promise. All by the commands that a user has.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
+
+from patchlab.study.grid import (
+    Count,
+    GridSettings,
+    Names,
+    cell_of,
+    networks_at,
+    pairs,
+    scene_of,
+    short_name,
+    with_tables,
+)
+from patchlab.study.record import bits, hits_of
+from patchlab.study.study import Cell, Result
+from patchproof.base.sessions import Spread, in_sessions, spread_of
+from patchproof.base.strict import expand
+
+if TYPE_CHECKING:
+    from patchproof.optimizer.run import Run
+
+
+class SessionsSettings(GridSettings):
+    """A run for each scene, network, printer and seed, and sessions of photographs of each."""
+
+    printers: Names = ("coated",)  # that print the designs, and are known while optimizing
+    sessions: Count = 4  # of each print
+    photos: Annotated[int, Field(ge=5, le=1000)] = 20  # of each session
+    path_traced: bool = True  # taken by Mitsuba 3, else by our renderer
+
+
+def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
+    """One per combination, with the whole scene in it."""
+    return [
+        cell_of(
+            with_tables(values, {"target": {"models": values["networks"]}, "printer": {"profile": printer}}),
+            seed,
+            values["network"],
+            short_name(printer),
+        )
+        for values in pairs(settings, base)
+        for printer in settings.printers
+        for seed in settings.seeds
+    ]
+
+
+def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
+    """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
+    from patchproof.optimizer.given import import_patch
+    from patchproof.optimizer.run import optimize_scene
+    from patchproof.reprint.run_sheet import sheet_of
+
+    scene = scene_of(base, cell.values)
+    scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
+    # one control is enough for a page, and all of them would take most of a promise's time
+    if (picture := cell.values.get("picture")) is None:
+        made = optimize_scene(scene, folder / "run", controls=("bare",))
+    else:
+        made = import_patch(expand(picture, base), scene, folder / "run", controls=("bare",))
+    sheet_of(made, folder / "sheet.pdf")
+    return made
+
+
+def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path, control: str | None = None) -> Path:
+    """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
+    conditions.
+    """
+    from patchproof.reprint.hung_sheet import Hanging
+    from patchproof.reprint.reprint import reprint
+
+    out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
+    how = Hanging(path_traced=settings.path_traced, control=control)
+    # cells that shared a seed's draws would be one case
+    seed = zlib.crc32(cell.name.encode())
+    reprint(folder / "sheet.pdf", made, n, out, how, sessions=settings.sessions, seed=seed)
+    return out
+
+
+def recorded_promise(made: Run) -> dict[str, Any]:
+    """What answers keep of a run's promise."""
+    promise = made.promise
+    hits = bits([condition.recognized for condition in promise.conditions])
+    return {"promised": hits, "per_session": promise.per_session, "places": list(promise.places)}
+
+
+def recorded_spread(result: Result) -> Spread:
+    """What that promise says of photographs to come."""
+    answers = result.answers
+    return spread_of(*in_sessions(hits_of(answers["promised"]), answers["per_session"], answers["places"]))

@@ -1,0 +1,244 @@
+"""Whether promised rates hold in independently rendered sessions.
+
+Many runs are promised, printed, photographed by a renderer that is not ours, and verified.
+In: scene files, networks, printers, seeds. Out: for every combination the promised rate, and for each session of its
+photographs (one print, one place, light and camera) the counts that the promise allows for and what it shows; the share
+of intervals that held, their widths beside those of the best possible ones, and each scene's bias. Beside them the rule
+that takes photographs for independent. If asked for, sessions of views by our own renderer and the rate in many other
+places, too. A cell runs the same commands as a user does: optimize, sheet, reprint, verify.
+
+Photographs are path-traced (`path_traced`), since those of our own renderer would share the promise's mistakes; with
+`path_traced = false` they are ours, and only sampling and the page in between are tested.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from patchlab.study.grid import Names, grouped, networks_at, of_values, short_name
+from patchlab.study.record import bits, hits_of
+from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.photographed import (
+    SessionsSettings,
+    cells,
+    printed_run,
+    recorded_promise,
+    recorded_spread,
+    take_photos,
+)
+from patchproof.base.claims import mean, rate
+from patchproof.base.sessions import TAIL, Spread, in_sessions, spread_of
+from patchproof.base.strict import Refused, nearest
+from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import shown_with_controls
+from patchproof.optimizer.responses import responses
+from patchproof.report.tables import Drawing, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from patchproof.optimizer.run import Run
+
+
+_LEAST_SESSIONS = 20  # of which the ends of what they showed say anything
+
+
+class PromisesSettings(SessionsSettings):
+    """As above, and views by our own renderer without paper, in places that the promise does not know."""
+
+    rendered: Annotated[int, Field(ge=0, le=1000)] = 0  # sessions of as many views as photographs
+    elsewhere: Annotated[int, Field(ge=0, le=100_000)] = 0  # views, each in a place of its own
+    # By scene's name pictures made elsewhere, imported in place of optimized designs; scenes without any have no runs.
+    pictures: dict[str, Names] = Field(default_factory=dict)
+
+
+def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
+    """One per combination and picture."""
+    optimized = cells(settings, base)
+    if not settings.pictures:
+        return optimized
+    names = {cell.values["name"] for cell in optimized}
+    for name in settings.pictures.keys() - names:
+        raise Refused("pictures of the config's scenes", f'"{name}"', nearest(name, names))
+    return [
+        Cell(f"{short_name(f'/{picture}')}.{cell.name}", {**cell.values, "picture": picture})
+        for cell in optimized
+        for picture in settings.pictures.get(cell.values["name"], ())
+    ]
+
+
+def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
+    """Promise and count of one combination."""
+    from patchproof.app.verify import verify_photos
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        made = printed_run(base, cell, folder)
+        photos, networks = take_photos(settings, cell, made, folder), networks_at(base, cell.values)
+        report = verify_photos(photos, folder / "sheet.json", folder / "report", models=networks)
+    sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
+    kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
+    return kept | _without_paper(settings, made)
+
+
+def _without_paper(settings: PromisesSettings, made: Run) -> dict[str, Any]:
+    """What our own renderer's views show of the design, in sessions and elsewhere."""
+    if not settings.rendered and not settings.elsewhere:
+        return {}
+    problem, scene, kept = set_problem(made.scene), made.scene, {}
+    show = partial(responses, problem, shown_with_controls(problem, made.design, ()))
+    if settings.rendered:
+        views = scene.draw("reprint", settings.rendered * settings.photos, per_session=settings.photos)
+        hits = show(views)["design"].recognized[0]
+        kept["rendered"] = list(zip(*in_sessions(hits, settings.photos), strict=True))
+    if settings.elsewhere:
+        kept["elsewhere"] = bits(show(scene.draw("evaluate", settings.elsewhere))["design"].recognized[0])
+    return kept
+
+
+def tables(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Table, ...]:
+    """Shares that held, by scene and in all; every combination; the same of views; rates elsewhere."""
+    how = "path-traced photographs" if settings.path_traced else "photographs by our own renderer"
+    about = f"{settings.sessions} sessions of {settings.photos} {how} for each promise"
+    all_tables = [_shares("held", "Sessions in which promises held", about, results)]
+    if settings.rendered:
+        about = f"{settings.rendered} sessions of {settings.photos} views by our own renderer for each promise"
+        all_tables.append(_shares("rendered", "Sessions of views in which promises held", about, results))
+    if settings.elsewhere:
+        all_tables.append(_elsewhere(settings, results))
+    return *all_tables, _each(results)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """One session of one run: what was recognized of the photographs that were judged, and its promise."""
+
+    recognized: int
+    judged: int
+    rate: float
+    spread: Spread
+    alone: Spread  # as if every condition were drawn anew
+
+    @property
+    def share(self) -> float:
+        """What the session shows."""
+        return self.recognized / self.judged
+
+    def interval(self, alone: bool = False) -> tuple[int, int]:
+        """Counts that the promise allows for, or would if photographs were independent."""
+        return self.alone.counts((1,) * self.judged) if alone else self.spread.counts((self.judged,))
+
+    def held(self, alone: bool = False) -> bool:
+        """Whether the count lies in that interval."""
+        low, high = self.interval(alone)
+        return low <= self.recognized <= high
+
+
+def counted(result: Result, sessions: str = "sessions") -> list[Counted]:
+    """A run's sessions, or those of "rendered" views, in which anything could be judged."""
+    hits = hits_of(result.answers["promised"])
+    about = sum(hits) / len(hits), recorded_spread(result), spread_of(*in_sessions(hits, 1))
+    return [Counted(recognized, judged, *about) for recognized, judged in result.answers[sessions] if judged]
+
+
+def _width(sessions: Sequence[Counted], alone: bool = False) -> float:
+    """The median width of the intervals, as a share of the photographs."""
+    return float(np.median([np.ptp(session.interval(alone)) / session.judged for session in sessions]))
+
+
+def _best_width(sessions: Sequence[Counted]) -> float | None:
+    """Between the 2.5 and 97.5 % points of what sessions showed beside their promise: who knew how much sessions really
+    differ could not promise less. None of too few sessions to say.
+    """
+    if len(sessions) < _LEAST_SESSIONS:
+        return None
+    low, high = np.quantile([session.share - session.rate for session in sessions], (TAIL, 1 - TAIL))
+    return float(high - low)
+
+
+def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
+    kind = "rendered" if name == "rendered" else "sessions"
+    scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
+    rows = []
+    for scene, group in {**scenes, "all": list(results)}.items():
+        by_run = [own for result in group if (own := counted(result, kind))]
+        sessions = [session for own in by_run for session in own]
+        if not sessions:
+            continue
+        rows.append(
+            (
+                scene,
+                rate([session.held() for session in sessions]),
+                _width(sessions),
+                _best_width(sessions),
+                rate([session.held(alone=True) for session in sessions]),
+                _width(sessions, alone=True),
+                mean([float(np.mean([session.share - session.rate for session in own])) for own in by_run]),
+            )
+        )
+    about = (
+        f"{about}; widths: medians, as a share of the photographs; best: between the ends of what sessions showed; "
+        "bias: recognized minus promised rate, over runs"
+    )
+    head = ("scene", "held", "width", "best width", "held, if independent", "width, if independent", "bias")
+    return Table(name, title, head, tuple(rows), about)
+
+
+def _each(results: Sequence[Result]) -> Table:
+    head = ("scene", "network", "printer", "seed", "design", "session", "promised", "correlation")
+    head = (*head, "judged", "recognized", "low", "high", "held", "verdict")
+    rows = []
+    for result in results:
+        values, printer = result.cell.values, short_name(result.cell.values["scene"]["printer"]["profile"])
+        for number, session in enumerate(counted(result), 1):
+            design = short_name(f"/{values['picture']}") if "picture" in values else "own"
+            start = (values["name"], values["network"], printer, values["seed"], design, number)
+            what = (session.rate, session.spread.correlation[0], session.judged, session.recognized)
+            rows.append((*start, *what, *session.interval(), session.held(), result.answers["verdict"]))
+    return Table("promises", "Every session", head, tuple(rows), "the verdict is that of all sessions of the run")
+
+
+def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
+    rows = []
+    for result in results:
+        values, (low, high) = result.cell.values, recorded_spread(result).rate
+        shown, promised = rate(hits_of(result.answers["elsewhere"])), hits_of(result.answers["promised"])
+        within = shown is not None and low <= shown.value <= high
+        about = (values["name"], values["network"], values["seed"])
+        rows.append((*about, sum(promised) / len(promised), low, high, shown, within))
+    head = ("scene", "network", "seed", "promised", "low", "high", "elsewhere", "within")
+    about = f"{settings.elsewhere} views by our own renderer, each in another place that the promise does not know"
+    return Table("elsewhere", "Rates elsewhere within the promised interval", head, tuple(rows), about)
+
+
+def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
+    """The calibration plot."""
+    scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
+        for name, group in scenes.items():
+            sessions = [session for result in group for session in counted(result)]
+            if not sessions:
+                continue
+            promised = [session.rate for session in sessions]
+            low, high = np.array([np.array(session.interval()) / session.judged for session in sessions]).T
+            (line,) = axes.plot(promised, [session.share for session in sessions], "o", label=name, markersize=4)
+            axes.vlines(promised, low, high, colors=line.get_color(), alpha=0.2, linewidth=3)
+        axes.set(xlabel="promised rate", ylabel="share recognized in a session", xlim=(0, 1.02), ylim=(-0.02, 1.04))
+        axes.legend(loc="upper left", fontsize=8)
+
+    about = "points: what sessions showed; bars: the promises' 95 % prediction intervals"
+    return (Drawing("calibration", "Promised and seen", draw, (6.0, 5.0), about),)
+
+
+STUDY = Study("promises", PromisesSettings, promise_cells, run, tables, figures)

@@ -1,0 +1,136 @@
+"""What a file tells of an object before anybody says it: which axis is up, how long it is, what it is called.
+
+In: a mesh file, and names of files. Out: `Up`, a length in millimeters, a label. Each guess carries the words for the
+comment beside it in the scene file. Where there is no telling, a length is refused, since everything in a scene is in
+millimeters; so is a label.
+
+glTF has a standard: y up, meters. Other formats have habits: OBJ is mostly written y up, printers' STL and scanners'
+PLY z up, all without units. Whether an object lies oddly is judged by what it would stand on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from patchproof.base.strict import Refused
+from patchproof.classifier.labels import find_labels, find_words
+from patchproof.mesh.load_mesh import load_mesh
+
+_GLTF = (".glb", ".gltf")
+Axis = Literal["y", "z"]
+_HABIT: dict[str, Axis] = {".obj": "y", ".stl": "z", ".ply": "z"}
+_MM_PER_M = 1000.0
+_SENSIBLE_MM = (5.0, 30_000.0)  # what people hang paper on
+_FOOT = 0.005  # of the object's height: what is no higher touches the ground
+_HARDLY = 0.25  # of its footprint: a cylinder that lies touches 14 % by these rules, one that stands 79 %
+_FIRMLY = 2.0  # times as much: where the other axis is clearly the better one
+_FEW_LABELS = 20  # of a network: all of them are said
+
+
+@dataclass(frozen=True)
+class Up:
+    """The axis of the file that points up, why, and whether that is odd."""
+
+    axis: Axis
+    reason: str
+    odd: str | None = None
+
+
+def guess_up(path: Path) -> Up:
+    """The axis by the format's standard or habit; one that the object hardly stands on is odd, and of a mere habit the
+    other one is taken then.
+    """
+    kind = path.suffix.lower()
+    axis: Axis = "y" if kind in _GLTF else _HABIT.get(kind, "z")
+    odd = lies_oddly(load_mesh(path, 100.0, axis).vertices, axis)
+    if odd is not None and kind not in _GLTF:
+        return Up(other_axis(axis), f"as it stands: {kind[1:].upper()} files say nothing")
+    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {kind[1:].upper()} files", odd)
+
+
+def lies_oddly(vertices: np.ndarray, up: Axis) -> str | None:
+    """Words for an object (y up here, its file's `up` taken for that) that would stand clearly better with the file's
+    other axis up; None for any other.
+    """
+    x, y, z = vertices.T
+    turned = np.stack([x, z, -y] if up == "y" else [x, -z, y], 1)
+    stands, would = footing(vertices), footing(turned)
+    if stands >= _HARDLY or would < max(_HARDLY, _FIRMLY * stands):
+        return None
+    return f'it stands on {stands:.0%} of its footprint so, with "{other_axis(up)}" on {would:.0%}'
+
+
+def other_axis(up: Axis) -> Axis:
+    """The other one of those that point up in files."""
+    return "z" if up == "y" else "y"
+
+
+def footing(vertices: np.ndarray) -> float:
+    """The share of an object's footprint (y up) that lies between the points that touch the ground."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    low, size = vertices.min(0), np.ptp(vertices, axis=0)
+    touching = vertices[vertices[:, 1] <= low[1] + _FOOT * size[1]][:, [0, 2]]
+    try:
+        return float(ConvexHull(touching).volume / (size[0] * size[2]))  # of a plane's points, the area
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def length_of(path: Path) -> float:
+    """The longest extent by the file's own units; refused where it has none, or none that make sense."""
+    do = "add --length-mm with the object's longest extent"
+    if path.suffix.lower() not in _GLTF:
+        got = f"{path.name}, which has no units"
+        raise Refused("a file that says how large the object is", got, f"{do}: {file_length(path):.3g} if it is in mm")
+    length_mm = file_length(path) * _MM_PER_M
+    low, high = _SENSIBLE_MM
+    if not low <= length_mm <= high:
+        raise Refused(f"an object of {low:g} mm to {high / 1000:g} m", f"{length_mm:.3g} mm by the file's units", do)
+    return float(f"{length_mm:.3g}")
+
+
+def file_length(path: Path) -> float:
+    """The longest extent in the file's own unit."""
+    from patchproof.mesh.mesh_file import read_parts
+
+    parts, _ = read_parts(path, np.eye(3))
+    corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
+    corners = corners[np.isfinite(corners).all(1)]
+    return float(np.ptp(corners, axis=0).max()) if len(corners) else 0.0
+
+
+def label_of(labels: Sequence[str], said: str | None, path: str) -> str | int:
+    """The label as a scene file writes it: what was said, found by its words, or what the file is called."""
+    if said is not None:
+        return _written(labels, find_words(labels, said))
+    words = [word for word in re.split(r"[^a-z]+", re.split(r"[/\\:]", path)[-1].rsplit(".", 1)[0].casefold()) if word]
+    for text in (" ".join(words), *words):
+        try:
+            return _written(labels, find_words(labels, text, whole=True))
+        except Refused:
+            continue
+    few = f": {', '.join(map(_in_quotes, labels))}" if len(labels) <= _FEW_LABELS else ""
+    do = f"add --label with what it is to be recognized as{few}"
+    raise Refused("a file that is called what it shows", f'"{" ".join(words)}", which no label of the network is', do)
+
+
+def _in_quotes(label: str) -> str:
+    return f'"{label}"'
+
+
+def _written(labels: Sequence[str], index: int) -> str | int:
+    """The shortest way to name an entry that leads back to it."""
+    for name in (labels[index].split(",")[0].strip(), labels[index]):
+        try:
+            if find_labels(labels, name) == (index,):
+                return name
+        except Refused:
+            continue
+    return index

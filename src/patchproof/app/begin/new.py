@@ -1,0 +1,250 @@
+"""`new`: a commented scene file for an object that somebody has as a mesh, as photographs or as images.
+
+In: a mesh (a file, or `primitive:NAME`), a folder of photographs with a blank sheet's manifest in or beside it, or a
+folder of images with a CSV of labels. Out: a TOML file that loads, and lines that say what was guessed. Distances
+follow the object's length, the piece is the largest that lies well on one of its sides. A file that could not be
+optimized is never written.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis
+from patchproof.app.begin.hang import place_for
+from patchproof.app.begin.sides import SIDE_NAMES
+from patchproof.base.input import is_file, is_folder
+from patchproof.base.output import check_file, write_whole
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import NETWORK_FILE, Refused, validated
+from patchproof.classifier.labels import find_labels
+from patchproof.classifier.load import load_classifier
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.scene.image_scene import label_rows
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.places import Ground
+from patchproof.scene.scene import build_scene
+from patchproof.sheets.manifest import load_manifest
+
+NEAR, FAR = 1.5, 2.7  # camera distances over the object's length: those of a default scene of 300 mm
+_HEAD = ("# Written by patchproof new. All keys and their ranges: patchproof keys.", "# Millimeters and degrees.", "")
+
+
+def new_scene(
+    thing: str,
+    out: str | Path,
+    *,
+    label: str | None = None,
+    length_mm: float | None = None,
+    up: Axis | None = None,
+    models: Sequence[str] = ("builtin",),
+    overwrite: bool = False,
+) -> list[str]:
+    """Write the scene file `out` for a mesh or a folder; returns what was guessed and warned of. `length_mm` and `up`
+    are in place of what a mesh's file says.
+    """
+    out = Path(out)
+    check_file(out, overwrite)
+    base = out.resolve().parent
+    if thing.startswith("primitive:") or not is_folder(Path(thing)):
+        text, lines = _of_mesh(thing, base, label, length_mm, up, models)
+    elif length_mm is not None or up is not None:
+        do = "leave it out: pictures have no length and no axes"
+        raise Refused("a mesh with --length-mm or --up", f"the folder {thing}", do)
+    else:
+        text, lines = _of_folder(Path(thing), base, label, models)
+    warnings = _checked(text, base)
+    write_whole(out, text)
+    return [*lines, *(f"warning: {warning}" for warning in warnings)]
+
+
+def _of_mesh(
+    thing: str, base: Path, label: str | None, length_mm: float | None, axis: Axis | None, models
+) -> tuple[str, list[str]]:
+    named = label_of(_labels(models, base), label, thing)
+    path = Path(thing)
+    if thing.startswith("primitive:"):
+        from patchproof.mesh import primitives
+
+        up, said = Up("y", "primitives are"), "the primitive's own"
+        own_mm = primitives.longest_mm(thing.partition(":")[2])
+    else:
+        up, said, own_mm = (
+            Up(axis, "as given") if axis else guess_up(path),
+            "by the file's units, meters: measure it",
+            None,
+        )
+    if length_mm is None:
+        length_mm = own_mm or length_of(path)
+    else:
+        said = "as given"
+    mesh = load_mesh(thing, length_mm, up.axis)
+    hang = place_for(mesh, length_mm)
+    mesh_name = thing if thing.startswith("primitive:") else _path(path, base)
+    near, far = (_rounded(times * length_mm) for times in (NEAR, FAR))
+    azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
+    if hang.side == "+y":
+        azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
+    lies = "paper follows the surface" if hang.bend else "a flat card lies close enough"
+    text = "\n".join(
+        [
+            *_HEAD,
+            "[object]",
+            f"mesh = {_quoted(mesh_name)}",
+            _line(f"length_mm = {length_mm:g}", f"its longest extent, {said}"),
+            _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
+            *_turned(up),
+            "",
+            "[patch]",
+            *_size(*hang.size_mm),
+            _line(f'side = "{hang.side}"', f'{SIDE_NAMES[hang.side]}; place = "auto" searches the whole object')
+            if hang.side
+            else _line('place = "auto"', "no side's middle takes it: optimize searches the whole object"),
+            *([] if hang.side else [_line('side = "+z"', "front: what azimuth 0 faces")]),
+            _line(f"bend = {str(hang.bend).lower()}", lies),
+            "",
+            *_target(named, models, base),
+            "",
+            "[view]",
+            _line(f"distance_mm = [{near:g}, {far:g}]", f"to the object's middle: {NEAR} to {FAR} times its length"),
+            _line("azimuth_deg = [-60, 60]", azimuth),
+            _line("elevation_deg = [2, 27]", elevation),
+            "",
+            "# [background]",
+            _line('# images = "places"', "a folder of photographs of places; procedural rooms without"),
+            "",
+        ]
+    )
+    width, height = hang.size_mm
+    lines = [
+        f'up: "{up.axis}", {up.reason}'
+        + (f"; {up.odd}: if the preview shows it lying, {_again(up)}" if up.odd else ""),
+        f"length: {length_mm:g} mm, {said}",
+        f"piece: {width:g} × {height:g} mm, {hang.words}",
+        f'label: "{named}" ({models[0]})',
+    ]
+    return text, lines
+
+
+def _turned(up: Up) -> list[str]:
+    """The other axis as a comment beside the one of an object that may lie."""
+    if up.odd is None:
+        return []
+    other = f'# up = "{other_axis(up.axis)}"'
+    return [_line(other, f"in its place if the preview shows it lying: {up.odd}"), f"# Best of all {_again(up)}."]
+
+
+def _again(up: Up) -> str:
+    return f"write the scene again with --up {other_axis(up.axis)}: sides and sizes change with it"
+
+
+def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:
+    tables = sorted(folder.glob("*.csv"))
+    manifests = [
+        path for path in sorted([*folder.glob("*.json"), *folder.resolve().parent.glob("*.json")]) if _blank(path)
+    ]
+    if not tables and not manifests:
+        expected = "a CSV of labels among images, or a blank sheet's JSON in or beside the folder of photographs"
+        raise Refused(expected, f"neither for {folder}", "put one there, or name a mesh")
+    if not tables and len(manifests) > 1:
+        names = ", ".join(path.name for path in manifests)
+        raise Refused(
+            "one blank sheet's JSON", names, "lay the one that hangs there into the folder, the others elsewhere"
+        )
+    if not tables:
+        named = label_of(_labels(models, base), label, folder.resolve().name)
+        sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")
+        lines = [
+            "[object]",
+            f"photos = {_quoted(_path(folder, base))}",
+            sheet,
+            "",
+            _line("[patch]", "as the blank's"),
+            "",
+        ]
+        text = "\n".join([*_HEAD, *lines, *_target(named, models, base), ""])
+        return text, [
+            f"photographs: {folder}, with the blank of {manifests[0].name}",
+            f'label: "{named}" ({models[0]})',
+        ]
+    table = next((path for path in tables if path.stem == "labels"), tables[0])
+    counts = Counter(named for name, named in label_rows(table) if is_file(folder / name))
+    if not counts:
+        raise Refused(f"images that {table.name} names in {folder}", "none", "write their file names there")
+    named = label_of(_labels(models, base), label or counts.most_common(1)[0][0], folder.name)
+    lines = ["[object]", f"images = {_quoted(_path(folder, base))}", f"labels = {_quoted(_path(table, base))}", ""]
+    lines += ["[patch]", *_size(100, 100), "", *_target(named, models, base), "", "[view]"]
+    lines += [_line("patch_share = [0.2, 0.3]", "the piece's longer side over the picture's shorter one"), ""]
+    text = "\n".join([*_HEAD, *lines])
+    return text, [f"images: {folder}, labels of {table.name}", f'label: "{named}" ({models[0]})']
+
+
+def _blank(path: Path) -> bool:
+    """Whether a JSON file is the manifest of a blank sheet."""
+    try:
+        return load_manifest(path).kind == "blank"
+    except Refused:
+        return False
+
+
+def _labels(models: Sequence[str], base: Path) -> tuple[str, ...]:
+    """The first network's list."""
+    if not models:
+        raise Refused("a network", "none", "leave --models out, or name one")
+    return load_classifier(_model(models[0], base), base).labels
+
+
+def _target(named: str | int, models: Sequence[str], base: Path) -> list[str]:
+    written = [_model(name, base) for name in models]
+    for name in written[1:]:
+        find_labels(load_classifier(name, base).labels, named)
+    label = named if isinstance(named, int) else _quoted(named)
+    return [
+        "[target]",
+        _line(f"label = {label}", "an index, or a name in the network's list"),
+        f"models = [{', '.join(map(_quoted, written))}]",
+        _line('goal = "assist"', '"deceive" measures robustness'),
+    ]
+
+
+def _size(width_mm: float, height_mm: float) -> list[str]:
+    return [_line(f"width_mm = {width_mm:g}", "of the piece that is cut out"), f"height_mm = {height_mm:g}"]
+
+
+def _line(setting: str, comment: str) -> str:
+    return f"{setting:<29} # {comment}"
+
+
+def _model(name: str, base: Path) -> str:
+    """A network's name as a scene in `base` says it; on the command line paths start where one is."""
+    match = NETWORK_FILE.fullmatch(name)
+    return f"{match[1]}{_path(Path(match[2]), base)}" if match and "${" not in match[2] else name
+
+
+def _path(path: Path, base: Path) -> str:
+    """Relative to the scene's folder where it lies in it, else whole."""
+    whole = path.resolve()
+    return (whole.relative_to(base) if whole.is_relative_to(base) else whole).as_posix()
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; JSON's escapes are TOML's."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _rounded(value_mm: float) -> float:
+    """To two figures."""
+    return float(f"{value_mm:.2g}")
+
+
+def _checked(text: str, base: Path) -> tuple[str, ...]:
+    """The warnings of the scene that the text describes; refused where it cannot be loaded or has no place."""
+    settings = validated(SceneSettings, tomllib.loads(text), "the new scene")
+    scene = build_scene(settings, base)
+    if isinstance(scene, OpenScene):
+        Ground(scene).spots(1)
+    return scene.warnings

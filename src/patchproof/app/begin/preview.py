@@ -1,0 +1,274 @@
+"""`preview`: a look at a scene before anything is optimized, in seconds.
+
+In: a scene file. Out: a folder with `preview.html`, which needs nothing from outside of itself and asks nobody for
+anything, and for a mesh `preview.glb`; where its own texture may change, `uv.png` to draw a mask on. Where the piece is
+refused, the page shows the object without it and says why: that is when a look helps most. A piece that is still to be
+placed is shown in the middle of the side that azimuth 0 faces. Left out on purpose: anything that a design decides;
+that is `plan`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from patchproof.app.begin.guess import lies_oddly, other_axis
+from patchproof.app.begin.sides import (
+    SIDE_NAMES,
+    extent_mm,
+    gap_colors,
+    gap_top_mm,
+    side_of,
+    side_views,
+    stretch_colors,
+)
+from patchproof.app.begin.uv_layout import uv_layouts
+from patchproof.app.begin.views import Look, looks
+from patchproof.base.color import codes_of
+from patchproof.base.output import image_bytes, new_folder, write_whole
+from patchproof.base.settings import SceneSettings, load_scene_settings
+from patchproof.base.strict import Refused
+from patchproof.classifier.labels import find_labels
+from patchproof.classifier.load import load_classifier
+from patchproof.mesh.export import write_glb
+from patchproof.mesh.mesh import Material, Part
+from patchproof.render.stage import Stage, set_stage
+from patchproof.report.images import base64_uri, data_uri, jpeg, png
+from patchproof.report.page import page, viewer
+from patchproof.scene.bend import STRETCH_LIMIT
+from patchproof.scene.mesh_scene import MeshScene, TextureScene
+from patchproof.scene.patch_scene import OpenScene, PatchScene
+from patchproof.scene.scene import Scene, build_scene
+from patchproof.scene.texture import whole_colors
+from patchproof.sheets.pdf import numbered
+
+PAGE, OBJECT, LAYOUT = "preview.html", "preview.glb", "uv.png"
+_TEXTURE_PX = 1024  # of the object's textures in the page
+_MOST_BYTES = 16 << 20  # of an object that the page itself turns
+_DESIGN_PX = 256  # of the gray design on the piece, along its longer side
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What a preview found: the page, lines for the terminal, warnings, and what was refused."""
+
+    page: Path
+    lines: tuple[str, ...]
+    warnings: tuple[str, ...]
+    refused: str | None
+
+
+def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = False) -> Preview:
+    """Look at the scene of a file; what cannot be read, and networks that cannot be used, are refused."""
+    path = Path(scene_path)
+    settings = load_scene_settings(path)
+    with new_folder(out, (PAGE, OBJECT, "uv*.png"), overwrite) as folder:
+        scene, refused = _scene(settings, path.resolve().parent)
+        classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
+        indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
+        stage = set_stage(scene)
+        seen = looks(stage, classifiers, indices)
+        warnings = (*scene.warnings, *_lying(scene, settings))
+        if isinstance(scene, MeshScene):
+            _write_object(stage, folder / OBJECT)
+        layouts = _write_layouts(scene, folder)
+        facts = _facts(scene, settings) + [("texture", text) for text, _ in layouts]
+        lines = tuple(f"{name}: {text}" for name, text in facts) + tuple(_answers(settings, seen))
+        problems = [text for text in (refused, unknown) if text]
+        text = page(
+            "preview.html.j2",
+            name=path.name,
+            target=settings.target,
+            facts=facts,
+            problems=problems,
+            warnings=warnings,
+            sides=[(view, data_uri(png(view.picture))) for view in side_views(stage)]
+            if isinstance(scene, MeshScene)
+            else [],
+            maps=_maps(scene) if isinstance(scene, PatchScene) else [],
+            layouts=layouts,
+            model=_model(folder / OBJECT, scene) if isinstance(scene, MeshScene) else None,
+            viewer=viewer() if scene.HAS_OBJECT else "",
+            looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
+            summaries=_answers(settings, seen),
+        )
+        write_whole(folder / PAGE, text)
+    return Preview(Path(out) / PAGE, lines, warnings, " ".join(problems) or None)
+
+
+def _lying(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
+    """What to do about an object that would stand better with its file's other axis up."""
+    up, name = settings.object.up, settings.object.mesh or ""
+    odd = lies_oddly(scene.mesh.vertices, up) if isinstance(scene, MeshScene) and ":" not in name else None
+    other = other_axis(up)
+    return () if odd is None else (f'the object may lie: {odd}. If it does, write up = "{other}" in [object]',)
+
+
+def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:
+    """The scene, where its piece is refused without it, and the refusal."""
+    try:
+        scene = build_scene(settings, base)
+    except Refused as refused:
+        if settings.object.mesh is None or settings.patch.kind != "patch":
+            raise
+        patch = {"place": "auto", "at_mm": None, "offset_mm": (0.0, 0.0), "spin_deg": 0.0}
+        view = {"look_at": "object", "front": "patch"}
+        return build_scene(settings.changed(patch=patch, view=view), base), str(refused)
+    if not isinstance(scene, OpenScene):
+        return scene, None
+    try:
+        placed = scene.at(settings.patch.side, 0.0)
+    except Refused:  # the search will find another place, or refuse
+        return scene, None
+    return (scene if placed.placement.warnings else placed), None
+
+
+def _indices(settings: SceneSettings, labels: Sequence[Sequence[str]]) -> tuple[list[tuple[int, ...]], str | None]:
+    """The target's indices in each network, none where it is not known there, and the refusal."""
+    target, indices, unknown = settings.target, [], None
+    for own in labels:
+        try:
+            indices.append(find_labels(own, target.label, target.accept))
+        except Refused as refused:
+            indices.append(())
+            unknown = str(refused)
+    return indices, unknown
+
+
+def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
+    """What is where, in words."""
+    facts = [("object", scene.description())]
+    if isinstance(scene, MeshScene):
+        width, height, depth = extent_mm(scene.mesh)
+        size = f"{width:.0f} × {height:.0f} × {depth:.0f} mm (width, height and depth of its front)"
+        facts = [("object", f"{size}, {len(scene.mesh.faces)} faces")]
+        front, view = side_of(scene.frame.normal), scene.settings.view
+        (left, right), (low, high), (near, far) = view.azimuth_deg, view.elevation_deg, view.distance_mm
+        facts.append(
+            (
+                "camera",
+                f"{left:g}° to {right:g}° about the {SIDE_NAMES[front]} ({front}), {low:g}° to {high:g}° above it, "
+                f"{near:g} to {far:g} mm away",
+            )
+        )
+    lies = scene.lies()
+    width, height = lies["size_mm"]
+    if isinstance(scene, PatchScene):
+        side = side_of(scene.placement.normal)
+        where = f"facing {SIDE_NAMES[side]} ({side})"
+        fits = (
+            f"gap {lies['gap_mm']:.1f} mm at most, {lies['gap_mean_mm']:.1f} mm on average; "
+            f"{lies['overhang_share']:.0%} overhangs; stretch {lies['stretch']:.2%}"
+        )
+        facts.append(("piece", f"{lies['family']}, {width:g} × {height:g} mm, {where}: {fits}"))
+        facts.append(
+            ("markers", f"{scene.piece.marker_mm:.1f} mm, unreadable in {scene.unreadable_share:.0%} of views")
+        )
+    elif isinstance(scene, OpenScene):
+        facts.append(("piece", "not placed"))
+    else:
+        facts.append(("piece", f"{width:g} × {height:g} mm: {lies['reason']}"))
+    if settings.patch.place == "auto":
+        side = settings.patch.side
+        tried = f"until then it is tried on the {SIDE_NAMES[side]} ({side})" if isinstance(scene, PatchScene) else ""
+        facts.append(("place", f'"auto": optimize searches the object for it{"; " if tried else ""}{tried}'))
+    return facts
+
+
+def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
+    """How often each network recognizes the bare object."""
+    lines = []
+    for number, first in enumerate(seen[0].answers):
+        answers = [look.answers[number] for look in seen]
+        names = [answer.labels[0][0] for answer in answers]
+        most = max(dict.fromkeys(names), key=names.count)
+        count = sum(answer.recognized for answer in answers)
+        lines.append(
+            f'{first.network}: "{settings.target.label}" first in {count} of {len(seen)} views of the bare object; '
+            f'most often "{most}" ({names.count(most)})'
+        )
+    return lines
+
+
+def _maps(scene: PatchScene) -> list[dict[str, str]]:
+    """The piece's gap and stretch, each a picture with the words at the ends of its scale."""
+    laid = scene.placement
+    shape = "{:g} / {:g}".format(*laid.size_mm)
+    maps = [
+        {
+            "title": "gap to the surface",
+            "shape": shape,
+            "picture": data_uri(png(gap_colors(laid))),
+            "low": "0 mm",
+            "high": f"{gap_top_mm(laid):.2g} mm: too much",
+        }
+    ]
+    if not laid.is_flat:
+        maps.append(
+            {
+                "title": "stretch of the paper",
+                "shape": shape,
+                "picture": data_uri(png(stretch_colors(laid))),
+                "low": "0 %",
+                "high": f"{STRETCH_LIMIT:.0%}: refused",
+            }
+        )
+    return maps
+
+
+def _write_layouts(scene: Scene, folder: Path) -> list[tuple[str, str]]:
+    """A picture beside the page for each texture that may change: what it is, and itself for the page."""
+    layouts, shown = uv_layouts(scene.canvas) if isinstance(scene, TextureScene) else [], []
+    for number, layout in enumerate(layouts):
+        name = LAYOUT if len(layouts) == 1 else numbered(LAYOUT, number)
+        write_whole(folder / name, image_bytes(layout.picture, "PNG"))
+        width, height = layout.texels
+        text = (
+            f'{name} is the layout of "{layout.material}", {width} × {height} texels; {len(layout.numbered)} of its '
+            f"{layout.faces} faces have room for their numbers"
+        )
+        shown.append((text, data_uri(jpeg(_reduced(layout.picture)))))
+    return shown
+
+
+def _model(path: Path, scene: MeshScene) -> dict[str, str] | None:
+    """What the page's viewer turns and from where it first looks; None where that is too much for a page."""
+    content = path.read_bytes()
+    if len(content) > _MOST_BYTES:
+        return None
+    x, _, z = scene.normal
+    azimuth_deg = np.degrees(np.arctan2(x, z)) + 25
+    return {"source": base64_uri(content, "model/gltf-binary"), "orbit": f"{azimuth_deg:.0f}deg 72deg auto"}
+
+
+def _write_object(stage: Stage, path: Path) -> None:
+    scene = stage.scene
+    if not isinstance(scene, MeshScene):
+        raise ValueError("a scene of pictures has no object to turn")
+    mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
+    textures = [_reduced(m.texture_srgb) for m in mesh.materials if m.texture_srgb is not None]
+    piece = _gray_piece(stage, scene) if isinstance(scene, PatchScene) else None
+    write_whole(path, lambda part: write_glb(mesh, textures, part, piece))
+
+
+def _gray_piece(stage: Stage, scene: PatchScene) -> Part:
+    """The printed piece with a gray design where it lies."""
+    laid, scale = scene.placement, _DESIGN_PX / max(scene.piece.size_mm)
+    width, height = (max(8, round(side * scale)) for side in scene.piece.size_mm)
+    shown = stage.look.shown(torch.full((3, height, width), 0.5))
+    material = Material("piece", (1.0, 1.0, 1.0), codes_of(shown.srgb).cpu().numpy())
+    return Part(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
+
+
+def _reduced(texture: np.ndarray) -> np.ndarray:
+    """A texture of at most `_TEXTURE_PX` a side."""
+    import cv2
+
+    height, width = texture.shape[:2]
+    scale = min(1.0, _TEXTURE_PX / max(width, height))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return texture if scale == 1 else cv2.resize(texture, size, interpolation=cv2.INTER_AREA)

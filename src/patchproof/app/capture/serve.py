@@ -1,0 +1,143 @@
+"""Listen on this machine, or on the local network where that is asked for, until interrupted.
+
+In: a sheet's manifest, the folder for the photographs. Out: the last `Report`. The address has a random token. Port and
+token are kept in the folder, readable by its owner alone, so that after a restart an open page goes on. HTTP is not
+encrypted: in a network of strangers use none but this machine's own address. Left out on purpose: live pictures, which
+browsers allow to encrypted pages only; the phone's own camera takes better ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import socket
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from patchproof.app.capture.album import ADDRESS, Album
+from patchproof.app.capture.gathered import ForecastFrom, Gathered, ready
+from patchproof.app.verify import options_of
+from patchproof.base.input import read_json
+from patchproof.base.output import write_whole
+from patchproof.base.strict import Refused, Strict, validated
+from patchproof.base.workers import open_workers
+from patchproof.evidence.results import Report
+from patchproof.sheets.manifest import load_manifest
+
+_NOWHERE = ("192.0.2.1", 9)  # reserved for documentation: a datagram socket that is "connected" to it sends nothing
+_CONNECTIONS = 64
+
+
+class _Address(Strict):
+    token: Annotated[str, Field(pattern="^[A-Za-z0-9_-]{22,64}$")]
+    port: Annotated[int, Field(ge=0, le=65535)]
+
+
+def serve_capture(
+    sheet: str | Path,
+    out: str | Path,
+    *,
+    run: str | Path | None = None,
+    models: Sequence[str] | None = None,
+    camera: str | None = None,
+    lan: bool = False,
+    on_photo: Callable[[int, int], None] = lambda done, total: None,
+    on_address: Callable[[str], None] = print,
+) -> Report:
+    """Serve the page and receive photographs into `out` until interrupted; `on_photo` gets (done, all) of those that
+    are there already, `on_address` the address once it listens. `run`, `models` and `camera` as in `verify_photos`.
+    """
+    try:
+        import uvicorn
+
+        from patchproof.app.capture.app import capture_app
+    except ImportError:
+        raise Refused("Starlette and uvicorn", "none", "pip install 'patchproof[capture]'") from None
+    manifest = load_manifest(sheet)
+    if manifest.promise is None:
+        got = f"the {manifest.kind} sheet {manifest.sheet_id}"
+        raise Refused("a sheet that promises something", got, "photograph it with any camera")
+    options = options_of(sheet, manifest, models, camera)
+    forecast = None if run is None else ForecastFrom(Path(run).resolve(), Path(sheet).resolve())
+    album = Album(Path(out))
+    with open_workers(1, apart=True) as workers:
+        workers.map(ready, [None])
+        with closing(Gathered(album, manifest, options, workers, forecast)) as gathered:
+            gathered.measure(album.photos(), on_photo)
+            kept = _kept_address(album.folder)
+            with _listening(_host(lan), kept.port) as listener:
+                host, port = listener.getsockname()
+                _keep_address(album.folder, kept.changed(port=port))
+                on_address(f"http://{host}:{port}/{kept.token}/")
+                config = uvicorn.Config(
+                    capture_app(gathered, kept.token),
+                    http="h11",
+                    ws="none",
+                    lifespan="off",
+                    log_level="warning",
+                    access_log=False,  # addresses have the token
+                    server_header=False,
+                    limit_concurrency=_CONNECTIONS,
+                    timeout_graceful_shutdown=2,
+                )
+                try:
+                    uvicorn.Server(config).run(sockets=[listener])
+                except KeyboardInterrupt:  # how it ends
+                    pass
+            return gathered.report()
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """A socket at that port, or at a free one where it is taken."""
+    for wanted in dict.fromkeys((port, 0)):
+        listener = socket.socket()
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, os.name != "nt")
+        try:
+            listener.bind((host, wanted))
+            listener.listen()  # who comes before the server is ready waits
+            return listener
+        except OSError as error:
+            listener.close()
+            if not wanted:
+                raise Refused("a port to listen at", f"none on {host} ({error.strerror})", "mend that") from error
+    raise AssertionError("port 0 is always tried")
+
+
+def _host(lan: bool) -> str:
+    """One address, never all that this machine has."""
+    return _own_address() if lan else "127.0.0.1"
+
+
+def _own_address() -> str:
+    """This machine's address in its local network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_NOWHERE)
+            address = probe.getsockname()[0]
+        except OSError as error:
+            raise Refused(
+                "a local network", f"none ({error.strerror})", "connect to one, or leave --lan out"
+            ) from error
+    return address
+
+
+def _kept_address(folder: Path) -> _Address:
+    """Token and port of last time; new ones where there are none."""
+    try:
+        return validated(_Address, read_json(folder / ADDRESS, "an address", "remove it"), ADDRESS)
+    except Refused:
+        return _Address(token=secrets.token_urlsafe(24), port=0)
+
+
+def _keep_address(folder: Path, address: _Address) -> None:
+    def write(part: Path) -> None:
+        part.unlink(missing_ok=True)
+        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+            json.dump(address.model_dump(), file)
+
+    write_whole(folder / ADDRESS, write)

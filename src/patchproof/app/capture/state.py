@@ -1,0 +1,133 @@
+"""What the page shows, as plain data: the verdict so far, the map of views, sessions, and photographs with advice.
+
+In: what is gathered. Out: JSON values. Every sentence about a photograph or the promise is that of the report: remarks'
+advice, the verdict's reason, the plan page's counts.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from patchproof.app.capture.album import CONTROLS
+from patchproof.app.capture.gathered import Gathered
+from patchproof.app.capture.views import map_views
+from patchproof.base.output import image_bytes
+from patchproof.evidence.results import PhotoEntry
+from patchproof.evidence.verdict import EACH
+from patchproof.report.images import data_uri
+from patchproof.report.words import VERDICTS, headline_of, worth_sentence
+from patchproof.reprint.shots import sessions_line
+
+_LATEST = 12  # photographs with advice
+_USUAL_SESSIONS = 4  # where no number of them would do
+_PREVIEW = {"quality": 80}
+
+
+def _number(path: Path) -> str:
+    return path.name  # in the order in which they came
+
+
+def state_of(gathered: Gathered, sessions: int | None) -> dict[str, Any]:
+    """All that the page shows but single answers; `sessions` of `EACH` photographs are planned."""
+    report = gathered.report()
+    counts = {session.name: session for session in report.summary.sessions}
+    rows = [
+        {"name": name, "judged": counts[name].judged, "recognized": counts[name].recognized}
+        if name in counts
+        else {"name": name, "judged": 0, "recognized": 0}
+        for name in gathered.album.sessions
+    ]
+    plain = report.summary.model_dump()
+    summary, promise = report.summary, gathered.manifest.promise
+    promised = promise.controls if promise is not None else ()
+    return {
+        "verdict": summary.verdict,
+        "headline": VERDICTS[summary.verdict],
+        "reason": summary.reason,
+        "effect": f"{headline_of(plain)}. {worth_sentence(plain)}",
+        "photos": summary.photos,
+        "judged": summary.judged,
+        "recognized": sum(row["recognized"] for row in rows),
+        "interval": summary.interval,
+        "prediction_interval": summary.prediction_interval,
+        "sessions": rows,
+        "each": EACH,
+        "plan": summary.next_step or sessions_line(sessions),
+        "controls": [
+            {"name": control.name, "photos": control.n, "recognized": control.recognized} for control in report.controls
+        ],
+        "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
+        "map": _map(gathered, EACH * (sessions or _USUAL_SESSIONS)),
+        "latest": [answer_of(gathered, path) for path in sorted(gathered.photos, key=_number)[-_LATEST:][::-1]],
+    }
+
+
+def answer_of(gathered: Gathered, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
+    """What one measured photograph says, and what to do; `picture` (uint8 H×W×3) goes along as a data URI."""
+    photo, promise, prediction = gathered.photos[path], gathered.manifest.promise, None
+    entry, control = photo.entry, gathered.control_of(path)
+    if promise is not None and photo.counted:
+        prediction = entry.predictions.get(promise.models[0].name)
+    answer = "not counted"
+    if prediction is not None:
+        answer = "recognized" if prediction.recognized else "not recognized"
+    return {
+        "file": f"{path.parent.name}/{path.name}",
+        "answer": answer,
+        "control": control,
+        "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
+        "code": entry.code,
+        "advice": entry.remark and entry.remark.advice,
+        "view": _view(entry),
+        "forecast": entry.forecast,
+        "picture": None if picture is None else data_uri(image_bytes(picture, "JPEG", _PREVIEW)),
+    }
+
+
+def _view(entry: PhotoEntry) -> str:
+    """Where it was taken from, as far as it tells."""
+    geometry, pose, parts = entry.geometry, entry.pose, []
+    if pose is not None and pose.distance_mm is not None:
+        parts.append(f"{pose.distance_mm / 1000:.2f} m")
+    if pose is not None and pose.azimuth_deg is not None:
+        parts.append(f"{abs(pose.azimuth_deg):.0f}° {'right' if pose.azimuth_deg > 0 else 'left'}")
+    if geometry is not None:
+        parts.append(f"tilt {geometry.tilt_deg:.0f}°")
+    return ", ".join(parts)
+
+
+def _map(gathered: Gathered, wanted: int) -> dict[str, Any] | None:
+    """The map with its rows' and columns' names: degrees, and the piece's share of the picture's shorter side."""
+    promise, side_px = gathered.manifest.promise, gathered.side_px
+    photos = gathered.photos
+    counted = [photo.entry for path, photo in photos.items() if photo.counted and gathered.control_of(path) is None]
+    views = promise and map_views(promise.conditions, counted, wanted, side_px)
+    if not views:
+        return None
+    columns = [_side(low, high) for low, high in zip(views.azimuth_deg, views.azimuth_deg[1:], strict=False)]
+    pairs = zip(views.px_per_mm, views.px_per_mm[1:], strict=False)
+    if side_px is None:
+        rows = [f"{low:.1f}–{high:.1f} px/mm" for high, low in pairs]
+    else:
+        share = 100 * gathered.manifest.cut_mm[2] / side_px
+        rows = [f"{share * low:.0f}–{share * high:.0f} %" for high, low in pairs]
+    return {
+        "columns": columns,
+        "rows": rows,
+        "photos": views.photos,
+        "wanted": views.wanted,
+        "elsewhere": views.elsewhere,
+        "next": views.most_missing,
+        "of_picture": side_px is not None,
+    }
+
+
+def _side(low: float, high: float) -> str:
+    """A range of azimuths, as seen by who looks at the piece."""
+    if low < 0 < high:
+        return f"{-low:.0f}° left to {high:.0f}° right"
+    near, far = sorted((abs(low), abs(high)))
+    return f"{near:.0f}–{far:.0f}° {'left' if low < 0 else 'right'}"

@@ -1,0 +1,40 @@
+"""The command line: verbs only. Each one reads its arguments, calls one function, and prints a short summary.
+
+Heavy imports happen inside the verbs, so that help is quick. What a user can cause ends in one sentence and exit code
+1.
+"""
+
+from __future__ import annotations
+
+import typer
+
+from patchproof.app.cli.begin import new, plan, preview
+from patchproof.app.cli.calibrate import camera, printer
+from patchproof.app.cli.capture import capture
+from patchproof.app.cli.console import carried_out, run_command_line, version_option
+from patchproof.app.cli.designs import evaluate, import_picture
+from patchproof.app.cli.journey import demo, optimize, promise, reprint, sheet, verify
+from patchproof.app.cli.keys import keys
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Optimize a patch on a 3D object, print it at true size, photograph it, and judge the photographs.",
+)
+_calibrate = typer.Typer(no_args_is_help=True, help="Models of a printer or a camera, from photographs and profiles.")
+
+for _verb in (demo, new, preview, plan, optimize):
+    app.command()(carried_out(_verb))
+app.command("import")(carried_out(import_picture))
+for _verb in (promise, evaluate, sheet, reprint, capture, verify):
+    app.command()(carried_out(_verb))
+app.add_typer(_calibrate, name="calibrate")
+for _verb in (printer, camera):
+    _calibrate.command()(carried_out(_verb))
+app.command()(keys)
+app.callback()(version_option)
+
+
+def main() -> None:
+    """Run the command line."""
+    run_command_line(app)

@@ -1,0 +1,81 @@
+"""Before anything is optimized: new, preview, plan."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from patchproof.app.cli.console import Overwrite, names_of, progress, say, warn
+
+SceneFile = Annotated[Path, typer.Argument(help="The scene file (TOML).")]
+
+
+def new(
+    thing: Annotated[
+        str, typer.Argument(metavar="MESH|PHOTOS|IMAGES", help="A mesh file, primitive:NAME, or a folder of pictures.")
+    ],
+    out: Annotated[Path, typer.Option(help="The scene file to write.")] = Path("scene.toml"),
+    label: Annotated[
+        str | None, typer.Option(help="What networks should see: words of a label; from the file's name without.")
+    ] = None,
+    length_mm: Annotated[
+        float | None, typer.Option(min=1e-3, help="The object's longest extent; from the file's units without.")
+    ] = None,
+    up: Annotated[
+        Literal["y", "z"] | None, typer.Option(help="The file's axis that points up; by its format without.")
+    ] = None,
+    models: Annotated[str, typer.Option(help="Comma-separated classifiers.")] = "builtin",
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a commented scene for an object, photographs of it, or a folder of images."""
+    from patchproof.app.begin.new import new_scene
+
+    given = names_of(models) or ()
+    lines = new_scene(thing, out, label=label, length_mm=length_mm, up=up, models=given, overwrite=overwrite)
+    say(*lines, f"scene: {out}", f"next: patchproof preview {out}")
+
+
+def preview(
+    scene: SceneFile,
+    out: Annotated[Path, typer.Option(help="Folder for the page and the object.")] = Path("patchproof-preview"),
+    overwrite: Overwrite = False,
+) -> None:
+    """A page that shows the object, the piece on it, and what networks see now; in seconds."""
+    from patchproof.app.begin.preview import preview_scene
+
+    shown = preview_scene(scene, out, overwrite=overwrite)
+    warn(shown.warnings)
+    say(*shown.lines, f"page: {shown.page}")
+    if not shown.refused:
+        say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
+    if shown.refused:
+        print(shown.refused, file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def plan(
+    scene: SceneFile,
+    out: Annotated[Path | None, typer.Option(help="Write the plan as JSON, too.")] = None,
+    no_timing: Annotated[bool, typer.Option("--no-timing", help="Leave out the cost of a step.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """What is modeled, what is not, and why: first how the piece lies, then what is measured."""
+    from patchproof.app.plan.lines import geometry_lines, measured_lines
+    from patchproof.app.plan.plan import measured_plan, plan_geometry
+    from patchproof.base.output import check_file, write_whole
+
+    if out is not None:
+        check_file(out, overwrite)
+    with progress() as bar:
+        geometry, problem = plan_geometry(scene, on_stage=bar)
+    warn(geometry.warnings)
+    say(*geometry_lines(geometry))
+    sys.stdout.flush()  # what follows takes minutes
+    with progress() as bar:
+        planned = measured_plan(geometry, problem, timing=not no_timing, on_stage=bar)
+    say(*measured_lines(planned))
+    if out is not None:
+        write_whole(out, planned.model_dump_json(indent=1) + "\n")

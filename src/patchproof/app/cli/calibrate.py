@@ -1,0 +1,62 @@
+"""Models of a printer or a camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from patchproof.app.cli.console import Overwrite, pair_of, progress, say, warn
+
+
+def printer(
+    out: Annotated[Path, typer.Option(help="NAME.npz; NAME.json is written beside it.")],
+    more: Annotated[list[Path] | None, typer.Argument(metavar="[PHOTO]...", help="More photographs.")] = None,
+    icc: Annotated[Path | None, typer.Option(help="An RGB or CMYK output profile.")] = None,
+    intent: Annotated[
+        Literal["relative", "perceptual"], typer.Option(help="The profile's intent that the driver is set to.")
+    ] = "relative",
+    licence: Annotated[str, typer.Option(help="Of the profile, for the record.")] = "unknown",
+    source: Annotated[str, typer.Option(help="Where the profile is from, for the record.")] = "unknown",
+    chart: Annotated[
+        list[Path] | None, typer.Option(help="Photographs of the printed chart; a folder holds those of one print.")
+    ] = None,
+    sheet: Annotated[Path | None, typer.Option(help="The manifest of the chart's page.")] = None,
+    camera: Annotated[str | None, typer.Option(help="A camera file with a tone curve.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """A printer from its ICC profile, or from photographs of its printed chart."""
+    from patchproof.calibrate.printer import printer_from_chart, printer_from_icc
+
+    photos = [*(chart or []), *(more or [])]
+    if (icc is None) == (chart is None) or (more and chart is None):
+        raise typer.BadParameter("give either --icc FILE or --chart PHOTO...", param_hint="--icc / --chart")
+    if icc is not None:
+        lines, warned = printer_from_icc(icc, out, intent == "perceptual", licence, source, overwrite), ()
+    elif sheet is None:
+        raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
+    else:
+        with progress() as bar:
+            on_photo = lambda done, total: bar("chart", done, total)  # noqa: E731
+            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, on_photo)
+    warn(warned)
+    say(*lines)
+
+
+def camera(
+    photos: Annotated[Path, typer.Argument(help="A folder of photographs of a board.")],
+    board: Annotated[str, typer.Option(help="The board's template, or the BOARD.json beside its PDF.")] = "charuco_a4",
+    out: Annotated[Path, typer.Option(help="The camera file; its figures and a picture are written beside it.")] = Path(
+        "camera.json"
+    ),
+    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Focal length, middle and lens distortion of a camera."""
+    from patchproof.calibrate.camera import calibrate_camera, calibration_lines
+
+    ruler = None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm")
+    with progress() as bar:
+        fitted = calibrate_camera(photos, board, out, ruler_mm=ruler, overwrite=overwrite, progress=bar)
+    say(*calibration_lines(fitted), f"camera: {out}")

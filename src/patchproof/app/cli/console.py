@@ -1,0 +1,207 @@
+"""What all commands share: options, progress, and how things are said.
+
+Summaries go to standard output; warnings, failures and progress to standard error.
+"""
+
+from __future__ import annotations
+
+import io
+import shlex
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from patchproof.base.output import disk_is_full
+from patchproof.base.strict import Refused
+from patchproof.base.version import __version__
+from patchproof.base.workers import keep_freed_memory
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
+Device = Annotated[str, typer.Option(help="cpu or cuda.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="In place of the scene's own seed.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on where a run that was stopped left off.")]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Local processes that share the work, by default one for each free core where they can be forked; any "
+        "number of them gives the same results.",
+    ),
+]
+Cluster = Annotated[str | None, typer.Option(help="A Dask scheduler's address, in place of local processes.")]
+Models = Annotated[str | None, typer.Option(help="Comma-separated classifiers in place of the sheet's own.")]
+
+
+LINE_EVERY_S = 30.0  # where progress is not seen by a person at a terminal
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar with time left on standard error: call it with a stage's name, what is done, and the total. A file or pipe
+    in place of a terminal gets a line now and then.
+    """
+    if not sys.stderr.isatty():
+        yield _line_now_and_then()
+        return
+    from rich import progress as rich
+    from rich.console import Console
+
+    times = rich.TimeElapsedColumn(), rich.TimeRemainingColumn()
+    columns = rich.TextColumn("{task.description:>12}"), rich.BarColumn(), rich.MofNCompleteColumn(), *times
+    with rich.Progress(*columns, console=Console(stderr=True)) as progress:
+        tasks: dict[str, rich.TaskID] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage, total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def _line_now_and_then() -> Callable[[str, int, int], None]:
+    last = time.monotonic()
+
+    def advance(stage: str, done: int, total: int) -> None:
+        nonlocal last
+        if done >= total or time.monotonic() - last >= LINE_EVERY_S:
+            last = time.monotonic()
+            print(f"{stage}: {done} of {total}", file=sys.stderr, flush=True)
+
+    return advance
+
+
+def carried_out(verb: Callable[..., None]) -> Callable[..., None]:
+    """A verb on the cores that are free (`jobs`), which, stopped by Ctrl-C, says what is kept and how to go on, and
+    exits with 130.
+    """
+
+    @wraps(verb)
+    def carry_out(**given: Any) -> None:
+        try:
+            with _on_free_cores(given):
+                verb(**given)
+        except KeyboardInterrupt:
+            print(_stopped(given), file=sys.stderr)
+            raise typer.Exit(130) from None
+
+    return carry_out
+
+
+@contextmanager
+def _on_free_cores(given: dict[str, Any]) -> Iterator[None]:
+    """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and processes that
+    would import everything anew have the number that is asked for, one by default, and the threads of this one.
+    """
+    if "jobs" not in given:
+        yield
+        return
+    from patchproof.base.workers import can_fork, free_cores, threads
+
+    by_processes = can_fork() and given.get("device", "cpu") == "cpu"
+    if given["jobs"] is None:
+        given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
+    with threads(1) if by_processes else nullcontext():
+        yield
+
+
+def _stopped(given: dict[str, Any]) -> str:
+    out = given.get("out")
+    if "resume" not in given or not Path(out or "").is_dir():
+        return "Stopped: nothing was written."
+    again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
+    again = shlex.join([_program(), *again, "--resume"])
+    return f"Stopped: {out} keeps what was finished. Go on with: {again}"
+
+
+def _program() -> str:
+    """The name that the command was called by."""
+    path = Path(sys.argv[0])
+    return path.parent.name if path.stem == "__main__" else path.stem
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        print(f"{_program()} {__version__}")
+        raise typer.Exit()
+
+
+def version_option(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version and exit.")
+    ] = False,
+) -> None:
+    """The options that stand before the verb."""
+
+
+def run_command_line(app: typer.Typer) -> None:
+    """Run one of the commands; a refusal is one sentence on standard error and exit code 1."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # Windows gives pipes its code page, which has no ε
+            stream.reconfigure(encoding="utf-8")
+    keep_freed_memory()
+    warnings.formatwarning = lambda message, *where: f"warning: {message}\n"
+    try:
+        app()
+    except Refused as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(1) from None
+    except Exception as error:
+        if disk_is_full(error):
+            print("Expected room on the disk, got none left: make room, then run the command again.", file=sys.stderr)
+            raise SystemExit(1) from None
+        if not isinstance(error, OSError):
+            raise
+        print(f"Expected files that can be read and written, got {error}: mend that and try again.", file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("Stopped.", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def say(*lines: str) -> None:
+    """A summary's lines."""
+    for line in lines:
+        print(line)
+
+
+def say_study(finished) -> None:
+    """A study's or benchmark's tables, and on standard error what failed."""
+    from patchproof.report.tables import text_lines
+
+    for table in finished.tables:
+        say(table.title, *(f"  {line}" for line in text_lines(table)))
+    for cell, sentence in finished.failed.items():
+        print(f"failed: {cell}: {sentence}", file=sys.stderr)
+
+
+def warn(lines: tuple[str, ...]) -> None:
+    """One line each, on standard error."""
+    for line in lines:
+        print(f"warning: {line}", file=sys.stderr)
+
+
+def names_of(models: str | None) -> tuple[str, ...] | None:
+    """Names between commas."""
+    return None if models is None else tuple(name.strip() for name in models.split(",") if name.strip())
+
+
+def pair_of(text: str, option: str) -> tuple[float, float]:
+    """A number, or two as XxY."""
+    try:
+        numbers = [float(part) for part in text.lower().split("x")]
+        x, y = numbers * 2 if len(numbers) == 1 else numbers
+        if not (0 < x < float("inf") and 0 < y < float("inf")):
+            raise ValueError
+    except ValueError:
+        raise typer.BadParameter(
+            "takes one or two positive numbers, such as 0.97 or 0.97x0.98", param_hint=option
+        ) from None
+    return x, y

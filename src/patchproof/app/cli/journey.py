@@ -1,0 +1,297 @@
+"""From a scene to a verdict: demo, optimize, evaluate, sheet, reprint, verify."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from patchproof.app.cli.console import (
+    Cluster,
+    Device,
+    Jobs,
+    Models,
+    Overwrite,
+    Resume,
+    Seed,
+    names_of,
+    pair_of,
+    progress,
+    say,
+    warn,
+)
+
+Control = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
+Shown = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the run, the sheet, the photographs and the report.")] = Path(
+        "patchproof-demo"
+    ),
+    detector: Annotated[bool, typer.Option("--detector", help="Before the built-in detector, not classifier.")] = False,
+    jobs: Jobs = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """The whole journey, offline, on a built-in object and network."""
+    from patchproof.app.demo import run_demo
+
+    with progress() as bar:
+        summary = run_demo(out, detector=detector, jobs=jobs or 1, overwrite=overwrite, on_stage=bar)
+    say(*summary)
+
+
+def optimize(
+    scene: Annotated[Path, typer.Argument(help="The scene file (TOML).")],
+    out: Annotated[Path, typer.Option(help="Folder for the run.")],
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
+    overwrite: Overwrite = False,
+    draft: Annotated[bool, typer.Option("--draft", help="A first look: few steps, promised from few views.")] = False,
+    thorough: Annotated[bool, typer.Option("--thorough", help="Three times the steps, four times the views.")] = False,
+    steps: Annotated[int | None, typer.Option(min=1, help="In place of the scene's own.")] = None,
+    promise: Annotated[int | None, typer.Option(min=8, help="Views to promise from; under 400: a draft.")] = None,
+    device: Device = "cpu",
+    seed: Seed = None,
+    jobs: Jobs = None,
+    require: Annotated[
+        Literal["better"] | None,
+        typer.Option(help='"better" makes a design exit with 1 that is not better than its best control.'),
+    ] = None,
+) -> None:
+    """Optimize the patch of a scene and promise its rate."""
+    from patchproof.base.settings import behind
+    from patchproof.optimizer.place_files import read_place
+    from patchproof.optimizer.places import place_lines
+    from patchproof.optimizer.run import DRAFT, THOROUGH, optimize_scene
+    from patchproof.report.summary import promise_lines
+    from patchproof.scene.scene import load_scene
+
+    if draft and thorough:
+        raise typer.BadParameter("is the opposite of --draft; leave one out", param_hint="--thorough")
+    if draft or thorough:
+        effort = DRAFT if draft else THOROUGH
+        steps, promise = steps or effort[0], promise or effort[1]
+    with progress() as bar:
+        run = optimize_scene(
+            scene if steps is None else load_scene(scene, seed, steps),
+            out,
+            seed=seed,
+            device=device,
+            resume=resume,
+            overwrite=overwrite,
+            promise_views=promise,
+            jobs=jobs or 1,
+            on_scene=lambda loaded: warn(loaded.warnings),
+            on_place=lambda done, total: bar("place", done, total),
+            on_step=lambda step, total: bar("optimize", step.state.number, total),
+            on_promise=lambda done, total: bar("promise", done, total),
+        )
+    place = read_place(out)
+    background = behind(run.scene.settings.model_dump())
+    say(*promise_lines(run.promise, background), *([] if place is None else place_lines(place)), f"run: {out}")
+    if run.scene.settings.patch.kind == "patch":
+        say(f"next: patchproof sheet {out} --out sheet.pdf")
+    raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
+
+
+def promise(
+    run: Annotated[Path, typer.Argument(help="A finished run, such as a draft's.")],
+    n: Annotated[int | None, typer.Option("--n", min=8, help="Views to promise from, by default up to 400.")] = None,
+    device: Device = "cpu",
+    jobs: Jobs = None,
+) -> None:
+    """Promise a finished run's rate anew: the full promise of a draft, or one of more views."""
+    from patchproof.base.settings import behind
+    from patchproof.optimizer.promise_later import promise_run
+    from patchproof.report.summary import promise_lines
+
+    with progress() as bar:
+        made = promise_run(
+            run, views=n, device=device, jobs=jobs or 1, on_promise=lambda done, total: bar("promise", done, total)
+        )
+    say(*promise_lines(made.promise, behind(made.scene.settings.model_dump())))
+    if made.scene.settings.patch.kind == "patch":
+        say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
+
+
+def sheet(
+    out: Annotated[Path | None, typer.Option(help="The PDF; its manifest is written beside it.")] = None,
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Finished runs, on one page; none for blank, chart and board pages."),
+    ] = None,
+    template: Annotated[str | None, typer.Option(help="A template's name or file.")] = None,
+    control: Annotated[Control | None, typer.Option(help="The sheet of a control in place of the design's.")] = None,
+    copies: Annotated[int, typer.Option(min=1, max=1000, help="Pages of the same, for label rolls.")] = 1,
+    check: Annotated[bool, typer.Option("--check", help="Say what a print shop needs to know.")] = False,
+    templates: Annotated[bool, typer.Option("--list", help="Say which templates there are.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the page: design, markers, chart and rulers at true size."""
+    from patchproof.base.output import check_file
+    from patchproof.base.settings import behind
+    from patchproof.optimizer.run import load_run
+    from patchproof.reprint.run_sheet import blank_page, sheet_of, sheet_of_several
+    from patchproof.sheets.shop import shop_lines
+    from patchproof.sheets.template import template_lines
+    from patchproof.sheets.write import check_sheet, manifest_paths
+
+    if templates:
+        return say(*template_lines())
+    if out is None:
+        raise typer.BadParameter("name the PDF to write", param_hint="--out")
+    runs = runs or []
+    if copies > 1 and len(runs) != 1:
+        raise typer.BadParameter("copies are of one run's sheet", param_hint="--copies")
+    paths = manifest_paths(out, len(runs))
+    for path in (out, *paths):
+        check_file(path, overwrite)
+    if not runs:
+        manifests = [blank_page(out, template=template, control=control)]
+    elif len(runs) == 1:
+        manifests = [sheet_of(load_run(runs[0]), out, template=template, control=control, copies=copies)]
+    else:
+        manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=control)
+    for manifest, path in zip(manifests, paths, strict=True):
+        say(
+            *(
+                []
+                if manifest.promise is None
+                else [manifest.promise.headline, f"promised before {behind(manifest.settings)}"]
+            )
+        )
+        say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
+    if check:
+        lines = (line for manifest in manifests for line in check_sheet(manifest))
+        say(*dict.fromkeys(lines), *shop_lines(out))  # what holds for several designs is said once
+
+
+def reprint(
+    pdf: Annotated[Path, typer.Argument(help="A sheet's PDF.")],
+    n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
+    out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
+    run: Annotated[
+        Path | None,
+        typer.Option(help="The run it was made from; none for blank, chart and board pages."),
+    ] = None,
+    sessions: Annotated[
+        int, typer.Option(min=1, help="Places to take them in, each with its light, camera and folder.")
+    ] = 1,
+    seed: Seed = None,
+    printer: Annotated[str | None, typer.Option(help="Another printer than the scene's: a name or a file.")] = None,
+    print_scale: Annotated[str, typer.Option(help="Size of the print, 0.97 or 0.97x0.98 (x, y).")] = "1",
+    control: Annotated[Shown | None, typer.Option(help="Photograph a control in place of the design.")] = None,
+    scan_dpi: Annotated[float | None, typer.Option(min=30, max=1200, help="Scan the uncut page flat instead.")] = None,
+    path_traced: Annotated[
+        bool, typer.Option("--path-traced", help="Render with Mitsuba 3 in place of our renderer (slow).")
+    ] = False,
+    jobs: Jobs = None,
+    cluster: Cluster = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Print the PDF in simulation, put it back on the object, and photograph it."""
+    from patchproof.optimizer.run import load_run
+    from patchproof.reprint.hung_sheet import Hanging
+    from patchproof.reprint.page_photos import reprint_pages
+    from patchproof.reprint.reprint import reprint as reprint_sheet
+    from patchproof.reprint.reprint import scan
+
+    scale = pair_of(print_scale, "--print-scale")
+    if scan_dpi is not None and control is not None:
+        raise typer.BadParameter("a scan is of the PDF itself; leave --control out", param_hint="--scan-dpi")
+    if path_traced and scan_dpi is not None:
+        raise typer.BadParameter("is of the piece on its object; leave --scan-dpi out", param_hint="--path-traced")
+    how = Hanging(printer, scale, control, path_traced)
+    if run is None:
+        if scan_dpi is not None or control is not None or path_traced or sessions > 1:
+            raise typer.BadParameter(
+                "scans, controls, sessions and path tracing are of a run's sheet; name the run", param_hint="--run"
+            )
+        reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
+        return say(f"{n} photographs: {out}")
+    made = load_run(run)
+    if scan_dpi is not None:
+        truth = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
+    else:
+        with progress() as bar:
+            truth = reprint_sheet(
+                pdf,
+                made,
+                n,
+                out,
+                how,
+                sessions=sessions,
+                seed=seed,
+                overwrite=overwrite,
+                jobs=jobs or 1,
+                cluster=cluster,
+                on_photo=lambda done, total: bar("photograph", done, total),
+            )
+    say(f"{len(truth)} photographs: {out}")
+
+
+def verify(
+    photos: Annotated[Path, typer.Argument(help="A folder of photographs, or of folders: one for each place.")],
+    sheet: Annotated[Path, typer.Option(help="The manifest that was written beside the PDF.")],
+    out: Annotated[Path, typer.Option(help="Folder for the report.")],
+    models: Models = None,
+    controls: Annotated[Path | None, typer.Option(help="Photographs of a control, one control per folder.")] = None,
+    scan_dpi: Annotated[
+        float | None, typer.Option(min=30, max=4800, help="These are scans at this resolution.")
+    ] = None,
+    ruler_mm: Annotated[str | None, typer.Option(help="The printed rulers as measured, e.g. 97.1x97.3 (x, y).")] = None,
+    camera: Annotated[str | None, typer.Option(help="The camera that took them: a camera file or its name.")] = None,
+    boxes: Annotated[
+        Path | None, typer.Option(help="The object's boxes in photographs (COCO JSON), for detectors.")
+    ] = None,
+    require: Annotated[
+        Literal["kept", "helps"] | None,
+        typer.Option(
+            help='What else than exits with 1: "kept", a promise that held, however little it promised; "helps", one '
+            "that held of a patch that beats every control."
+        ),
+    ] = None,
+    ledger: Annotated[
+        int, typer.Option(min=0, help="Photographs in gap ledger and estimated effect at most; 0 for none.")
+    ] = 24,
+    run: Annotated[
+        Path | None, typer.Option(help="The run that the sheet is of: forecasts each photograph at its measured view.")
+    ] = None,
+    jobs: Jobs = None,
+    cluster: Cluster = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure photographs of the print and judge them against the promise."""
+    from patchproof.app.verify import verify_photos
+    from patchproof.report.summary import verdict_lines
+
+    with progress() as bar:
+        report = verify_photos(
+            photos,
+            sheet,
+            out,
+            models=names_of(models),
+            controls=controls,
+            scan_dpi=scan_dpi,
+            ruler_mm=None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm"),
+            ledger_photos=ledger,
+            camera=camera,
+            boxes=boxes,
+            run=run,
+            jobs=jobs or 1,
+            cluster=cluster,
+            resume=resume,
+            overwrite=overwrite,
+            on_photo=lambda done, total: bar("verify", done, total),
+        )
+    say(*verdict_lines(report), f"report: {out / 'report.html'}")
+    nothing = report.summary.judged == 0 and report.summary.measured == 0
+    if nothing:
+        see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
+        print(see, file=sys.stderr)
+    if require == "kept" and report.summary.meets("kept") and not report.summary.meets("helps"):
+        print("The promise held, and the patch is not shown to help: --require helps asks for both.", file=sys.stderr)
+    raise typer.Exit(1 if nothing or (require is not None and not report.summary.meets(require)) else 0)

@@ -1,0 +1,190 @@
+"""Every key of scene files and page templates as one Markdown page, read from the settings classes.
+
+Out: per table a row per key: type and range, unit, default, meaning. The meaning is the comment at the end of the
+field's last line or, where there is none, the comment above the field: it stands once, where the code says the key.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+from collections.abc import Iterator, Mapping
+from enum import Enum
+from functools import lru_cache, partial
+from itertools import takewhile
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import typer
+from pydantic import AfterValidator
+from pydantic.fields import FieldInfo
+
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Refused, Strict, nearest, ordered
+from patchproof.sheets.board import BoardTemplate
+from patchproof.sheets.template import Template
+
+HEAD = """# All keys
+
+Printed by `patchproof keys`; the text is that of the settings classes. A key that does not exist is refused with the
+nearest one that does. `[low, high]` is a range to draw from. Paths are relative to the file that names them, and
+`${VAR}` in them is expanded.
+"""
+_UNITS = {"mm": "mm", "deg": "°", "px": "px", "ev": "stops"}
+_WORDS = {str: "text", int: "integer", float: "number", bool: "true or false"}
+
+
+Documents = Mapping[str, tuple[str, type[Strict]]]  # by name what a file of settings is for, and its settings
+DOCUMENTS: Documents = {
+    "scene": ("A scene file: `patchproof optimize`, `plan`.", SceneSettings),
+    "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
+    "board": ("A page template with a board that calibrates cameras.", BoardTemplate),
+}
+
+
+def keys(
+    name: Annotated[str | None, typer.Argument(help="scene, template or board; without one, all.")] = None,
+) -> None:
+    """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
+    print(keys_page(DOCUMENTS, name), end="")
+
+
+def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -> str:
+    """The page of these documents as Markdown, or what it says of one kind of file."""
+    if name is None:
+        where: dict[type[Strict], str] = {}
+        return "\n".join([head, *(_document(name, *documents[name], where) for name in documents)])
+    if name not in documents:
+        raise Refused(f"one of {', '.join(documents)}", f'"{name}"', nearest(name, documents))
+    return _document(name, *documents[name], {})
+
+
+@lru_cache
+def meanings(model: type[Strict]) -> dict[str, str]:
+    """By key the comment that says what it means; a key without one is missing."""
+    texts = {}
+    for owner in reversed(model.__mro__):
+        if not issubclass(owner, Strict) or owner is Strict:
+            continue
+        source = inspect.getsource(owner)
+        lines = source.splitlines()
+        (definition,) = ast.parse(source).body
+        for field in definition.body if isinstance(definition, ast.ClassDef) else ():
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                above = takewhile(lambda line: line.startswith("    # "), lines[field.lineno - 2 :: -1])
+                text = lines[(field.end_lineno or field.lineno) - 1].partition("  # ")[2] or " ".join(
+                    [*above][::-1]
+                ).replace("    # ", "")
+                texts |= {field.target.id: text} if text else {}
+    return texts
+
+
+def _document(name: str, about: str, settings: type[Strict], where: dict[type[Strict], str]) -> str:
+    """One file's tables; those in `where` are told there."""
+    lines = [f"## {name}", "", about, ""]
+    for path, model in tables(settings):
+        if path:
+            lines += [f"### {name}: `{path}`", ""]
+        if model in where:
+            lines += [f"As in {where[model]}.", ""]
+            continue
+        where[model] = f"{name}: `{path}`" if path else name
+        lines += [_cell(model.__doc__ or ""), "", "| key | value | unit | default | meaning |", "|---|---|---|---|---|"]
+        lines += [_row(model, key, field) for key, field in model.model_fields.items()] + [""]
+    return "\n".join(lines)
+
+
+def tables(model: type[Strict], path: str = "") -> Iterator[tuple[str, type[Strict]]]:
+    """The settings and the tables in them, each with its place as TOML writes it."""
+    yield path, model
+    for key, hint in get_type_hints(model).items():
+        for inner, many in models_in(hint):
+            place = f"{path.strip('[]')}.{key}".strip(".")
+            yield from tables(inner, f"[[{place}]]" if many else f"[{place}]")
+
+
+def models_in(hint: Any, many: bool = False) -> Iterator[tuple[type[Strict], bool]]:
+    """The settings classes in a type, and whether it holds many of each."""
+    if isinstance(hint, type) and issubclass(hint, Strict):
+        yield hint, many
+    for inner in get_args(hint):
+        yield from models_in(inner, many or get_origin(hint) is tuple)
+
+
+def _row(model: type[Strict], key: str, field: FieldInfo) -> str:
+    kind = _kind(get_type_hints(model, include_extras=True)[key])
+    meaning = meanings(model).get(key, "its own table" if kind.startswith("table") else "")
+    cells = (f"`{key}`", kind, _UNITS.get(key.rpartition("_")[2], ""), default_text(field), meaning)
+    return "| " + " | ".join(map(_cell, cells)) + " |"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def default_text(field: FieldInfo) -> str:
+    """A key's default as a cell of the page."""
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    return "none" if value is None else f"`{toml_text(value)}`"
+
+
+def toml_text(value: Any) -> str:
+    """A value as TOML writes it, four digits of numbers."""
+    if isinstance(value, Strict):
+        value = value.model_dump(exclude_defaults=True)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {toml_text(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(toml_text, value)) + "]"
+    if value is None:
+        return '"none"'
+    return f"{value:.4g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+
+
+def _kind(hint: Any, checks: tuple[Any, ...] = (), plural: str = "") -> str:
+    """A type as one who writes TOML needs to know it, with its range."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _kind(inner[0], (*checks, *inner[1:]), plural)
+    if origin in (Union, UnionType):
+        return " or ".join(_kind(member, checks, plural) for member in inner if member is not type(None))
+    if origin is Literal or (isinstance(hint, type) and issubclass(hint, Enum)):
+        return ", ".join(f'`"{value}"`' for value in (inner or hint))
+    if origin is dict:
+        return f"table{plural} of {_kind(inner[1], plural='s')}"
+    if origin is tuple and inner[-1] is Ellipsis:
+        least = max((value for name, value in _bounds(checks) if name == "min_length"), default=0)
+        return f"list of {_kind(inner[0], plural='s')}{ {0: '', 1: ', not empty'}.get(least, f', {least} or more') }"
+    if origin is tuple and AfterValidator(ordered) in checks:
+        return f"[low, high]{_range((*get_args(inner[0])[1:], *checks))}"
+    if origin is tuple:
+        kinds = {_kind(member, plural="s") for member in inner}
+        return f"[{len(inner)} {kinds.pop() if len(kinds) == 1 else 'numbers'}]"
+    word = "table" if isinstance(hint, type) and issubclass(hint, Strict) else _WORDS.get(hint, "value")
+    return word + plural + _range(checks)
+
+
+def _range(checks: tuple[Any, ...]) -> str:
+    """The tighter one of two bounds; of equal ones the one that leaves the end out."""
+    bounds = _bounds(checks)
+    low = max(((value, name == "gt") for name, value in bounds if name in ("ge", "gt")), default=None)
+    high = min(((value, name == "le") for name, value in bounds if name in ("le", "lt")), default=None)
+    if low and high and (low[1], high[1]) == (False, True):
+        return f", {low[0]:g} to {high[0]:g}"
+    parts = [f", {'>' if low[1] else '≥'} {low[0]:g}"] if low else []
+    return "".join([*parts, f", {'≤' if high[1] else '<'} {high[0]:g}"] if high else parts)
+
+
+def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
+    """What a type's checks bound it by, by pydantic's names."""
+    bounds = []
+    for check in checks:
+        if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # strict.within
+            bounds += zip(("ge", "le"), check.func.args, strict=True)
+        for limit in getattr(check, "metadata", ()):
+            names = ("ge", "gt", "le", "lt", "min_length")
+            bounds += [(name, getattr(limit, name)) for name in names if hasattr(limit, name)]
+    return bounds

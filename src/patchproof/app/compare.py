@@ -1,0 +1,198 @@
+"""Designs side by side: several runs of one scene under the same conditions, and the best of them under fresh ones.
+
+In: finished runs, optimized here or imported, whose scenes differ in [patch], [optimize] and [sheet] at most. Out:
+DIR/designs.html with each design's picture, rate, gain over its best control and difference to the best design, paired
+on the same views; DIR/designs.json, and a CSV of each table.
+
+The best of several rates is too good on the views that chose it (the winner's curse), and so is its lead. The two best
+are therefore shown under as many conditions again, which had no say in the choice: those figures are to be quoted. Left
+out on purpose: corrections of the other rows for how many there are; they only choose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from patchproof.base.claims import Estimate, difference, rate
+from patchproof.base.output import new_folder
+from patchproof.base.strict import Refused, listed
+from patchproof.base.workers import open_workers
+from patchproof.classifier.network import Classifier
+from patchproof.optimizer.evaluate import answers_of, forget, refuse_unnamed
+from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
+from patchproof.optimizer.responses import Answers
+from patchproof.optimizer.run import Run, load_run
+from patchproof.report.results import Results, write_results
+from patchproof.report.tables import Drawing, Table, Value
+from patchproof.scene.scene import Scene, needs_piece
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OWN = ("designs.html", "designs.json", "designs_*.csv", "designs_*.png")
+_HEAD = ("design", "made", "network", "rate", "best control", "minus it", "minus the best design")
+Shown = Mapping[str, Answers]  # what networks answered to a design and its controls
+
+
+def compare_runs(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    models: Sequence[str | Classifier] | None = None,
+    n: int = PROMISE_VIEWS,
+    seed: int | None = None,
+    device: str = "cpu",
+    jobs: int = 1,
+    cluster: str | None = None,
+    overwrite: bool = False,
+    on_view: Callable[[int, int], None] = lambda done, total: None,
+) -> Results:
+    """Compare the designs of run folders under n conditions of the first one's seed (or of `seed`), and the two best
+    under n more; all else as in `evaluate_run`. Written into the folder `out`.
+    """
+    networks, loaded = None if models is None else tuple(models), _loaded(runs, models is None)
+    refuse_unnamed(networks, jobs, cluster)
+    scene, total, before = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
+    names = tuple(
+        each.name if isinstance(each, Classifier) else each for each in networks or scene.settings.target.models
+    )
+    seed = scene.seed if seed is None else seed
+    with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
+
+        def ask(name: str, start: int) -> Shown:
+            nonlocal before
+            run = loaded[name]
+            views = run.scene.draw("evaluate", n, seed, start)
+            done = before
+            answers, _ = answers_of(
+                run.folder.resolve(), views, workers, networks, device, lambda count: on_view(done + count, total)
+            )
+            before += n
+            return answers
+
+        try:
+            chosen_by = {name: ask(name, 0) for name in loaded}
+            order = sorted(loaded, key=partial(_reached, chosen_by, scene))[::-1]
+            fresh = {name: ask(name, n) for name in order[:2]}
+        finally:
+            forget()
+        results = Results(
+            kind="comparison",
+            name="designs",
+            about=f"{len(loaded)} designs for {scene.settings.target.goal} "
+            f'"{scene.settings.target.label}", under the same conditions.',
+            extent=f"{len(loaded)} designs, {n} conditions, and {n} more for the best two; seed {seed}",
+            settings=scene.settings.model_dump(mode="json"),
+            tables=_tables(loaded, names, order, chosen_by, fresh),
+            figures=[_drawing({name: loaded[name] for name in order}, chosen_by)],
+            failed={},
+            more={"imported": {name: run.details["imported"] for name, run in loaded.items() if _made(run) != "here"}},
+        )
+        write_results(folder, results)
+    return results
+
+
+def _loaded(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
+    """The runs by their folders' names, in full where two are alike; refused where their views are not the same."""
+    paths = [Path(run).resolve() for run in runs]
+    if len(set(paths)) < max(len(paths), 2):
+        raise Refused(
+            "two runs or more to compare, each once", listed([str(run) for run in runs]) or "none", "name them"
+        )
+    names = [path.name for path in paths]
+    names = names if len(set(names)) == len(names) else [str(path) for path in paths]
+    loaded = {name: load_run(path) for name, path in zip(names, paths, strict=True)}
+    first, *others = loaded
+    for name in others:
+        if _views_of(loaded[name].scene, with_networks) != _views_of(loaded[first].scene, with_networks):
+            do = "compare runs whose scenes differ in [patch], [optimize] and [sheet] at most"
+            raise Refused(f"runs that are seen alike, as {first} is", name, do)
+    return loaded
+
+
+def _views_of(scene: Scene, with_networks: bool) -> tuple[Any, ...]:
+    """All that views of the scene depend on but its piece, and what is asked of networks."""
+    needs_piece(scene)
+    settings = scene.settings.model_dump(mode="json", exclude={"patch", "optimize", "sheet"})
+    if not with_networks:
+        del settings["target"]["models"]
+    return settings, scene.base.resolve(), scene.given_glb
+
+
+def _reached(answers: Mapping[str, Shown], scene: Scene, name: str) -> tuple[float, float]:
+    """How far a design reaches its goal before the first network: by rate, then by confidence."""
+    design, sign = answers[name]["design"], scene.settings.target.goal.sign
+    return sign * float(design.recognized[0].mean()), sign * float(design.confidence[0].mean())
+
+
+def _tables(
+    runs: Mapping[str, Run],
+    networks: Sequence[str],
+    order: Sequence[str],
+    all_views: Mapping[str, Shown],
+    fresh: Mapping[str, Shown],
+) -> list[Table]:
+    best, *_ = order
+    n = all_views[best]["design"].recognized.shape[1]
+    quoted = Table(
+        "fresh",
+        "The best two, under conditions that had no say in choosing them",
+        _HEAD,
+        tuple(_row(runs, fresh, name, best, network, 0) for name in fresh for network in networks[:1]),
+        f"{n} fresh conditions: these are the figures to quote.",
+    )
+    chosen = Table(
+        "designs",
+        "All designs, under the same conditions",
+        _HEAD,
+        tuple(_row(runs, all_views, name, best, network, i) for name in order for i, network in enumerate(networks)),
+        f"{n} conditions, the same for all; differences are paired. The best is the best by the first network. That it "
+        "was chosen on these conditions flatters its rate and its lead.",
+    )
+    return [quoted, chosen]
+
+
+def _row(
+    runs: Mapping[str, Run], answers: Mapping[str, Shown], name: str, best: str, network: str, i: int
+) -> tuple[Value, ...]:
+    hits = {kind: answer.recognized[i].tolist() for kind, answer in answers[name].items()}
+    sign = runs[name].promise.target.goal.sign
+    control = max(CONTROLS, key=lambda kind: sign * sum(hits[kind]))
+    lead = None if name == best else difference(hits["design"], answers[best]["design"].recognized[i].tolist())
+    gain = difference(hits["design"], hits[control])
+    return name, _made(runs[name]), network, rate(hits["design"]), control, gain, lead
+
+
+def _made(run: Run) -> str:
+    """Where a run's design was made."""
+    return "here" if run.details.get("imported") is None else "elsewhere"
+
+
+def _drawing(runs: Mapping[str, Run], answers: Mapping[str, Shown]) -> Drawing:
+    """Each design's picture beside its rate and its best control's."""
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(len(runs), 2, squeeze=False, width_ratios=(1, 5), sharex="col")
+        for (picture, axes), (name, run) in zip(grid, runs.items(), strict=True):
+            picture.imshow(run.design, interpolation="nearest")
+            picture.set_axis_off()
+            hits = {kind: answer.recognized[0].tolist() for kind, answer in answers[name].items()}
+            shown = {kind: rate(each) for kind, each in hits.items()}
+            for height, (kind, estimate) in enumerate(reversed(shown.items())):
+                _bar(axes, height, estimate, "#2457c5" if kind == "design" else "#b0713c")
+            axes.set_yticks(range(len(shown)), list(shown)[::-1], fontsize=6)
+            axes.set(xlim=(-0.01, 1.01), ylim=(-0.7, len(shown) - 0.3))
+            axes.set_title(name, fontsize=9, loc="left")
+        grid[-1][1].set_xlabel("recognized by the first network")
+
+    about = "Bars are 95 % intervals of the rate under the conditions that all designs share."
+    return Drawing("designs", "The designs, best first", draw, (7.0, 1.3 * len(runs) + 0.4), about)
+
+
+def _bar(axes: Any, height: float, estimate: Estimate | None, color: str) -> None:
+    if estimate is not None:
+        axes.hlines(height, estimate.low, estimate.high, colors=color, linewidth=3, alpha=0.4)
+        axes.plot(estimate.value, height, "o", color=color, markersize=4)

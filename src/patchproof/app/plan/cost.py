@@ -1,0 +1,139 @@
+"""What one step of optimization costs on this machine, and where the time goes.
+
+In: a problem and a design. Out: `Cost`: median milliseconds of each part over a few steps' views, after a warm-up. The
+parts are those of the loop, where views that share a pose share what it takes to see it; what cannot be timed inside of
+`see` is the difference of two calls of it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.base.strict import Strict
+from patchproof.optimizer.loop import new_share
+from patchproof.optimizer.problem import Problem
+from patchproof.render.photograph import expose, windows_of
+from patchproof.render.pixels import Shown
+from patchproof.render.raster import rasterize
+from patchproof.render.views import Views, cameras, near_mm
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.scene import needs_mesh
+
+REPEATS = 5
+
+
+class Part(Strict):
+    """Milliseconds of a part of a step and their share of it."""
+
+    name: str
+    ms: float
+    share: float
+
+
+class Cost(Strict):
+    """One step of `views` views of `side_px`."""
+
+    views: int
+    side_px: int
+    threads: int
+    ms: float
+    parts: tuple[Part, ...]
+
+
+def measure_cost(
+    problem: Problem, design: Tensor, on_step: Callable[[int, int], None] = lambda done, total: None
+) -> Cost:
+    """The cost of a step that shows `design`, with all classifiers of the problem."""
+    settings = problem.scene.settings.optimize
+    rows = []
+    for number in range(REPEATS + 1):
+        conditions = problem.scene.draw("train", settings.views, start=number * settings.views)
+        rows.append(_step_ms(problem, design, conditions))
+        on_step(number + 1, REPEATS + 1)
+    median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
+    total = sum(median.values())
+    parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
+    threads = torch.get_num_threads()
+    return Cost(views=settings.views, side_px=problem.training_px, threads=threads, ms=total, parts=parts)
+
+
+def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tensor) -> dict[str, float]:
+    """What a step of each other problem takes, as a multiple of the problem's own just before: medians of ratios."""
+    views, ratios = problem.scene.settings.optimize.views, {name: [] for name in others}
+    for number in range(REPEATS + 1):
+        conditions = problem.scene.draw("train", views, start=number * views)
+        for name, other in others.items():
+            own_ms, other_ms = (sum(_step_ms(p, design, conditions).values()) for p in (problem, other))
+            ratios[name].append(other_ms / own_ms)
+    return {name: statistics.median(values[1:]) for name, values in ratios.items()}
+
+
+def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
+    """Milliseconds of each part of one step, in the order of the loop."""
+    design = design.clone().requires_grad_()
+    parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
+    share = new_share(problem.scene)
+    parts = {name: ms * share for name, ms in parts.items()}
+    clock = _Clock(problem.device)
+    shown = problem.subject.shown(design)
+    parts[problem.subject.LOOK] = clock.lap()
+    pictures = expose(views, shown)
+    parts["light, piece and camera"] = clock.lap()
+    leaf, boxes, windows = pictures.detach().requires_grad_(), problem.boxes(conditions), windows_of(views)
+    losses = [
+        problem.losses(classifier, classifier.logits(leaf, boxes, windows), indices).mean()
+        for classifier, indices in zip(problem.classifiers, problem.indices, strict=True)
+    ]
+    loss = torch.stack(losses).mean()
+    parts["classifier forward"] = clock.lap()
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    parts["classifier backward"] = clock.lap()
+    cost = (pictures * gradient).sum() + problem.subject.penalty(design)
+    torch.autograd.grad(cost, design)
+    parts["design backward"] = clock.lap()
+    return parts
+
+
+def _see_ms(problem: Problem, shown: Shown, conditions: Conditions) -> tuple[dict[str, float], Views]:
+    """(milliseconds of the parts of `see`, the views)."""
+    side_px = problem.training_px
+    problem.see(None, conditions, 16)  # brings the places behind the object into memory, which a run does once
+    clock = _Clock(problem.device)
+    views = problem.see(shown, conditions, side_px)
+    whole = clock.lap()
+    problem.see(None, conditions, side_px)
+    parts = {"see: background": clock.lap()}
+    if problem.scene.HAS_OBJECT:
+        scene = needs_mesh(problem.scene)
+        poses, surface = scene.camera_from_world(conditions), problem.stage.object_surface
+        matrices = np.broadcast_to(scene.matrix_px((side_px, side_px)), (len(poses), 3, 3))
+        rasterize(
+            surface.vertices, surface.faces, cameras(poses, matrices, (side_px, side_px), problem.stage), near_mm(scene)
+        )
+        rasterizing = min(clock.lap(), parts["see: background"])
+        rest = parts.pop("see: background") - rasterizing
+        parts |= {"see: rasterize object": rasterizing, "see: object's texels, outlines, background": rest}
+    if views.piece is not None:
+        parts["see: piece's footprints"] = max(0.0, whole - sum(parts.values()))
+    return parts, views
+
+
+class _Clock:
+    """A stopwatch in milliseconds that waits for the device."""
+
+    def __init__(self, device: torch.device):
+        self._device, self._last = device, 0.0
+        self.lap()
+
+    def lap(self) -> float:
+        """Milliseconds since the last time, and begin again."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        before, self._last = self._last, time.perf_counter()
+        return 1000 * (self._last - before)

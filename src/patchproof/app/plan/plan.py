@@ -1,0 +1,201 @@
+"""`plan`: what of a scene is modeled, what is not, and why, each time with the figure that decided it.
+
+In: a scene file. Out: `Plan`: where the piece lies (searched for first, where the scene asks for that) and what a
+simpler or richer surface would do, the pixels that views have for design and markers, the error that each term of
+light, camera and renderer would leave, what chance leaves, and the cost of a step. All of it comes from the code that
+optimizes: a draft of a few steps is what the terms are measured with, because a classifier that a design says nothing
+to would miss none of them.
+
+Left out on purpose: deciding for the user. The plan says what can go; the scene file says what is modeled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from patchproof.app.plan.cost import Cost, measure_cost
+from patchproof.app.plan.errors import Terms, measure_terms
+from patchproof.app.plan.samples import Sample, sample_plan
+from patchproof.base.strict import Strict
+from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.places import Place, choose_place
+from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.scene import PieceScene, load_scene, needs_piece
+from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
+
+TERM_VIEWS = 16
+DRAFT_VIEWS = 120  # that the draft is trained on
+_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
+
+
+class Surface(Strict):
+    """Where the piece lies. `other` is what `patch.bend` the other way round would do."""
+
+    family: str
+    size_mm: tuple[float, float]
+    gap_mm: float | None = None
+    gap_mean_mm: float | None = None
+    overhang_share: float | None = None
+    stretch: float | None = None
+    reason: str
+    other: str | None = None
+
+
+class Resolution(Strict):
+    """Pixels per millimeter at the 5 % and 95 % points of the views, and the design's own; null where unknown."""
+
+    network_px: int
+    photo_px: tuple[int, int]
+    px_per_mm_network: tuple[float, float]
+    px_per_mm_photo: tuple[float, float]
+    closest_px_per_mm: float  # at the network's size, in the closest view that the settings allow
+    design_px: tuple[int, int] | None  # None of textures, which keep their own sizes
+    printed_px: tuple[int, int] | None
+    printed_px_per_mm: float | None
+    texels: int
+    texels_per_px: float  # along a side, in the closest view
+
+
+class Markers(Strict):
+    """Markers needed by the rule (PX_PER_MODULE in READABLE_SHARE of the views) and printed."""
+
+    needed_mm: float
+    printed_mm: float
+    unreadable_share: float
+
+
+class Draft(Strict):
+    """The design that terms are measured with: the loop's own after `steps` steps, and the rate it has there."""
+
+    steps: int
+    rate: float
+
+
+class Geometry(Strict):
+    """What needs no design: known in seconds, unless a place is searched for."""
+
+    scene: str
+    kind: str
+    target: str
+    models: tuple[str, ...]
+    place: Place | None  # the search for it, where the scene asks for one
+    surface: Surface
+    resolution: Resolution
+    markers: Markers | None
+    warnings: tuple[str, ...]
+
+
+class Plan(Geometry):
+    """Everything that `plan` found out."""
+
+    draft: Draft
+    terms: Terms
+    samples: tuple[Sample, ...]
+    omitted: tuple[str, ...]
+    cost: Cost | None
+
+
+def plan_geometry(
+    scene_path: str | Path,
+    *,
+    device: str = "cpu",
+    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> tuple[Geometry, Problem]:
+    """How the piece of a scene lies and what views show of it, and the problem that a plan goes on with."""
+    scene, place = load_scene(scene_path), None
+    if isinstance(scene, OpenScene):
+        place = choose_place(scene, device=device, on_pass=partial(on_stage, "place"))
+        scene = scene.at(place.at, place.spin_deg)
+    problem, target = set_problem(scene, device), scene.settings.target
+    _, sentence = scene.other_surface()
+    geometry = Geometry(
+        scene=Path(scene_path).name,
+        kind=scene.description(),
+        target=f"{target.goal} {target.label}",
+        models=tuple(classifier.name for classifier in problem.classifiers),
+        place=place,
+        surface=Surface(**scene.lies(), other=sentence),
+        resolution=resolution_plan(problem),
+        markers=marker_plan(needs_piece(scene)) if scene.HAS_PIECE else None,
+        warnings=scene.warnings,
+    )
+    return geometry, problem
+
+
+def measured_plan(
+    geometry: Geometry,
+    problem: Problem,
+    *,
+    timing: bool = True,
+    views: int = TERM_VIEWS,
+    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> Plan:
+    """The rest of a plan: a draft of the design, the terms and the cost."""
+    scene = problem.scene
+    other, _ = scene.other_surface()
+    design, draft = _draft(problem, on_stage)
+    conditions = scene.draw("select", views)
+    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(on_stage, "terms"))
+    return Plan(
+        **dict(geometry),
+        draft=draft,
+        terms=terms,
+        samples=sample_plan(draft.rate, terms.threshold),
+        omitted=scene.OMITTED,
+        cost=measure_cost(problem, design, partial(on_stage, "cost")) if timing else None,
+    )
+
+
+def resolution_plan(problem: Problem) -> Resolution:
+    """What views resolve of the design."""
+    scene, grid = problem.scene, problem.subject.grid
+    network_px = max(classifier.input_px for classifier in problem.classifiers)
+    closest = scene.closest_px_per_mm((network_px, network_px))
+    return Resolution(
+        network_px=network_px,
+        photo_px=scene.photo_px,
+        px_per_mm_network=_quantiles(scene.px_per_mm((network_px, network_px))),
+        px_per_mm_photo=_quantiles(scene.px_per_mm(scene.photo_px)),
+        closest_px_per_mm=closest,
+        design_px=grid.design_px,
+        printed_px=grid.printed_px,
+        printed_px_per_mm=grid.printed_px_per_mm,
+        texels=grid.texels,
+        texels_per_px=grid.texels_per_mm / closest,
+    )
+
+
+def marker_plan(scene: PieceScene) -> Markers:
+    """The marker rule on this scene's views."""
+    px_per_mm = np.quantile(scene.px_per_mm(scene.photo_px, shorter=True), 1 - READABLE_SHARE)
+    return Markers(
+        needed_mm=max(MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
+        printed_mm=scene.piece.marker_mm,
+        unreadable_share=scene.unreadable_share,
+    )
+
+
+def _quantiles(values: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(values, [1 - READABLE_SHARE, READABLE_SHARE])
+    return float(low), float(high)
+
+
+def _draft(problem: Problem, on_stage: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
+    """The loop's design after a few steps, in 8-bit colors, tried on the selection set."""
+    settings = problem.scene.settings.optimize
+    count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
+    state, rate = start(problem), None
+    for step in steps(problem.trained_by(settings.changed(steps=count)), state):
+        state, rate = step.state, step.select_rate
+        on_stage("draft", state.number, count)
+    assert rate is not None  # the last step ends with a selection
+    return from_pixels(as_pixels(state.design), problem.device), Draft(steps=count, rate=rate)

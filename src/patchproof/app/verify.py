@@ -1,0 +1,187 @@
+"""Verify: photographs and a manifest in, a report out.
+
+In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
+report.html, pictures, coco.json with the piece's and a detected object's place, and photos.jsonl, one line per finished
+photograph, from which `resume` goes on. This joins what must not know each other: the judge, its networks and the page.
+The promise's primary network always judges, whatever others are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.input import is_file
+from patchproof.base.output import check_folder, write_whole
+from patchproof.base.strict import Refused
+from patchproof.channel.lens import Camera, load_camera
+from patchproof.channel.printer import load_printer
+from patchproof.classifier.detector import Detector, at_score
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.network import Classifier
+from patchproof.evidence.batch import WITH_PICTURES
+from patchproof.evidence.boxes import from_square, given_boxes
+from patchproof.evidence.classify import Box
+from patchproof.evidence.journal import file_sha256
+from patchproof.evidence.results import Origin, Report
+from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.task import LEDGER_PHOTOS, Options
+from patchproof.optimizer.run import Run, load_run
+from patchproof.report.coco import PATCH, Labeled, coco_json
+from patchproof.report.images import save_pictures, stem_of
+from patchproof.report.results import versions_of
+from patchproof.report.write import write_report
+from patchproof.reprint.retake import retaker
+from patchproof.sheets.manifest import Manifest, load_manifest
+
+_JOURNAL = "photos.jsonl"
+OWN = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _JOURNAL)
+_LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
+
+
+def verify_photos(
+    photos: str | Path,
+    sheet: str | Path,
+    out: str | Path,
+    *,
+    models: Sequence[str | Classifier] | None = None,
+    controls: str | Path | None = None,
+    scan_dpi: float | None = None,
+    ruler_mm: tuple[float, float] | None = None,
+    ledger_photos: int = LEDGER_PHOTOS,
+    camera: str | None = None,
+    boxes: str | Path | None = None,
+    run: str | Path | Run | None = None,
+    jobs: int = 1,
+    cluster: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    on_photo: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
+
+    `models` are names, or classifiers in memory; a network of the sheet that is code (`module:`) is run only where it
+    is one of them. `camera` is a camera file's name or path. Model and printer names are looked up from the manifest's
+    folder, then as the scene's were. For detectors, `boxes` is COCO JSON with the object's box in photographs whose
+    sheet does not tell it, or tells it wrongly. With the `run` that the sheet was made from, each photograph gets a
+    forecast of its own. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are
+    new, or differ, are measured.
+    """
+    out, manifest = Path(out), load_manifest(sheet)
+    _check_out(out, resume, overwrite)
+    options = replace(
+        options_of(sheet, manifest, models, camera),
+        scan_dpi=scan_dpi,
+        ruler_mm=ruler_mm,
+        controls=controls,
+        ledger_photos=ledger_photos,
+    )
+    if boxes is not None:
+        options = replace(options, boxes=_drawn(boxes, manifest, options))
+    forecast = None if run is None else retaker(run if isinstance(run, Run) else load_run(run), manifest)
+    report = gather_evidence(
+        photos,
+        manifest,
+        options,
+        jobs=jobs,
+        cluster=cluster,
+        journal=out / _JOURNAL,
+        resume=resume,
+        forecast=forecast,
+        on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
+        progress=on_photo,
+    )
+    given = {
+        "scan_dpi": scan_dpi,
+        "ruler_mm": ruler_mm,
+        "camera": camera and Path(camera).name,
+        "boxes": boxes and Path(boxes).name,
+        "ledger_photos": ledger_photos,
+    }
+    hashes = {"manifest": file_sha256(Path(sheet))} | {
+        f"network {network.name}": network.sha256 for network in options.models
+    }
+    report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
+    _drop_pictures(out / "pictures", {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]})
+    ledger = report.ledger and report.ledger.model_dump()
+    write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
+    write_whole(out / "coco.json", _boxes(report, manifest, options.camera))
+    return report
+
+
+def _drawn(boxes: str | Path, manifest: Manifest, options: Options) -> dict[str, Box]:
+    """The boxes of a file, refused before networks that do not look at them."""
+    if manifest.promise is None or not any(isinstance(model, Detector) for model in options.models):
+        raise Refused("a detector, which alone looks at boxes", "none that judges these photographs", "leave boxes out")
+    return given_boxes(boxes, manifest.promise.target.label)
+
+
+def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
+    """The photographs, and where the piece lies in those that show it flat and straight, as COCO JSON; where detectors
+    were asked and it is known, the object's box, too: what of it lies in the middle square.
+    """
+    corners, photos = rect_corners(manifest.cut_mm), []
+    bends = camera is not None and camera.bends  # then places are those in the picture made straight
+    label = "object" if manifest.promise is None else manifest.promise.target.label
+    for entry in report.photos:
+        if entry.photo_px is None:
+            continue
+        px_from_mm = None if entry.geometry is None else entry.geometry.homography_px_from_mm
+        known = px_from_mm is not None and not bends and entry.status != "rejected"
+        outlines = {PATCH: apply_homography(np.array(px_from_mm), corners)} if known else {}
+        if entry.box is not None and not bends:
+            outlines[label] = from_square(entry.box, entry.photo_px)
+        photos.append(Labeled(entry.file, entry.photo_px, outlines))
+    return coco_json(photos, label, f"photographs of sheet {manifest.sheet_id}")
+
+
+def options_of(
+    sheet: str | Path, manifest: Manifest, models: Sequence[str | Classifier] | None = None, camera: str | None = None
+) -> Options:
+    """What photographs of the sheet are judged with and measured against; see `verify_photos`."""
+    base, promise = Path(sheet).resolve().parent, manifest.promise
+    least_score = None if promise is None else promise.models[0].least_score
+    return Options(
+        models=[at_score(load_classifier(network, base), least_score) for network in _networks(manifest, models)],
+        printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
+        camera=None if camera is None else load_camera(camera),
+    )
+
+
+def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
+    """Refuse a folder with files in it, unless they are ours and to be gone on from, or replaced."""
+    begun = is_file(out / _JOURNAL)
+    if resume:
+        check_folder(out, OWN if begun else (), overwrite=begun)
+        return
+    if begun and not overwrite and not is_file(out / "report.json"):
+        raise Refused("an empty or new folder", f"{out} with an unfinished verification", "add --resume or --overwrite")
+    check_folder(out, OWN, overwrite)
+
+
+def _drop_pictures(folder: Path, files: set[str]) -> None:
+    """Remove pictures of photographs that this report does not show."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name.rsplit(".", 2)[0] not in files:
+            path.unlink()
+
+
+def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
+    """The primary network first, then the others asked for, or else the promise's; of one given in memory, itself."""
+    given = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
+    if manifest.promise is None:
+        if not given:
+            got = f"the {manifest.kind} sheet {manifest.sheet_id}"
+            raise Refused("a sheet that promises something", got, "name --models")
+        return tuple(given.values())
+    promised = tuple(model.name for model in manifest.promise.models)
+    names = dict.fromkeys((promised[0], *(given or promised)))
+    code = next((name for name in names if name.startswith("module:") and name not in given), None)
+    if code is not None:
+        do = f"name it yourself if that code is yours (--models {code})"
+        raise Refused("a sheet whose networks are no code, which would be run", f"{code}", do)
+    return tuple(given.get(name, name) for name in names)

@@ -1,0 +1,1 @@
+"""Errors, strict settings, rates and sessions, color, geometry, files and workers: what every room stands on."""

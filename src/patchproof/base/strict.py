@@ -1,0 +1,199 @@
+"""The one way to refuse, strict settings, and where shipped data lies.
+
+In: a TOML file or a dictionary and a model of it; `${VAR}` in paths is expanded. Out: frozen settings, every value
+checked: an unknown key names the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three
+things in one sentence: what was expected, what was there, and what to do. The command line prints that sentence and
+exits with 1.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+
+class Refused(ValueError):
+    """What the tool will not do, in one sentence that says expected, got, do."""
+
+    def __init__(self, expected: str, got: str, do: str):
+        self._parts = expected, got, do
+        # what stands in a hostile file may be of any length
+        expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
+        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
+
+    def advised(self, advice: str) -> Refused:
+        """The same with more to do."""
+        expected, got, do = self._parts
+        return Refused(expected, got, f"{do.rstrip('.')}{advice}")
+
+    def __reduce__(self):
+        # exceptions are rebuilt from their message when they come back from another process; this one has three parts
+        return Refused, self._parts
+
+
+def shipped(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:
+    """A file of the data that travels with the program: inside the installed package, else in the checkout."""
+    package = Path(__file__).resolve().parents[1]
+    # an editable install keeps these folders at the top of the checkout, two levels up
+    roots = [root for root in (package / folder, package.parents[1] / folder) if root.is_dir()]
+    if not roots:
+        raise Refused(f"the folder {folder} beside the program", "none", "install patchproof again")
+    return roots[0].joinpath(*parts)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """A range as it is, when its low end is not above its high one."""
+    if pair[0] > pair[1]:
+        raise ValueError(f"must be [low, high] with low <= high, not [{pair[0]:g}, {pair[1]:g}]")
+    return pair
+
+
+Finite = Annotated[float, AfterValidator(_finite)]
+Positive = Annotated[Finite, Field(gt=0)]
+NotNegative = Annotated[Finite, Field(ge=0)]
+Share = Annotated[Finite, Field(ge=0, le=1)]
+Range = Annotated[tuple[Finite, Finite], AfterValidator(ordered)]
+ShareRange = Annotated[tuple[Share, Share], AfterValidator(ordered)]
+NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
+Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+# runs and sheets from before the spelling was one say "grey"
+Gray = BeforeValidator(lambda word: "gray" if word == "grey" else word)
+
+
+class Strict(BaseModel):
+    """Frozen settings that know all their keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def changed(self, **values: Any) -> Self:
+        """These settings with other values, checked like a file's; a dictionary changes single keys of a table:
+        `scene.changed(optimize={"steps": 10})`.
+        """
+        tables = {name: getattr(self, name) for name in type(self).model_fields}
+        for name, value in values.items():
+            table = tables.get(name)
+            tables[name] = table.changed(**value) if isinstance(table, Strict) and isinstance(value, dict) else value
+        return validated(type(self), tables, type(self).__name__)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """A TOML file as a dictionary; refused where it is missing, not text, or not TOML."""
+    path = Path(path)
+    if not os.path.isfile(path):  # of a path that no system takes, 300 letters or a NUL, this is false, too
+        raise Refused("a TOML file", f"no file at {path}", "check the path")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise Refused("a TOML file", f"{path} that cannot be read ({error})", "mend that line") from error
+
+
+def validated(model: type[Model], data: Any, where: str) -> Model:
+    """`data` as `model`; the first thing wrong with it is refused by its key, with the nearest known key."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        # a misspelt key is also a missing one: the spelling says more
+        first = min(error.errors(), key=lambda error: error["type"] != "extra_forbidden")
+        raise _explain(model, first, where) from error
+
+
+# a network's name up to the file in it, and that file
+NETWORK_FILE = re.compile(r"(file:|clip:[^@:]+@|(?:torchvision|timm):[^@:]+@(?=.+\.safetensors$))(.*)", re.DOTALL)
+
+
+def expand(text: str, base: Path) -> str:
+    """A path or model name with `${VAR}` expanded and, where it names a file, relative to `base`."""
+
+    def variable(match: re.Match) -> str:
+        if match[1] not in os.environ:
+            raise Refused(f"the environment variable {match[1]}", "none", f"set {match[1]} or write the path out")
+        return os.environ[match[1]]
+
+    text = re.sub(r"\$\{(\w+)\}", variable, text)
+    if match := NETWORK_FILE.fullmatch(text):
+        return f"{match[1]}{base / match[2]}"  # an absolute path stays as it is
+    prefix, colon, _ = text.partition(":")
+    if (colon and (prefix in {"primitive", "torchvision", "timm", "clip", "module", "python"})) or text in (
+        "builtin",
+        "builtin-detector",
+    ):
+        return text
+    return str(base / text)
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`(did you mean "x"?)` where a known word is near, else the known words."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, 1, 0.5)
+    return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def within(low: float, high: float) -> AfterValidator:
+    """The check that a range lies in [low, high]."""
+    return AfterValidator(partial(_inside, low, high))
+
+
+def _inside(low: float, high: float, pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] < low or pair[1] > high:
+        raise ValueError(f"must lie within [{low:g}, {high:g}]")
+    return pair
+
+
+def _explain(model: type[BaseModel], error: ErrorDetails, where: str) -> Refused:
+    key = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        hint = nearest(str(error["loc"][-1]), _keys_at(model, error["loc"][:-1]))
+        return Refused(f"only known keys in {where}", f'"{key}"', hint)
+    if error["type"] == "missing":
+        return Refused(f'the key "{key}" in {where}', "none", f"add {key}")
+    value = str(error.get("input"))
+    value = value if len(value) < 80 else value[:77] + "..."
+    reason = error["msg"].removeprefix("Value error, ").rstrip(".")
+    reason = reason[0].lower() + reason[1:]
+    if not key:  # tables that do not go together
+        return Refused(f"settings in {where} that go together", "others", reason)
+    return Refused(
+        f'a usable "{key}" in {where}', value, f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
+    )
+
+
+def _keys_at(model: Any, location: tuple) -> Iterable[str]:
+    """The known keys of the table at a location, through lists, dictionaries and optional tables."""
+    for part in location:
+        if part in model.model_fields:  # else an index or a dictionary's own key
+            model = next(models_in(model.model_fields[part].annotation), model)
+    return model.model_fields
+
+
+def models_in(hint: Any) -> Iterator[type[BaseModel]]:
+    """The tables that a type speaks of."""
+    if isinstance(hint, type) and issubclass(hint, BaseModel):
+        yield hint
+    for inner in get_args(hint):
+        yield from models_in(inner)

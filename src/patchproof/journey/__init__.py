@@ -1,1 +1,0 @@
-"""Verification of photographs, and the demo that goes the whole way."""

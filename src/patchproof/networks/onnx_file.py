@@ -1,0 +1,265 @@
+"""`file:NAME.onnx`: an ONNX file that nobody vouches for, read without onnx.
+
+In: its bytes, and a way to those of NAME.onnx.data, where exporters put large weights. Out: a Program of numbered
+steps (graph.py), and the batches that it takes; Unwanted where there is anything else in it. Nothing of the file is
+executed, and no text of it becomes a path: where a weight's "location" points is not looked at.
+Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
+weights, opsets before 13, of which onnx.version_converter makes newer ones.
+
+Source: github.com/onnx/onnx, onnx.proto (IR version 13).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.networks.archive import MAX_DIMENSIONS, MAX_NUMBERS, Unwanted, quoted, whole
+from patchproof.networks.batches import MAX_BATCH
+from patchproof.networks.description import MAX_LIST
+from patchproof.networks.graph import Program
+from patchproof.networks.onnx_operators import DTYPES, OPERATORS
+from patchproof.networks.onnx_plain import Way, way_through
+from patchproof.networks.onnx_shapes import MAX_SIZES
+from patchproof.networks.protobuf import BYTES, FLOAT, INT, NEVER, TEXT, Schema, read_message
+from patchproof.networks.steps import Here, Step, Value, mark_spent
+
+OPSETS = (13, 28)
+MAX_SCALARS = 8  # fractions that stay on the CPU: a Resize has as many in its list of factors
+
+_ENTRY: Schema = {1: ("key", TEXT, False), 2: ("value", TEXT, False)}
+_TENSOR: Schema = {
+    1: ("dims", INT, True),
+    2: ("data_type", INT, False),
+    3: ("segment", NEVER, False),
+    4: ("floats", BYTES, True),
+    5: ("ints", INT, True),
+    6: ("strings", NEVER, False),
+    7: ("longs", INT, True),
+    8: ("name", TEXT, False),
+    9: ("raw", BYTES, False),
+    10: ("doubles", BYTES, True),
+    11: ("unsigned", NEVER, False),
+    13: ("external", _ENTRY, True),
+    14: ("place", INT, False),
+}
+_ATTRIBUTE: Schema = {
+    1: ("name", TEXT, False),
+    2: ("f", FLOAT, False),
+    3: ("i", INT, False),
+    4: ("s", TEXT, False),
+    5: ("t", _TENSOR, False),
+    6: ("a graph within the graph", NEVER, False),
+    7: ("floats", FLOAT, True),
+    8: ("ints", INT, True),
+    **{number: ("an attribute of an unusual kind", NEVER, True) for number in (9, 10, 11, 14, 15, 21, 22, 23)},
+}
+_NODE: Schema = {
+    1: ("input", TEXT, True),
+    2: ("output", TEXT, True),
+    4: ("op_type", TEXT, False),
+    5: ("attribute", _ATTRIBUTE, True),
+    7: ("domain", TEXT, False),
+    8: ("overload", NEVER, False),
+}
+_SIZE: Schema = {1: ("value", INT, False), 2: ("symbol", TEXT, False)}
+_TYPE: Schema = {1: ("tensor", {1: ("kind", INT, False), 2: ("shape", {1: ("dim", _SIZE, True)}, False)}, False)}
+_PLACE: Schema = {1: ("name", TEXT, False), 2: ("type", _TYPE, False)}
+_GRAPH: Schema = {
+    1: ("node", _NODE, True),
+    5: ("initializer", _TENSOR, True),
+    11: ("input", _PLACE, True),
+    12: ("output", {1: ("name", TEXT, False)}, True),
+    15: ("sparse weights", NEVER, True),
+}
+_MODEL: Schema = {
+    7: ("graph", _GRAPH, False),
+    8: ("opset", {1: ("domain", TEXT, False), 2: ("version", INT, False)}, True),
+    20: ("training steps", NEVER, True),
+    25: ("functions of its own", NEVER, True),
+}
+
+
+def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int, int]:
+    """The network, and the smallest and largest batch that it takes; `beside` reads NAME.onnx.data, once at most."""
+    model = read_message(stored, _MODEL)
+    versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
+    if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
+        raise Unwanted(f"opset {quoted(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
+    return _Reader(model["graph"], _Weights(beside)).read()
+
+
+_STANDARD = ("", "ai.onnx")
+
+
+class _Weights:
+    """Tensors from what describes them; of the bytes in the other file each is taken once at most."""
+
+    def __init__(self, beside: Callable[[], bytes]):
+        self.beside, self.data, self.taken, self.locations = beside, b"", 0, set()
+
+    def tensor(self, content: dict[str, Any]) -> Tensor:
+        """A tensor of its own memory."""
+        sizes = [whole(size, 0, MAX_NUMBERS) for size in content.get("dims", [])]
+        dtype = DTYPES.get(content.get("data_type", 0))
+        if dtype is None or len(sizes) > MAX_DIMENSIONS:
+            raise Unwanted(f"{quoted(content.get('name'))} of a type that is not supported")
+        if "ints" in content or "longs" in content:
+            values = torch.tensor(content.get("ints") or content["longs"], dtype=torch.int64).to(dtype)
+            if dtype.is_floating_point:
+                raise Unwanted("bits of fractions in a list of integers")
+        else:
+            values = _from_bytes(self._bytes(content), dtype)
+        if values.numel() != math.prod(sizes):
+            raise Unwanted(f"{values.numel()} numbers in {quoted(content.get('name'))} of the shape {quoted(sizes)}")
+        return values.reshape(sizes)
+
+    def _bytes(self, content: dict[str, Any]) -> Any:
+        if not content.get("place", 0):
+            lists = content.get("floats", []) if content["data_type"] == 1 else content.get("doubles", [])
+            return content["raw"] if "raw" in content else b"".join(lists)
+        where = {entry["key"]: entry["value"] for entry in content["external"]}
+        self.locations.add(where["location"])
+        if len(self.locations) > 1:
+            raise Unwanted("weights in more than one other file")
+        self.data = self.data or self.beside()
+        offset, size = (whole(int(where.get(key, default)), 0, len(self.data)) for key, default in
+                        (("offset", 0), ("length", len(self.data))))  # fmt: skip
+        part = memoryview(self.data)[offset : offset + size]
+        self.taken += len(part)
+        if self.taken > len(self.data):
+            raise Unwanted("weights that overlap")
+        return part
+
+
+def _from_bytes(stored: Any, dtype: torch.dtype) -> Tensor:
+    """Little-endian numbers, copied: torch's own memory is aligned for vector units."""
+    if len(stored) % dtype.itemsize:
+        raise Unwanted("weights that end within a number")
+    values = torch.empty(len(stored), dtype=torch.uint8)
+    values.numpy()[:] = np.frombuffer(stored, np.uint8)
+    return values != 0 if dtype == torch.bool else values.view(dtype)
+
+
+class _Reader:
+    """The names of one file, each of them once, and what they stand for from then on: a number, or a small constant."""
+
+    def __init__(self, graph: dict[str, Any], weights: _Weights):
+        self.graph, self.nodes = graph, graph.get("node", [])
+        self.weights: list[Tensor] = []
+        self.count = 0  # of values with a number
+        self.of_four = set[int]()  # numbers of those with four dimensions, as far as that is known
+        self.values: dict[str, Value | Tensor | None] = {"": None}  # an input that is left out
+        self.tensor = weights.tensor
+
+    def read(self) -> tuple[Program, int, int]:
+        """See read_onnx."""
+        for initializer in self.graph.get("initializer", []):
+            self._constant(initializer.get("name", ""), self.tensor(initializer))
+        given = [place for place in self.graph["input"] if place["name"] not in self.values]
+        for node in self.nodes:
+            if node["op_type"] == "Constant":
+                self._constant(node["output"][0], self._attribute(node["attribute"][0]))
+        if len(given) != 1:
+            raise Unwanted(f"{len(given)} inputs, not one of N×3×S×S")
+        low, high, sizes = _shape(given[0]["type"]["tensor"])
+        self.count = len(self.weights)
+        self.of_four = {number for number, weight in enumerate(self.weights) if weight.dim() == 4}
+        self._new(given[0]["name"])
+        steps = [step for node in self.nodes for step in self._steps(node)]
+        outputs = [self._known(place["name"]) for place in self.graph["output"]]
+        if len(outputs) != 1 or not isinstance(outputs[0], Value):
+            raise Unwanted(f"{len(outputs)} outputs, not one of N×K")
+        mark_spent(steps, {*range(len(self.weights) + 1), outputs[0].number})
+        return Program(self.weights, steps, outputs[0].number, sizes), low, high
+
+    def _constant(self, name: str, value: Any) -> None:
+        """A weight has a number and moves with the network; lists of sizes and factors stay on the CPU."""
+        tensor = value if isinstance(value, Tensor) else torch.tensor(value)
+        if tensor.numel() > (MAX_SCALARS if tensor.is_floating_point() else MAX_SIZES):
+            self.weights.append(tensor)
+            self._name(name, Value(len(self.weights) - 1))
+        else:
+            self._name(name, tensor)
+
+    def _name(self, name: str, value: Value | Tensor | None) -> None:
+        if name in self.values:
+            raise Unwanted(f"{quoted(name)} twice, or no name")
+        self.values[name] = value
+
+    def _new(self, name: str) -> int:
+        self._name(name, Value(self.count))
+        self.count += 1
+        return self.count - 1
+
+    def _known(self, name: str) -> Value | Tensor | None:
+        if name not in self.values:
+            raise Unwanted(f"{quoted(name)} before it is computed")
+        return self.values[name]
+
+    def _steps(self, node: dict[str, Any]) -> list[Step]:
+        """What computes a node: nothing where it is a constant or another name for one."""
+        name, domain, outputs = node["op_type"], node.get("domain", ""), node["output"]
+        if domain not in _STANDARD or name not in (*OPERATORS, "Constant", "Identity"):
+            raise Unwanted(f"the operator {quoted(f'{domain}.{name}'.lstrip('.'))}")
+        several = name == "Split"
+        if len(outputs) != 1 and not several:
+            raise Unwanted(f"{len(outputs)} results of {name}, where only the first is supported")
+        inputs = [self._known(word) for word in node.get("input", [])]
+        if name == "Constant":
+            return []
+        if name == "Identity":
+            self._name(outputs[0], *inputs)
+            return []
+        operator, attributes = OPERATORS[name], self._attributes(node)
+        if several and len(inputs) == 1:
+            attributes.setdefault("num_outputs", len(outputs))
+        operator.check(inputs, attributes)
+        if way := way_through(name, inputs, attributes, self.of_four):
+            return self._along(way, name, inputs[0], outputs[0])
+        return [Step(operator, [Here, *inputs], attributes, [self._new(word) for word in outputs], several, [])]
+
+    def _along(self, way: Way, name: str, value: Any, output: str) -> list[Step]:
+        steps, known = [], name == "Conv" or value.number in self.of_four
+        for compute, others in way:
+            steps.append(Step(compute, [value, *others], {}, [self.count], False, []))
+            value, self.count = Value(self.count), self.count + 1
+        self._name(output, value)
+        self.of_four |= {value.number} if known else set()
+        return steps
+
+    def _attributes(self, node: dict[str, Any]) -> dict[str, Any]:
+        listed = [(attribute["name"], self._attribute(attribute)) for attribute in node.get("attribute", [])]
+        if len(dict(listed)) != len(listed):
+            raise Unwanted("an attribute twice")
+        return dict(listed)
+
+    def _attribute(self, attribute: dict[str, Any]) -> Any:
+        """A plain number, word or list of numbers, or a tensor."""
+        kinds = attribute.keys() - {"name"}
+        if len(kinds) != 1:
+            raise Unwanted(f"the attribute {quoted(attribute.get('name'))} of {len(kinds)} kinds")
+        kind = kinds.pop()
+        content = attribute[kind]
+        if kind == "t":
+            return self.tensor(content)
+        if isinstance(content, list) and len(content) > MAX_LIST:
+            raise Unwanted(f"a list of more than {MAX_LIST} items")
+        return content
+
+
+def _shape(tensor: dict[str, Any]) -> tuple[int, int, list[int | None]]:
+    """The smallest and largest batch, and the input's sizes, None where any is allowed."""
+    if tensor["kind"] != 1:
+        raise Unwanted("an input that is not float32")
+    sizes = [size.get("value") for size in tensor["shape"].get("dim", [])]
+    if len(sizes) != 4:
+        raise Unwanted(f"an input of {len(sizes)} dimensions, not N×3×S×S")
+    fixed = [None if size is None else whole(size, 1, 1 << 16) for size in sizes]
+    low, high = (1, MAX_BATCH) if fixed[0] is None else (whole(fixed[0], 1, MAX_BATCH),) * 2
+    return low, high, [None, *fixed[1:]]

@@ -1,0 +1,272 @@
+"""What an ONNX file may compute: the standard's operators of image classifiers, written with torch.
+
+In: a name as the file writes it. Out: a function of tensors. As in operators.py none of them reads or writes anything
+but its tensors or draws random numbers, and a name that is not in the table leads nowhere. In a signature inputs before
+`/` are data, those after it sizes or axes, and these and what follows `*` may be attributes of that name. Data are sent
+to the pictures' device, which has no memory when graph.py tries the steps. Only for the operators in `_ON_SIZES`, whose
+results their inputs bound, a few numbers on the CPU stay there: so sizes can be reckoned with.
+To allow one more, add a line to `_TABLE`, of what torch computes alike (test_classifier_onnx.py holds it against onnx).
+Left out on purpose: control flow, sequences, text, random numbers, quantized and recurrent networks, boxes.
+
+Source: onnx.ai/onnx/operators, opsets 13 to 28; where two differ, both forms are read.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+import patchproof.networks.onnx_shapes as shapes
+from patchproof.networks.archive import Unwanted
+from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
+
+# the numbers of TensorProto.DataType
+DTYPES = {
+    1: torch.float32,
+    2: torch.uint8,
+    3: torch.int8,
+    5: torch.int16,
+    6: torch.int32,
+    7: torch.int64,
+    9: torch.bool,
+    10: torch.float16,
+    11: torch.float64,
+    16: torch.bfloat16,
+}
+_ON_SIZES = frozenset(
+    "Abs Add And Cast Ceil Concat ConstantOfShape Div Equal Expand Floor Gather Greater GreaterOrEqual Less Mod Mul "
+    "LessOrEqual Neg Not Or Pow Range Reciprocal ReduceProd Reshape ScatterND Slice Split Sqrt Squeeze Sub Transpose "
+    "Unsqueeze Where".split()
+)
+
+
+class Operator:
+    """A line of the table, as a function of the pictures' device and its inputs."""
+
+    def __init__(self, name: str, compute: Callable[..., Any]):
+        self.compute, self.on_sizes, self.signature = compute, name in _ON_SIZES, inspect.signature(compute)
+        kinds = [parameter.kind for parameter in self.signature.parameters.values()]
+        many = inspect.Parameter.VAR_POSITIONAL in kinds
+        self.data = None if many else kinds.count(inspect.Parameter.POSITIONAL_ONLY)
+        self.makes = "device" in self.signature.parameters
+
+    def check(self, inputs: Sequence[Any], attributes: dict[str, Any]) -> None:
+        """Unwanted where it takes other inputs or attributes; what they hold is the operator's own to check."""
+        if "device" in attributes:
+            raise Unwanted("an attribute 'device'")
+        try:
+            self.signature.bind(*inputs, **attributes, **({"device": None} if self.makes else {}))
+        except TypeError as error:
+            raise Unwanted(f"other inputs or attributes than are supported ({error})") from error
+
+    def __call__(self, device: torch.device, *inputs: Any, **attributes: Any) -> Any:
+        """Its result, a tensor or a tuple of them; inputs that are left out are None."""
+        if self.makes:
+            attributes["device"] = device
+        data, rest = inputs[: self.data], inputs[len(inputs) if self.data is None else self.data :]
+        if self.on_sizes and all(x is None or (x.device.type == "cpu" and x.numel() <= MAX_SIZES) for x in data):
+            result = self.compute(*inputs, **attributes)
+            return result.to(device) if isinstance(result, Tensor) and result.numel() > MAX_SIZES else result
+        return self.compute(*(x if x is None else x.to(device) for x in data), *rest, **attributes)
+
+
+# --- windows and products ---
+
+
+def _padded(x: Tensor, pads: Sequence[int] | None, most: Sequence[float], fill: float) -> tuple[Tensor, list[int]]:
+    """The input and the padding that is left to torch, which pads alike before and after, pools by half a window."""
+    n = x.dim() - 2
+    before, after = list(pads or [0] * n)[:n], list(pads or [0] * n)[-n:]
+    if before == after and all(pad <= limit for pad, limit in zip(before, most, strict=True)):
+        return x, before
+    return F.pad(x, shapes.in_torchs_order(list(zip(before, after, strict=True))), value=fill), [0] * n
+
+
+def _check_auto_pad(auto_pad: str) -> None:
+    if auto_pad not in ("NOTSET", "VALID"):
+        raise ValueError("paddings that follow from the size (auto_pad)")
+
+
+def _conv(x, w, b=None, /, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape=None, pads=None, strides=None):
+    _check_auto_pad(auto_pad)
+    ones = [1] * (x.dim() - 2)
+    x, padding = _padded(x, pads, [math.inf] * len(ones), 0.0)
+    return torch.convolution(x, w, b, strides or ones, padding, dilations or ones, False, [0] * len(ones), group)
+
+
+def _max_pool(
+    x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, dilations=None, pads=None, storage_order=0, strides=None
+):
+    _check_auto_pad(auto_pad)
+    x, padding = _padded(x, pads, [size // 2 for size in kernel_shape], -math.inf)
+    return F.max_pool2d(x, kernel_shape, strides or [1, 1], padding, dilations or [1, 1], bool(ceil_mode))
+
+
+def _average_pool(
+    x, /, *, kernel_shape, auto_pad="NOTSET", ceil_mode=0, count_include_pad=0, dilations=None, pads=None, strides=None
+):
+    _check_auto_pad(auto_pad)
+    padded, padding = _padded(x, pads, [size // 2 for size in kernel_shape], 0.0)
+    if set(dilations or [1]) != {1} or (padded is not x and (ceil_mode or not count_include_pad)):
+        raise ValueError("an AveragePool with holes, or with other paddings before and after")
+    return F.avg_pool2d(padded, kernel_shape, strides or [1, 1], padding, bool(ceil_mode), bool(count_include_pad))
+
+
+def _gemm(a, b, c=None, /, *, alpha=1.0, beta=1.0, transA=0, transB=0):
+    a, b = a.mT if transA else a, b.mT if transB else b
+    return alpha * (a @ b) if c is None else torch.addmm(c, a, b, beta=beta, alpha=alpha)
+
+
+def _einsum(*tensors, equation):
+    return torch.einsum(equation, *tensors)
+
+
+# --- normalization ---
+
+
+def _batch_norm(x, scale, b, mean, var, /, *, epsilon=1e-5, momentum=0.9, training_mode=0):
+    if training_mode:
+        raise ValueError("a BatchNormalization in training mode")
+    return F.batch_norm(x, mean, var, scale, b, False, 0.0, epsilon)
+
+
+def _layer_norm(x, scale, b=None, /, *, axis=-1, epsilon=1e-5, stash_type=1):
+    return F.layer_norm(x, x.shape[axis:], scale, b, epsilon)
+
+
+def _instance_norm(x, scale, b, /, *, epsilon=1e-5):
+    return F.instance_norm(x, weight=scale, bias=b, eps=epsilon)
+
+
+def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5, stash_type=1):
+    each = x.shape[1] // len(scale)  # before opset 21 there is one for each group
+    return F.group_norm(x, num_groups, scale.repeat_interleave(each), b.repeat_interleave(each), epsilon)
+
+
+def _dropout(x, /, ratio=None, training_mode=None, *, seed=None):
+    if any(numbers(training_mode)):
+        raise ValueError("a Dropout in training mode")
+    return x
+
+
+# --- activations and arithmetic ---
+
+
+def _clip(x, low=None, high=None, /):
+    return x if low is None and high is None else torch.clamp(x, low, high)
+
+
+def _one(compute: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+    return lambda x, /: compute(x)
+
+
+def _two(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+    return lambda a, b, /: compute(a, b)
+
+
+def _several(compute: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+    return lambda *tensors: functools.reduce(compute, tensors)
+
+
+def _along(compute: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A sum or an extreme along axes, along all of them where none are given."""
+
+    def computed(x, /, axes=None, *, keepdims=1, noop_with_empty_axes=0):
+        along = numbers(axes)
+        if not along and noop_with_empty_axes:
+            return x
+        return compute(x, along or list(range(x.dim())), keepdim=bool(keepdims))
+
+    return computed
+
+
+def _product(x: Tensor, along: list[int], keepdim: bool) -> Tensor:
+    for axis in along:
+        x = x.prod(axis, keepdim=True)
+    return x if keepdim else x.squeeze(along)
+
+
+_TABLE: dict[str, Callable[..., Any]] = {
+    # of one input
+    **{name: _one(getattr(torch, name.lower())) for name in "Abs Ceil Cos Erf Exp Floor Log Neg Reciprocal".split()},
+    **{name: _one(getattr(torch, name.lower())) for name in "Relu Sigmoid Sign Sin Sqrt Tanh".split()},
+    "Not": _one(torch.logical_not),
+    "IsNaN": _one(torch.isnan),
+    "HardSwish": _one(F.hardswish),
+    "Mish": _one(F.mish),
+    "Softplus": _one(F.softplus),
+    "GlobalAveragePool": _one(lambda x: x.mean(tuple(range(2, x.dim())), keepdim=True)),
+    "GlobalMaxPool": _one(lambda x: x.amax(tuple(range(2, x.dim())), keepdim=True)),
+    "Elu": lambda x, /, *, alpha=1.0: F.elu(x, alpha),
+    "LeakyRelu": lambda x, /, *, alpha=0.01: F.leaky_relu(x, alpha),
+    "HardSigmoid": lambda x, /, *, alpha=0.2, beta=0.5: (alpha * x + beta).clamp(0, 1),
+    "Gelu": lambda x, /, *, approximate="none": F.gelu(x, approximate=approximate),
+    "Softmax": lambda x, /, *, axis=-1: x.softmax(axis),
+    "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
+    "Cast": lambda x, /, *, to, saturate=1: x.to(DTYPES[to]),
+    # of two or more
+    "Add": _two(torch.add),
+    "Sub": _two(torch.sub),
+    "Mul": _two(torch.mul),
+    "Div": _two(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
+    "Mod": lambda a, b, /, *, fmod=0: torch.fmod(a, b) if fmod else torch.remainder(a, b),
+    "Pow": _two(lambda x, y: torch.pow(x, y).to(x.dtype)),
+    "PRelu": _two(lambda x, slope: torch.where(x < 0, slope * x, x)),
+    "MatMul": _two(torch.matmul),
+    "Equal": _two(torch.eq),
+    "Greater": _two(torch.gt),
+    "GreaterOrEqual": _two(torch.ge),
+    "Less": _two(torch.lt),
+    "LessOrEqual": _two(torch.le),
+    "And": _two(torch.logical_and),
+    "Or": _two(torch.logical_or),
+    "Where": lambda condition, x, y, /: torch.where(condition, x, y),
+    "Clip": _clip,
+    "Max": _several(torch.maximum),
+    "Min": _several(torch.minimum),
+    "Sum": _several(torch.add),
+    "Gemm": _gemm,
+    "Einsum": _einsum,
+    # along axes
+    "ReduceMean": _along(torch.mean),
+    "ReduceSum": _along(torch.sum),
+    "ReduceMax": _along(torch.amax),
+    "ReduceMin": _along(torch.amin),
+    "ReduceProd": _along(_product),
+    "ReduceL2": _along(lambda x, along, keepdim: torch.linalg.vector_norm(x, 2, along, keepdim)),
+    # windows and norms
+    "Conv": _conv,
+    "MaxPool": _max_pool,
+    "AveragePool": _average_pool,
+    "BatchNormalization": _batch_norm,
+    "LayerNormalization": _layer_norm,
+    "GroupNormalization": _group_norm,
+    "InstanceNormalization": _instance_norm,
+    "Dropout": _dropout,
+    # shapes
+    "Reshape": shapes.reshape,
+    "Flatten": shapes.flatten,
+    "Squeeze": shapes.squeeze,
+    "Unsqueeze": shapes.unsqueeze,
+    "Transpose": shapes.transpose,
+    "Concat": shapes.concat,
+    "Split": shapes.split,
+    "Slice": shapes.cut,
+    "Gather": shapes.gather,
+    "ScatterND": shapes.scatter_nd,
+    "Expand": shapes.expand,
+    "Tile": shapes.tile,
+    "Pad": shapes.pad,
+    "Resize": shapes.resize,
+    "Shape": shapes.shape,
+    "Range": shapes.counted,
+    "ConstantOfShape": shapes.constant_of_shape,
+}
+OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}

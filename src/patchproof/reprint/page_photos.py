@@ -1,0 +1,201 @@
+"""Simulated photographs of a page that lies flat: any printer, uneven light, and the reprint's camera.
+
+In: a page as pixels, or a number of swatches; a printer as a function from sRGB to light; a seed. Out: a chart's
+manifest, pages as light, photographs as JPEG files. Charts are drawn here, too, not only written as PDFs, so that those
+of any size can be tried; light (ambient, sun and a lamp near the page), blur, noise, vignetting and clipping are those
+of `channel`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from patchproof.base import geometry
+from patchproof.base.color import codes_of, linear_from_srgb, photo_codes_of
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.output import image_bytes, image_pixels, new_folder
+from patchproof.channel.camera import develop
+from patchproof.channel.effects import Sensor
+from patchproof.channel.lens import Camera
+from patchproof.channel.light import Lamp, Lighting, irradiance
+from patchproof.channel.printer import load_printer
+from patchproof.photo.detect import DICTIONARY, cells_of
+from patchproof.photo.read import Photo
+from patchproof.reprint.hung_sheet import Hanging
+from patchproof.sheets.chart import chart_colors
+from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.piece import hash_order
+from patchproof.sheets.raster import page_count, page_pixels
+
+Shows = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
+
+PAGE_MM = (210.0, 148.0)
+PX_PER_MM = 8
+PHOTO_PX = (1600, 1200)
+MARKER_MM, _MARKERS_MM = 14.0, ((8.0, 8.0), (188.0, 8.0), (188.0, 126.0), (8.0, 126.0))
+_CHART_MM = (30.0, 34.0, 150.0, 84.0)
+_GAP_MM = 0.4
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph's file, and the light of bare paper in the middle of the page as its sensor saw it (3,)."""
+
+    file: bytes
+    paper: np.ndarray
+
+    @cached_property
+    def photo(self) -> Photo:
+        """The file as it is read."""
+        return Photo(image_pixels(self.file), None)
+
+
+def chart_manifest(count: int) -> Manifest:
+    """A small page with `count` swatches in the middle, its colors and their order as those of the printed sheets."""
+    x, y, width, height = _CHART_MM
+    columns = math.ceil(math.sqrt(count * width / height))
+    side = min(width / columns, height / math.ceil(count / columns))
+    cells = [(x + side * (i % columns), y + side * (i // columns)) for i in range(count)]
+    colors, order = chart_colors(count), hash_order(f"photographed {count}", count)
+    swatches = [
+        {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
+        for cell, index in zip(cells, order, strict=True)
+    ]
+    corners = [geometry.rect_corners((*at, MARKER_MM, MARKER_MM)).tolist() for at in _MARKERS_MM]
+    markers = [{"dictionary": DICTIONARY, "id": 7 + i, "corners_mm": c, "page": 1} for i, c in enumerate(corners)]
+    head = {"sheet_id": "CHART00000", "kind": "blank", "page_mm": PAGE_MM, "design": None, "promise": None}
+    where = {"cut_mm": (100.0, 6.0, 1.0, 1.0), "ruler_mm": (100.0, 100.0), "settings": {}}
+    return Manifest.model_validate(head | where | {"markers": markers, "chart": swatches})
+
+
+def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
+    """The page as light H×W×3 at `PX_PER_MM`, with some writing beside the chart, as sheets have."""
+    width, height = (round(side * PX_PER_MM) for side in manifest.page_mm)
+    page = np.full((height, width, 3), 255, np.uint8)
+    for marker, code in zip(manifest.markers, cells_of(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
+        side = round(MARKER_MM * PX_PER_MM)
+        _fill(
+            page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
+        )
+    for line, at in enumerate((14, 20, 26, 124, 131, 138)):
+        where = (30 * PX_PER_MM, at * PX_PER_MM)
+        cv2.putText(page, f"{line} what stands beside a chart is not white paper", where, 0, 0.9, (0, 0, 0), 2)
+    for swatch in manifest.chart:
+        _fill(page, swatch.rect_mm, codes_of(np.array(swatch.srgb)))
+    return page_light(page, shows)
+
+
+def page_light(page: np.ndarray, shows: Shows) -> np.ndarray:
+    """A page's uint8 H×W×3 as the light of its print, of bare paper 1; a tall page is turned as photographs lie."""
+    page = np.rot90(page) if page.shape[0] > page.shape[1] else page
+    white = shows(np.ones((1, 3)))
+    packed, index = np.unique(page.reshape(-1, 3) @ np.array([65536, 256, 1]), return_inverse=True)
+    colors = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1) / 255
+    return (shows(colors) / white)[index.reshape(-1)].reshape(page.shape).astype(np.float32)
+
+
+def reprint_pages(
+    pdf_path: str | Path, n: int, out: str | Path, how: Hanging, *, seed: int | None = None, overwrite: bool = False
+) -> None:
+    """Write n photographs of the pages of a PDF, in turn, lying flat: of pages that belong to no run, as blank ones,
+    charts and boards. `how` names their printer (without a name: coated) and the print's size.
+    """
+    printer = load_printer(how.printer or "coated")
+
+    def shows(colors: np.ndarray) -> np.ndarray:
+        sent = torch.tensor(colors.T[None, :, :, None], dtype=torch.float32)
+        return linear_from_srgb(printer.apply(sent)[0, :, :, 0].T.numpy())
+
+    with new_folder(out, ("photo_*.jpg",), overwrite) as folder:
+        pages = []
+        for number in range(page_count(pdf_path)):
+            light = page_light(page_pixels(pdf_path, number + 1, PX_PER_MM * MM_PER_INCH), shows)
+            pages.append(cv2.resize(light, None, fx=how.print_scale[0], fy=how.print_scale[1]))
+        for i in range(n):
+            shot = photograph_page(pages[i % len(pages)], (seed or 0) + i)
+            (folder / f"photo_{i + 1:04d}.jpg").write_bytes(shot.file)
+
+
+def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -> Shot:
+    """One photograph of a page lying flat, from above and a little from the side; all conditions follow the seed."""
+    rng = np.random.default_rng([seed, 4])
+    page_mm = np.array(page.shape[1::-1]) / PX_PER_MM
+    distance = rng.uniform(1.2, 1.55) * page_mm.max()
+    eye = geometry.orbit(rng.uniform(-25, 25), rng.uniform(-25, 25), (0, 0, -1.0), (0, -1.0, 0)) * distance
+    pose = geometry.look_at(eye, rng.uniform(-8, 8, 3) * [1, 1, 0], rng.uniform(-8, 8), (0, -1.0, 0))
+    flat = np.eye(4)
+    flat[:2, 3] = -page_mm / 2
+    px_from_mm = geometry.plane_homography(geometry.intrinsics(50, PHOTO_PX), pose, flat)
+    sources = _light(rng)
+    white_balance = 1 + rng.uniform(-0.15, 0.15, 3)
+    corners = geometry.rect_corners((0, 0, *page_mm))
+    at_middle, brightest = (_falling(at - page_mm / 2, sources) for at in (corners.mean(0)[None], corners))
+    exposure = rng.uniform(0.5, 0.85) / (brightest.max() * white_balance.max())
+    light = _light_in_picture(px_from_mm, page_mm / 2, sources)
+    raw = _warped(page, px_from_mm) * light[..., None]
+    sensor = Sensor(
+        vignetting=np.array([rng.uniform(0, 0.2)]),
+        blur_px=np.array([rng.uniform(0, 1)]),
+        exposure_ev=np.array([np.log2(exposure)]),
+        white_balance=white_balance[None],
+        noise=np.array([rng.uniform(0, 0.01)]),
+        noise_seed=np.array([seed]),
+        jpeg=np.array([rng.uniform(60, 95)]),
+    )
+    picture = torch.tensor(raw.transpose(2, 0, 1)[None], dtype=torch.float32)
+    codes = develop(picture, sensor, 1.0, jpeg=False, camera=camera)[0].permute(1, 2, 0).numpy().astype(float)
+    file = image_bytes(photo_codes_of(codes), "JPEG", {"quality": int(sensor.jpeg[0])})
+    return Shot(file, at_middle * exposure * white_balance)
+
+
+def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
+    x, y, w, h = (round(v * PX_PER_MM) for v in rect_mm)
+    page[y : y + h, x : x + w] = value[..., None] if value.ndim == 2 else value
+
+
+def _light(rng: np.random.Generator) -> Lighting:
+    """Ambient light, sun, and a lamp 300 to 600 mm away, so that one side of the page is up to twice as light."""
+
+    def on(*values) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32)
+
+    lamp = geometry.orbit(rng.uniform(-60, 60), rng.uniform(-60, 60), (0, 0, -1.0), (0, -1.0, 0)) * rng.uniform(
+        300, 600
+    )
+    toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), (0, 0, -1.0), (0, -1.0, 0))
+    near = Lamp(on(rng.uniform(0.2, 0.8)), on(np.linalg.norm(lamp)), torch.tensor(lamp[None], dtype=torch.float32))
+    direction = torch.tensor(toward[None], dtype=torch.float32)
+    return Lighting(on(rng.uniform(0.3, 0.7)), on(rng.uniform(0, 0.5)), direction, lamp=near)
+
+
+def _falling(from_middle_mm: np.ndarray, sources: Lighting) -> np.ndarray:
+    """Light N on points N×2 of the page's plane."""
+    position = torch.tensor(np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))]), dtype=torch.float32)
+    normal, view = torch.tensor([[0.0, 0.0, -1.0]]).expand_as(position), torch.zeros(len(position), dtype=torch.long)
+    return irradiance(normal, view, sources, position).numpy().astype(float)
+
+
+def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: Lighting) -> np.ndarray:
+    """Light H×W on the page's plane as the photograph sees it; computed at every 8th pixel, since it is smooth."""
+    width, height = PHOTO_PX
+    x, y = np.meshgrid(np.arange(4.0, width, 8), np.arange(4.0, height, 8))
+    at = geometry.apply_homography(np.linalg.inv(px_from_mm), np.stack([x.ravel(), y.ravel()], 1))
+    return cv2.resize(_falling(at - middle_mm, sources).reshape(x.shape), PHOTO_PX, interpolation=cv2.INTER_LINEAR)
+
+
+def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
+    """The page in the picture's pixels before a gray table, averaged over pixels."""
+    mm_from_index = np.array([[1 / PX_PER_MM, 0, 0.5 / PX_PER_MM], [0, 1 / PX_PER_MM, 0.5 / PX_PER_MM], [0, 0, 1]])
+    index_from_px = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
+    finer = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
+    soft = cv2.GaussianBlur(page, (0, 0), 0.35 * float(finer))  # a pixel's own width, before it is sampled once
+    matrix = index_from_px @ px_from_mm @ mm_from_index
+    return cv2.warpPerspective(soft, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))

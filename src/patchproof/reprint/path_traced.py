@@ -1,0 +1,264 @@
+"""Photographs by a renderer that is not ours: Mitsuba 3 traces paths through the same scene under the same conditions.
+
+In: a stage, the printed piece (or none) and one view's conditions. Out: a picture, as `render.photograph` gives. What
+our renderer leaves out is here: shadows that are cast, with soft edges, light that goes back and forth between paper,
+object and what stands beside it, and depth of field. How large the light and the lens are follows from `draw_optics`,
+since conditions do not say. What stays ours: the printer, the camera behind its lens (`channel.camera`), and the
+picture in the background, which lights nothing. Levels follow `channel.light`: a surface with nothing around it comes
+out alike.
+
+Left out on purpose: colored light, transparency, scenes made of pictures.
+
+Source: Jakob et al., Mitsuba 3 renderer, 2022.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.base import geometry
+from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
+from patchproof.base.strict import Refused
+from patchproof.channel.camera import develop
+from patchproof.channel.effects import Light, Print
+from patchproof.channel.lens import Frame, distorted
+from patchproof.channel.light import PAPER_REFLECTANCE
+from patchproof.channel.printer import misregistered, vary
+from patchproof.mesh.mesh import Mesh
+from patchproof.render.photograph import PAPER_BACK_LINEAR
+from patchproof.render.pixels import PiecePicture
+from patchproof.render.stage import Stage
+from patchproof.render.views import backgrounds, lens_frame
+from patchproof.reprint.traced_light import lights
+from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.scene import needs_mesh, needs_patch, needs_piece
+
+LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
+APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
+PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels
+MOST_BOUNCES = 4  # of a path, the light included: paper lit by what paper lights
+_SQUARE = 1e-4  # how far a pixel's sides may differ
+# Older ones end the whole process: they cannot compile the minimum that Dr.Jit asks for.
+_FIRST_LLVM = 17
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What conditions do not say: the directional light's radius as an angle, and the lens's diameter."""
+
+    light_radius_deg: float
+    aperture_mm: float
+
+
+def draw_optics(conditions: Conditions) -> Optics:
+    """One view's light and lens, evenly drawn; they follow from the view's noise seed."""
+    u = np.random.default_rng([int(conditions.sensor.noise_seed[0]), 1]).random(2)
+    ends = zip((LIGHT_RADIUS_DEG, APERTURE_MM), u, strict=True)
+    return Optics(*(float(low + (high - low) * share) for (low, high), share in ends))
+
+
+def photograph_traced(
+    stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics | None = None
+) -> Tensor:
+    """1×3×H×W sRGB: the photograph of one view, without JPEG; `piece=None` is the bare object."""
+    light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
+    if stage.camera is not None:
+        light = distorted(light, stage.camera, stage.scene.settings.camera.photo_px)
+    return develop(light, conditions.sensor, 1.0, jpeg=False, camera=stage.camera)
+
+
+def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Conditions, optics: Optics) -> Tensor:
+    """1×3×H×W linear light before lens distortion and sensor, of the size of the lens's frame."""
+    scene, mi = _traceable(stage), mitsuba()
+    photo_px = scene.settings.camera.photo_px
+    frame = lens_frame(stage, scene, photo_px)
+    box = _box(scene, conditions, frame, optics.aperture_mm)
+    parts = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": MOST_BOUNCES, "hide_emitters": True},
+        "sensor": _sensor(mi, scene, conditions, frame, box, optics.aperture_mm),
+        **lights(mi, scene, conditions.light, optics.light_radius_deg),
+        **{f"object{i}": part for i, part in enumerate(_object(mi, scene.mesh))},
+    }
+    if piece is not None:
+        parts["piece"] = _piece(mi, scene, piece, conditions)
+    left, top, width, height = box
+    traced, total = mi.load_dict(parts), np.zeros((height, width, 4))
+    for i in range(PASSES):  # seeds of one view are its own
+        seed = (int(conditions.sensor.noise_seed[0]) * PASSES + i) % 2**32
+        total = total + np.array(mi.render(traced, spp=PASS_SAMPLES, seed=seed), np.float64) / PASSES
+    whole = LIGHT_OF_CODE[backgrounds(scene, conditions, photo_px, frame)[0]]
+    inside = whole[top : top + height, left : left + width]
+    inside *= 1 - total[..., 3:].clip(0, 1)
+    inside += total[..., :3] / PAPER_REFLECTANCE
+    return torch.tensor(whole, dtype=torch.float32).permute(2, 0, 1)[None]
+
+
+def mitsuba() -> ModuleType:
+    """Mitsuba with a variant set: compiled by LLVM where there is one that can, else the slow one that needs nothing.
+
+    Refused where it is not installed.
+    """
+    try:
+        drjit, mi = import_module("drjit"), import_module("mitsuba")
+    except ImportError as error:
+        raise Refused("Mitsuba 3 for path tracing", "none installed", "pip install 'patchproof[pathtrace]'") from error
+    if mi.variant() is None:
+        try:
+            mi.set_variant("llvm_ad_rgb")
+            if drjit.detail.llvm_version()[0] < _FIRST_LLVM:
+                mi.set_variant("scalar_rgb")
+        except ImportError:  # what Dr.Jit raises where it finds no library
+            mi.set_variant("scalar_rgb")
+    if mi.variant().startswith("llvm"):
+        drjit.set_thread_count(torch.get_num_threads())
+    return mi
+
+
+def _traceable(stage: Stage) -> MeshScene:
+    """The stage's scene; refused where Mitsuba cannot show it."""
+    scene = needs_mesh(stage.scene, "a scene with a mesh to trace paths in", "leave --path-traced out")
+    matrix = scene.matrix_px(scene.settings.camera.photo_px)
+    if abs(matrix[0, 0] / matrix[1, 1] - 1) > _SQUARE:
+        raise Refused("a camera with square pixels", f"fx / fy = {matrix[0, 0] / matrix[1, 1]:.5f}", "set fy to fx")
+    return scene
+
+
+def _box(scene: MeshScene, conditions: Conditions, frame: Frame, aperture_mm: float) -> tuple[int, int, int, int]:
+    """The part of the frame that shows anything but background: left, top, width and height, 1 at least."""
+    points = [scene.mesh.vertices, needs_piece(scene).paper()[0]] if scene.HAS_PIECE else [scene.mesh.vertices]
+    px = geometry.project(frame.matrix_px, scene.camera_from_world(conditions)[0], np.concatenate(points))
+    if not np.isfinite(px).all():  # some of it lies behind the camera
+        return 0, 0, *frame.size_px
+    # out of focus and printed larger it reaches farther
+    margin = 8 + 0.05 * np.ptp(px, axis=0) + frame.matrix_px[0, 0] * aperture_mm / conditions.pose.distance_mm[0]
+    size = np.array(frame.size_px)
+    low = np.clip(np.floor(px.min(0) - margin), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(px.max(0) + margin), low + 1, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Frame, box, aperture_mm: float) -> dict:
+    """A thin lens that is focused on the piece's middle; a pinhole where the picture's middle is not the lens's.
+
+    Mitsuba's cameras have x left and y up.
+    """
+    pose = scene.camera_from_world(conditions)[0]
+    (width, height), matrix = frame.size_px, frame.matrix_px
+    middle = pose[:3, :3] @ scene.middle_mm + pose[:3, 3]
+    off = matrix[:2, 2] / frame.size_px - 0.5
+    lens = {"type": "thinlens", "aperture_radius": aperture_mm / 2, "focus_distance": float(middle[2])}
+    if aperture_mm == 0 or off.any():
+        lens = {"type": "perspective"} | {
+            f"principal_point_offset_{axis}": float(off[i]) for i, axis in enumerate("xy")
+        }
+    return lens | {
+        "to_world": mi.ScalarTransform4f(np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        "fov": float(np.degrees(2 * np.arctan(width / 2 / matrix[0, 0]))),
+        "fov_axis": "x",
+        "near_clip": 1.0,
+        "far_clip": 1e6,
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            **dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), box, strict=True)),
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},  # what a pixel collects
+        },
+        "sampler": {"type": "multijitter", "sample_count": PASS_SAMPLES},
+    }
+
+
+def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):
+    """The printed piece as large as it came out of the printer, plain paper on its back."""
+    placement = needs_patch(scene).placement
+    scale = geometry.scaled_about(scene.middle_mm, conditions.pose.printed_scale[0])
+    vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
+    printed = _printed(picture, placement.size_mm, conditions.print)
+    front = _glossy(_diffuse(_texture(mi, printed, "clamp")), conditions.light)
+    back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
+    uv = placement.piece_mm / np.array(placement.size_mm)
+    bsdf = {"type": "twosided", "front": front, "back": back}
+    return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
+
+
+def _printed(picture: PiecePicture, size_mm, drawn: Print) -> np.ndarray:
+    """H×W×3 light of this print under white light, beside the sheet that light is measured by."""
+    srgb = picture.srgb
+    if drawn.misregistration_mm.any():
+        height, width = srgb.shape[:2]
+        shift = drawn.misregistration_mm[0] * [width / size_mm[0], height / size_mm[1]]
+        srgb = misregistered(srgb, torch.tensor(shift).to(srgb))
+    change = torch.tensor([drawn.dot_gain[0], drawn.density[0], drawn.black[0]]).to(srgb)
+    return vary(linear_from_srgb(srgb), change).numpy() * drawn.paper[0]
+
+
+def _glossy(diffuse: dict, light: Light) -> dict:
+    """A surface that mirrors the drawn share of the light, roughly; Beckmann's slopes match Blinn's exponent."""
+    if not light.gloss[0]:
+        return diffuse
+    rough = float(np.sqrt(2 / (light.shininess[0] + 2)))
+    mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": rough}
+    return {"type": "blendbsdf", "weight": float(light.gloss[0] * PAPER_REFLECTANCE), "a": diffuse, "b": mirror}
+
+
+def _object(mi: ModuleType, mesh: Mesh) -> list:
+    """One Mitsuba mesh per material, its corners apart: they have normals and texture coordinates of their own."""
+    shapes = []
+    for number, material in enumerate(mesh.materials):
+        faces = mesh.face_material == number
+        count = int(faces.sum())
+        if not count:
+            continue
+        colors = (mesh.corner_color_linear[faces] * np.array(material.base_color_linear)).reshape(-1, 3)
+        color = {"type": "mesh_attribute", "name": "vertex_color"}
+        if material.texture_srgb is not None:
+            if np.ptp(colors, axis=0).max() > 1 / 255:
+                raise Refused(
+                    "objects whose textures are not colored by corners, too", material.name, "bake the colors in"
+                )
+            color = _texture(mi, LIGHT_OF_CODE[material.texture_srgb] * colors[0], "repeat")
+        corners = mesh.vertices[mesh.faces[faces]].reshape(-1, 3)
+        normals, uv = mesh.corner_normal[faces].reshape(-1, 3), mesh.corner_uv[faces].reshape(-1, 2)
+        bsdf = {"type": "twosided", "both": _diffuse(color)}
+        paint = (colors * PAPER_REFLECTANCE).clip(0, 1)
+        shapes.append(
+            _mesh(mi, f"object{number}", corners, np.arange(3 * count).reshape(-1, 3), normals, uv, bsdf, paint)
+        )
+    return shapes
+
+
+def _diffuse(reflectance: dict) -> dict:
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def _texture(mi: ModuleType, linear: np.ndarray, wrap: str) -> dict:
+    """A picture of light beside white as reflectances."""
+    bitmap = mi.Bitmap((linear * PAPER_REFLECTANCE).clip(0, 1).astype(np.float32))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": wrap}
+
+
+def _mesh(mi: ModuleType, name: str, vertices, faces, normals, uv, bsdf: dict, colors: np.ndarray | None = None):
+    """Triangles as a Mitsuba shape; `uv` runs down from the top-left, as everywhere here."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh(
+        name, len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties
+    )
+    if colors is not None:
+        mesh.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
+    parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    parameters["faces"] = np.ravel(faces).astype(np.uint32)
+    parameters.update()
+    return mesh

@@ -1,0 +1,399 @@
+"""A scene file to begin with and a look at it: what was guessed, what is drawn, and what is refused."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from patchproof.app import cli
+from patchproof.app.begin.guess import footing, guess_up, label_of, length_of
+from patchproof.app.begin.new import new_scene
+from patchproof.app.begin.preview import OBJECT, PAGE, preview_scene
+from patchproof.app.begin.sides import (
+    NO_SURFACE,
+    PICTURE_PX,
+    RAMP,
+    gap_colors,
+    gap_top_mm,
+    ramp,
+    round_length,
+    side_of,
+    side_views,
+)
+from patchproof.base.settings import load_scene_settings
+from patchproof.base.strict import Refused
+from patchproof.render.stage import set_stage
+from patchproof.reprint.run_sheet import blank_page
+from patchproof.scene.fitting import largest
+from patchproof.scene.scene import load_scene, make_scene
+from test_report import seen_in_browser
+
+LABELS = ["coffee mug", "cup", "garbage truck, dustcart", "tow truck, tow car, wrecker", "mailbox, letter box"]
+QUICK = {"camera": {"photo_px": [400, 300]}, "background": {"color": [0.5, 0.5, 0.5]}}
+
+
+def box(width=300, photo_px=(400, 300), **patch):
+    """A box 300 mm wide, 200 high and 100 deep, made in Python, with a piece on its front."""
+    return make_scene(
+        {
+            "object": {"mesh": "python:box", "length_mm": 300, "up": "y"},
+            "patch": {"width_mm": 90, "height_mm": 90, "side": "+z", **patch},
+            "target": {"label": "carton", "models": ["builtin"]},
+            **QUICK,
+            "camera": {"photo_px": photo_px},
+        },
+        trimesh.creation.box((width, 200, 100)),
+    )
+
+
+@pytest.fixture(scope="module")
+def views():
+    return {view.name: view for view in side_views(set_stage(box()))}
+
+
+def test_six_sides_are_at_one_scale_with_ground_and_bar(views):
+    assert list(views) == ["front", "back", "left", "right", "top", "bottom"]
+    dark = {name: (view.picture.min(-1) < 250) for name, view in views.items()}
+    seen = {name: (mask.any(0).sum(), mask.any(1).sum()) for name, mask in dark.items()}
+    px = seen["front"][0] / 300  # per millimeter
+    for name, size in (("front", (300, 200)), ("left", (100, 200)), ("top", (300, 100))):
+        assert np.allclose(seen[name], np.array(size) * px, atol=2.5), name
+    assert views["front"].bar_mm == 100 and views["front"].bar_px == pytest.approx(100 * px, rel=0.02)
+    lowest = np.flatnonzero(dark["front"].any(1)).max()
+    assert views["front"].ground_px == pytest.approx(lowest + 1, abs=1.5)
+    assert views["top"].ground_px is None and views["bottom"].ground_px is None
+    assert [view.name for view in views.values() if view.holds_piece] == ["front"]
+
+
+def test_the_piece_has_the_color_of_its_gap_whatever_the_light(views):
+    middle = views["front"].picture[PICTURE_PX // 2, PICTURE_PX // 2]
+    assert np.abs(middle.astype(int) - RAMP[0]).max() <= 2
+    assert not (np.abs(views["back"].picture.astype(int) - RAMP[0]).max(-1) < 30).any()
+
+
+def test_gaps_are_drawn_where_they_are():
+    half = box(side="+x", width_mm=90, height_mm=90).placement  # the box is 100 mm deep: all of it lies
+    assert half.gaps_mm.shape == (65, 65) and np.nanmax(half.gaps_mm) == half.gap_mm == pytest.approx(0, abs=1e-9)
+    over = box(offset_mm=[120, 0]).placement  # from 75 to 165 mm, the object ends at 150: a sixth has nothing under it
+    colors = gap_colors(over)
+    nothing = (colors == NO_SURFACE).all(-1)
+    assert nothing.mean() == pytest.approx(over.overhang_share) == pytest.approx(1 / 6, abs=0.02)
+    assert nothing[:, -5:].all() and not nothing[:, :50].any()  # on the right as one faces it
+    assert gap_top_mm(over) == pytest.approx(0.15 * 90)
+    assert (ramp(np.array([-1.0, 0, 1, 7])) == np.array([RAMP[0], RAMP[0], RAMP[-1], RAMP[-1]])).all()
+
+
+@pytest.mark.parametrize(("most", "length"), [(100, 100), (99, 50), (21, 20), (1.99, 1), (0.5, 0.5)])
+def test_bars_are_round(most, length):
+    assert round_length(most) == pytest.approx(length)
+
+
+def test_a_side_is_the_one_that_faces_so():
+    assert side_of(np.array([0.1, -0.9, 0.2])) == "-y" and side_of(np.array([0.1, 0.2, 0.9])) == "+z"
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """The preview of a carton."""
+    folder = tmp_path_factory.mktemp("preview")
+    (folder / "scene.toml").write_text(
+        '[object]\nmesh = "primitive:carton"\nlength_mm = 300\nup = "y"\n[patch]\nside = "+z"\nwidth_mm = 90\n'
+        'height_mm = 90\n[target]\nlabel = "carton"\nmodels = ["builtin"]\n[camera]\nphoto_px = [400, 300]\n'
+    )
+    return preview_scene(folder / "scene.toml", folder / "out"), folder
+
+
+def test_a_page_shows_sides_piece_and_eight_views_with_labels(shown):
+    preview, folder = shown
+    text = (folder / "out" / PAGE).read_text(encoding="utf-8")
+    html = text.partition("<script>")[0]
+    assert html.count("<figcaption>") == 6 + 1 + 8 and "front (+z): <b>the piece hangs here</b>" in html
+    assert html.count("<ol") == 8 and html.count("<li>") == 40 and html.count("<polygon") > 0
+    assert re.search(r'builtin: "carton" first in \d of 8 views of the bare object', preview.lines[-1])
+    assert preview.refused is None and 'class="note refused"' not in html
+
+
+def test_a_page_asks_nobody_for_anything(shown):
+    _, folder = shown
+    html = (folder / "out" / PAGE).read_text(encoding="utf-8").partition("<script>")[0]
+    assert "default-src 'none'" in html and "connect-src data: blob:" in html
+    assert not re.findall(r'(?:src|href)="(?!data:)', html) and "http" not in html.replace("http-equiv", "")
+
+
+def test_the_object_in_the_page_is_the_file_with_the_piece_on_it(shown):
+    _, folder = shown
+    html = (folder / "out" / PAGE).read_text(encoding="utf-8")
+    content = (folder / "out" / OBJECT).read_bytes()
+    assert base64.b64encode(content).decode() in html and "customElements.define(" in html
+    found = trimesh.load_scene(folder / "out" / OBJECT)
+    assert np.ptp(found.bounds, axis=0).max() == pytest.approx(0.3, abs=2e-3)
+    paper = found.geometry["piece"]
+    corners = load_scene(folder / "scene.toml").placement.vertices_mm / 1000
+    assert np.allclose(paper.vertices, corners, atol=1e-6)
+    assert (paper.vertex_normals @ [0, 0, 1] > 0.999).all()
+    # the top-left of the picture is on the piece's top-left corner: trimesh's v runs up
+    assert np.allclose(paper.visual.uv[0], [0, 1]) and np.allclose(paper.visual.uv[2], [1, 0])
+
+
+def test_a_piece_that_is_refused_is_said_beside_the_bare_object(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nside = "+z"\nwidth_mm = 900\nheight_mm = 90\n'
+        '[target]\nlabel = "cartoon"\nmodels = ["builtin"]\n[camera]\nphoto_px = [400, 300]\n'
+    )
+    preview = preview_scene(path, tmp_path / "out")
+    html = (tmp_path / "out" / PAGE).read_text(encoding="utf-8").partition("<script>")[0]
+    assert "Expected a piece no larger" in preview.refused and 'did you mean "carton"' in preview.refused
+    assert html.count('class="note refused"') == 2 and "piece hangs here" not in html and html.count("<ol") == 8
+    with pytest.raises(Refused, match="add --overwrite"):
+        preview_scene(path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("said", "label"), [("mug", "coffee mug"), ("Coffee_Mug", "coffee mug"), ("cup", "cup"), ("dustcart", LABELS[2])]
+)
+def test_labels_are_found_by_their_words(said, label):
+    assert label_of(LABELS, said, "thing.glb") in (label, label.split(",")[0])
+
+
+def test_words_of_several_labels_or_none_are_refused():
+    with pytest.raises(Refused, match='"truck", which is in 2: choose "garbage truck", "tow truck"'):
+        label_of(LABELS, "truck", "thing.glb")
+    with pytest.raises(Refused, match='did you mean "cup"'):
+        label_of(LABELS, "cupp", "thing.glb")
+
+
+def test_a_file_is_called_what_it_shows_or_a_label_is_asked_for():
+    assert label_of(LABELS, None, "/a/b/mug_mujoco.v2.glb") == "coffee mug"
+    with pytest.raises(Refused, match='got "gz truck", which no label of the network is: add --label'):
+        label_of(LABELS, None, "gz_truck_3.glb")
+
+
+@pytest.fixture(scope="module")
+def bottles(tmp_path_factory):
+    """A cylinder of 80 × 250 mm that stands along y, in meters, in four formats, and one that lies."""
+    folder = tmp_path_factory.mktemp("bottles")
+    standing = trimesh.creation.cylinder(0.04, 0.25, sections=64)
+    lying = standing.copy()
+    standing.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    for suffix in ("glb", "obj", "stl", "ply"):
+        standing.export(folder / f"bottle.{suffix}")
+    lying.export(folder / "lying.glb")
+    return folder
+
+
+def test_gltf_is_y_up_and_in_meters_by_its_standard(bottles):
+    up = guess_up(bottles / "bottle.glb")
+    assert (up.axis, up.odd) == ("y", None) and length_of(bottles / "bottle.glb") == 250
+    odd = guess_up(bottles / "lying.glb")
+    assert odd.axis == "y" and re.search(r'stands on 1\d% of its footprint so, with "z" on 7[789]%', odd.odd)
+
+
+def test_a_habit_gives_way_to_how_the_object_stands(bottles):
+    assert guess_up(bottles / "bottle.obj").axis == "y"
+    stl = guess_up(bottles / "bottle.stl")
+    assert stl.axis == "y" and stl.odd is None and "as it stands" in stl.reason
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "ply"])
+def test_a_file_without_units_asks_for_a_length(bottles, suffix):
+    with pytest.raises(Refused, match="no units: add --length-mm"):
+        length_of(bottles / f"bottle.{suffix}")
+
+
+def test_a_file_without_units_says_how_long_it_is_in_its_own(tmp_path):
+    trimesh.creation.box((300, 200, 100)).export(tmp_path / "carton.stl")
+    with pytest.raises(Refused, match="longest extent: 300 if it is in mm"):
+        length_of(tmp_path / "carton.stl")
+
+
+def test_an_object_that_may_lie_is_turned_by_one_word(bottles, tmp_path):
+    """The scene has the other axis as a comment, the preview says which, `new` writes it whole."""
+    path = tmp_path / "scene.toml"
+    bottle = {"label": "bottle", "overwrite": True}
+    lines = new_scene(str(bottles / "lying.glb"), path, **bottle)
+    assert "write the scene again with --up z" in lines[0] and load_scene_settings(path).object.up == "y"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r'(?m)^up = "y".*\n# (up = "z")', r"\1", text), encoding="utf-8")
+    turned = load_scene(path).mesh
+    assert np.argmax(np.ptp(turned.vertices, axis=0)) == 1
+    assert not [each for each in preview_scene(path, tmp_path / "b").warnings if "may lie" in each]
+    path.write_text(text, encoding="utf-8")
+    (warning,) = [each for each in preview_scene(path, tmp_path / "a").warnings if "may lie" in each]
+    assert warning.endswith('write up = "z" in [object]')
+    lines = new_scene(str(bottles / "lying.glb"), path, up="z", **bottle)
+    assert lines[0] == 'up: "z", as given' and "# up" not in path.read_text(encoding="utf-8")
+    standing = tmp_path / "standing.toml"
+    new_scene(str(bottles / "bottle.glb"), standing, label="bottle")
+    assert load_scene_settings(path).patch == load_scene_settings(standing).patch
+
+
+def test_a_side_is_preferred_to_a_top_that_is_not_twice_as_large(tmp_path):
+    for name, size, side in (("low", (0.3, 0.1, 0.3), "+y"), ("high", (0.225, 0.17, 0.3), "+z")):
+        trimesh.creation.box(size).export(tmp_path / f"{name}.glb")
+        new_scene(str(tmp_path / f"{name}.glb"), tmp_path / f"{name}.toml", label="carton")
+        assert load_scene_settings(tmp_path / f"{name}.toml").patch.side == side
+    assert "of the camera to left and right of straight above" in (tmp_path / "low.toml").read_text(encoding="utf-8")
+
+
+def test_a_name_that_is_no_label_is_answered_with_the_labels_where_they_are_few():
+    with pytest.raises(Refused, match='add --label with what it is to be recognized as: "lamp", "vase"'):
+        label_of(("lamp", "vase"), None, "lantern.glb")
+    with pytest.raises(Refused, match=r"recognized as[.]$"):
+        label_of([f"thing {i}" for i in range(21)], None, "lantern.glb")
+
+
+def test_photographs_beside_two_blanks_ask_which_one_hangs_there(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for name in ("one", "two"):
+        blank_page(tmp_path / f"{name}.pdf", template="blank_a4")
+    with pytest.raises(Refused, match=r"one blank sheet's JSON, got one[.]json, two[.]json"):
+        new_scene(str(tmp_path / "photos"), tmp_path / "scene.toml")
+
+
+def test_a_length_that_makes_no_sense_is_refused(tmp_path):
+    trimesh.creation.box((31, 1, 1)).export(tmp_path / "hall.glb")
+    trimesh.creation.box((30, 1, 1)).export(tmp_path / "yard.glb")
+    assert length_of(tmp_path / "yard.glb") == 30_000
+    with pytest.raises(Refused, match=r"of 5 mm to 30 m, got 3\.1e\+04 mm by the file's units: add --length-mm"):
+        length_of(tmp_path / "hall.glb")
+
+
+def test_a_box_stands_on_all_of_its_footprint():
+    assert footing(trimesh.creation.box((3, 2, 1)).vertices) == pytest.approx(1)
+    assert footing(np.array([[0.0, 0, 0], [1, 1, 0], [0, 1, 1]])) == 0  # on a point
+
+
+def test_the_largest_piece_is_found_between_those_that_fit():
+    assert largest((100, 50), lambda size: size[0] <= 80, 20) == pytest.approx((79, 39), abs=1.5)
+    assert largest((100, 50), lambda size: True, 20) == (100, 50)
+    assert largest((100, 50), lambda size: False, 20) is None
+    assert largest((100, 50), lambda size: True, 51) is None
+
+
+def test_a_new_scene_loads_and_says_what_was_guessed(bottles, tmp_path):
+    lines = new_scene(str(bottles / "bottle.glb"), tmp_path / "scene.toml")
+    settings = load_scene_settings(tmp_path / "scene.toml")
+    assert (settings.object.length_mm, settings.object.up, settings.target.label) == (250, "y", "bottle")
+    assert settings.view.distance_mm == (380, 680) and settings.patch.bend and settings.patch.side == "+z"
+    assert lines[0] == 'up: "y", glTF\'s standard' and "by the file's units" in lines[1]
+    scene = load_scene(tmp_path / "scene.toml")
+    assert scene.placement.family == "cylinder" and scene.placement.gap_mm < 1
+    assert 39 <= min(scene.piece.size_mm) <= 80 * 0.7
+    with pytest.raises(Refused, match="add --overwrite"):
+        new_scene(str(bottles / "bottle.glb"), tmp_path / "scene.toml")
+
+
+def test_a_new_scene_of_a_primitive_has_a_flat_card_where_one_will_do(tmp_path):
+    new_scene("primitive:carton", tmp_path / "scene.toml", length_mm=300)
+    patch = load_scene_settings(tmp_path / "scene.toml").patch
+    assert not patch.bend and min(patch.width_mm, patch.height_mm) > 60
+
+
+def test_what_cannot_be_optimized_is_not_written(tmp_path):
+    path = tmp_path / "scene.toml"
+    with pytest.raises(Refused, match="room for a piece of 39 mm, got one of 30 mm"):
+        new_scene("primitive:carton", path, length_mm=30)
+    (tmp_path / "things").mkdir()
+    with pytest.raises(Refused, match="a CSV of labels among images, or a blank sheet's JSON"):
+        new_scene(str(tmp_path / "things"), path)
+    for given in ({"length_mm": 30}, {"up": "z"}):
+        with pytest.raises(Refused, match="pictures have no length and no axes"):
+            new_scene(str(tmp_path / "things"), path, **given)
+    with pytest.raises(Refused, match="no file at"):
+        new_scene(str(tmp_path / "mug.glb"), path)
+    assert not path.exists()
+
+
+def test_a_new_scene_of_images_takes_their_most_frequent_label(tmp_path):
+    from PIL import Image
+
+    folder = tmp_path / "images"
+    folder.mkdir()
+    rows = ["file,label"]
+    for i, label in enumerate(["mug", "carton", "carton"]):
+        pixels = np.random.default_rng(i).integers(0, 256, (64, 64, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / f"{i}.png")
+        rows.append(f"{i}.png,{label}")
+    (folder / "labels.csv").write_text("\n".join(rows))
+    new_scene(str(folder), tmp_path / "scene.toml")
+    settings = load_scene_settings(tmp_path / "scene.toml")
+    assert settings.target.label == "carton" and settings.object.images == "images"
+    preview = preview_scene(tmp_path / "scene.toml", tmp_path / "out")
+    html = (tmp_path / "out" / PAGE).read_text(encoding="utf-8")
+    assert preview.refused is None and html.count("<ol") == 8 and "<model-viewer" not in html
+    assert not (tmp_path / "out" / OBJECT).exists()
+
+
+def test_a_piece_without_a_place_is_left_off_where_it_would_not_lie(tmp_path):
+    scene = {
+        "object": {"mesh": "primitive:mug", "length_mm": 100, "up": "y"},
+        "patch": {"width_mm": 45, "height_mm": 45, "place": "auto", "side": "+z"},
+        "target": {"label": "mug", "models": ["builtin"]},
+        **QUICK,
+    }
+    lines = [f"{name} = {json.dumps(table).replace(':', ' =')}" for name, table in scene.items()]
+    text = "\n".join(re.sub(r'"(\w+)" =', r"\1 =", line) for line in lines).replace("primitive =", "primitive:")
+    (tmp_path / "scene.toml").write_text(text)
+    preview = preview_scene(tmp_path / "scene.toml", tmp_path / "out")
+    assert any(line.startswith('place: "auto": optimize searches') for line in preview.lines)
+    html = (tmp_path / "out" / PAGE).read_text(encoding="utf-8").partition("<script>")[0]
+    assert "piece hangs here" not in html and "piece: not placed" in preview.lines
+
+
+def test_a_browser_shows_the_page_on_a_phone_and_asks_nobody(shown, tmp_path):
+    _, folder = shown
+    seen = seen_in_browser(folder / "out" / PAGE, 390, tmp_path)
+    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == []
+    assert seen["broken"] == 0 and seen["small"] == 0 and seen["errors"] == []
+    assert [address for address in seen["fetched"] if not address.startswith("blob:")] == []
+
+
+def test_the_command_line_looks_and_says_where(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["patchproof", "new", "primitive:carton", "--length-mm", "300"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 0 and "next: patchproof preview scene.toml" in capsys.readouterr().out
+    text = (tmp_path / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(text.replace("width_mm = ", "width_mm = 9"))
+    monkeypatch.setattr(sys, "argv", ["patchproof", "preview", "scene.toml"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    said = capsys.readouterr()
+    assert stop.value.code == 1 and "page: patchproof-preview/preview.html" in said.out
+    assert said.err.splitlines()[-1].startswith("Expected a piece no larger than the object's side")
+
+
+@pytest.mark.parametrize(
+    ("patch", "advice"),
+    [
+        ({"height_mm": 900}, r"90 × \d\d\d mm lies well there$"),
+        ({"offset_mm": [400, 0]}, r"lies well with offset_mm = \[88, 0\]$"),
+        (
+            {"side": "+x", "width_mm": 120},
+            r"; 100 × 90 mm lies well there; 120 × 90 mm lies well with side = \"\+z\"$",
+        ),
+        ({"side": "+x", "width_mm": 350, "height_mm": 350}, r"; 100 × 200 mm lies well there$"),
+        ({"side": "+x", "width_mm": 900, "height_mm": 12}, "or choose a larger side$"),
+    ],
+)
+def test_a_refused_piece_is_told_what_would_fit(patch, advice):
+    with pytest.raises(Refused) as refused:
+        box(**patch)
+    assert re.search(advice, str(refused.value).rstrip(".")), refused.value
+
+
+def test_markers_say_what_asks_for_their_size():
+    sharp = {"photo_px": (1600, 1200)}
+    (note,) = [note for note in box(width_mm=45, height_mm=45, **sharp).warnings if "unreadable" in note]
+    needed, least = re.search(r"camera.photo_px ask for ([\d.]+) mm, and those for a piece of (\d+) mm", note).groups()
+    enough = box(width_mm=int(least), height_mm=int(least), **sharp)
+    assert not [note for note in enough.warnings if "unreadable" in note]
+    assert float(needed) == pytest.approx(enough.piece.marker_mm, abs=0.06)

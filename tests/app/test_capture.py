@@ -1,0 +1,477 @@
+"""Capture: what is let in and what is not, nothing lost, and the verdict that `verify` gives of the same folder."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from urllib.parse import quote, urlencode, urlsplit
+
+import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
+import uvicorn
+from browser import Browser
+from synthetic_photos import make_manifest, save
+
+from patchproof.app.capture import album as album_module
+from patchproof.app.capture import app as app_module
+from patchproof.app.capture import serve
+from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, NotTaken
+from patchproof.app.capture.app import capture_app
+from patchproof.app.capture.gathered import Gathered
+from patchproof.app.capture.views import map_views
+from patchproof.app.verify import options_of, verify_photos
+from patchproof.base import input
+from patchproof.base.strict import Refused
+from patchproof.base.workers import open_workers
+from patchproof.evidence.results import Geometry, PhotoEntry, Pose
+from patchproof.sheets.manifest import ConditionClaim, dump_manifest, load_manifest
+from test_verify_run import NET, promise, shot
+
+pytestmark = pytest.mark.filterwarnings("ignore:the network net:UserWarning")  # it sees no color
+TOKEN = "a-token-that-is-nobodys-own"
+SHOTS = 32
+
+
+def condition(azimuth_deg: float, px_per_mm: float) -> dict:
+    return dict(px_per_mm=px_per_mm, tilt_deg=30.0, azimuth_deg=azimuth_deg, contrast=0.8, blur_px=0.5, recognized=True)
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory) -> Path:
+    """A sheet that promises something of `NET`, from -40° to 40°, at one to two pixels a millimeter."""
+    conditions = [condition(azimuth, scale) for azimuth in (-40.0, -20.0, 0.0, 20.0, 40.0) for scale in (1.0, 1.5, 2.0)]
+    said = promise([c | {"tilt_deg": tilt} for c in conditions for tilt in (0.0, 60.0)])
+    path = tmp_path_factory.mktemp("sheet") / "sheet.json"
+    path.write_text(dump_manifest(make_manifest(said | {"n": 30})), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory) -> list[bytes]:
+    """What a phone that walks round the piece takes: one in eight in too little light for `NET`, one of no piece."""
+    folder = tmp_path_factory.mktemp("phone")
+    looks = [dict(light=0.1 if i % 8 == 3 else 0.8, seed=i, noise=0.003) for i in range(SHOTS)]
+    pictures = [shot(5 * (i % 16) - 38, 450 + 60 * (i % 3), **look) for i, look in enumerate(looks)]
+    pictures[5] = pictures[5] * 0 + 120
+    return [save(picture, folder / f"{i}.jpg", focal_35mm=36).read_bytes() for i, picture in enumerate(pictures)]
+
+
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> dict:
+        return json.loads(self.body)
+
+
+@dataclass(frozen=True)
+class Client:
+    """Who has the address."""
+
+    address: str
+
+    @property
+    def root(self) -> str:
+        return urlsplit(self.address).path
+
+    def connect(self) -> http.client.HTTPConnection:
+        parts = urlsplit(self.address)
+        return http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)
+
+    def get(self, path: str) -> Answer:
+        return self.ask("GET", self.root + path)
+
+    def post(self, path: str, content: bytes = b"", headers: Mapping[str, str] | None = None) -> Answer:
+        return self.ask("POST", self.root + path, content, headers)
+
+    def send(self, content: bytes, into: str = "session_01") -> Answer:
+        return self.post(f"photos?{urlencode({'into': into})}", content)
+
+    def ask(self, method: str, path: str, content: bytes = b"", headers: Mapping[str, str] | None = None) -> Answer:
+        with closing(self.connect()) as connection:
+            connection.request(method, path, content, dict(headers or {}))
+            answered = connection.getresponse()
+            return Answer(answered.status, {k.lower(): v for k, v in answered.headers.items()}, answered.read())
+
+    def begin(self, *headers: tuple[str, str], body: bytes) -> http.client.HTTPConnection:
+        """A photograph of which no more is sent than this."""
+        connection = self.connect()
+        connection.putrequest("POST", f"{self.root}photos?into=session_01")
+        for header in headers:
+            connection.putheader(*header)
+        connection.endheaders(body)
+        return connection
+
+
+@contextmanager
+def gathered_in(folder: Path, sheet: Path):
+    manifest = load_manifest(sheet)
+    with open_workers(1) as workers:
+        with closing(Gathered(Album(folder), manifest, options_of(sheet, manifest, [NET]), workers)) as gathered:
+            gathered.measure(gathered.album.photos())
+            yield gathered
+
+
+@pytest.fixture
+def client(tmp_path, sheet):
+    with gathered_in(tmp_path / "photos", sheet) as gathered:
+        with listening(capture_app(gathered, TOKEN)) as address:
+            yield Client(address)
+
+
+@contextmanager
+def listening(app):
+    """A real server on this machine; the address it is at."""
+    server = uvicorn.Server(uvicorn.Config(app, port=0, lifespan="off", log_level="warning"))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        while not server.started and thread.is_alive():  # else the socket closes under it, if nobody calls
+            time.sleep(0.01)
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}/{TOKEN}/"
+        server.should_exit = True
+        thread.join(20)
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet, photos):
+    folder = tmp_path / "photos"
+    with gathered_in(folder, sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+        client, answers = Client(address), []
+
+        def tab(own: list[bytes], into: str) -> None:
+            for photo in own:
+                answers.append(client.send(photo, into).json)
+
+        for session, part in (("session_01", photos[:16]), ("session_02", photos[16:])):
+            tabs = [threading.Thread(target=tab, args=(own, session)) for own in (part[::2], part[1::2])]
+            for thread in tabs:
+                thread.start()
+            for thread in tabs:
+                thread.join()
+            if session == "session_01":
+                assert client.post("sessions").json["session"] == "session_02"
+        assert client.send(save(shot(3, light=0.1), tmp_path / "gray.jpg").read_bytes(), "gray").status == 200
+        state = client.get("state").json
+    files = [path for path in files_in(folder) if path.endswith(".jpg")]
+    assert files[0] == "controls/gray/photo_0033.jpg" and len(files) == SHOTS + 1
+    assert sorted((folder / file).read_bytes() for file in files[1:]) == sorted(photos)  # EXIF and all
+    assert len({answer["photo"]["file"] for answer in answers}) == SHOTS
+    assert {answer["photo"]["code"] for answer in answers} >= {None, "too_few_markers"}
+    report = verify_photos(
+        folder, sheet, tmp_path / "report", models=[NET], controls=folder / "controls", ledger_photos=0
+    )
+    summary = report.summary
+    assert (state["verdict"], state["reason"]) == (summary.verdict, summary.reason)
+    assert tuple(state["prediction_interval"]) == summary.prediction_interval
+    assert state["interval"] == pytest.approx(summary.interval, abs=1e-12)
+    assert state["recognized"] == round(summary.rate * summary.judged)
+    assert state["judged"] == summary.judged > 20 and 3 <= summary.judged - state["recognized"] <= 4  # the dark ones
+    said = {(s["name"], s["recognized"], s["judged"]) for s in state["sessions"]}
+    assert (
+        said == {(s.name, s.recognized, s.judged) for s in summary.sessions}
+        and summary.sessions_known_from == "folders"
+    )
+    assert state["controls"] == [{"name": "gray", "photos": 1, "recognized": 0}]
+    assert sum(map(sum, state["map"]["photos"])) + state["map"]["elsewhere"] == summary.judged
+
+
+def test_a_restart_goes_on_and_measures_nothing_twice(tmp_path, sheet, photos, monkeypatch):
+    folder = tmp_path / "photos"
+    with gathered_in(folder, sheet) as gathered:
+        with listening(capture_app(gathered, TOKEN)) as address:
+            for photo in photos[:3]:
+                before = Client(address).send(photo).json["state"]
+    (folder / "session_01" / ".photo_0009.part").write_bytes(b"of a server that was killed")
+    monkeypatch.setattr("patchproof.evidence.batch.read_photo", None)  # nothing is read
+    with gathered_in(folder, sheet) as gathered:
+        with listening(capture_app(gathered, TOKEN)) as address:
+            assert Client(address).get("state").json == before
+            again = Client(address).send(photos[1]).json
+            assert again["photo"]["file"] == "session_01/photo_0002.jpg" and again["state"] == before
+    assert files_in(folder) == ["photos.jsonl", *(f"session_01/photo_000{i}.jpg" for i in (1, 2, 3))]
+
+
+def test_only_the_token_opens_anything(client, tmp_path):
+    for path in ("/", "/state", f"/{TOKEN[:-1]}/", f"/{TOKEN}x/state", "/../photos.jsonl", f"/{TOKEN.upper()}/", "/é/"):
+        for method in ("GET", "POST"):
+            answered = client.ask(method, quote(path), b"x" if method == "POST" else b"")
+            assert answered.status == 403 and "address with its token" in answered.json["refused"]
+    for path in ("photos.jsonl", "session_01/photo_0001.jpg", "../photos.jsonl", "photos/", "state/x"):
+        assert client.get(path).status == 404
+    assert client.get("photos").status == 405 and client.get("state").status == 200
+
+
+def test_the_token_is_compared_whatever_of_it_is_right(client, monkeypatch):
+    compared = []
+    monkeypatch.setattr(app_module.hmac, "compare_digest", lambda a, b: compared.append((a, b)) or a == b)
+    client.get("state")
+    client.ask("GET", "/nothing")
+    assert compared == [(TOKEN.encode(), TOKEN.encode()), (b"nothing", TOKEN.encode())]
+
+
+def test_the_page_is_let_load_nothing_of_others(client):
+    answered = client.get("")
+    policy, text = answered.headers["content-security-policy"], answered.body.decode()
+    assert "default-src 'none'" in policy and "unsafe" not in policy and "frame-ancestors 'none'" in policy
+    assert answered.headers["referrer-policy"] == "no-referrer" and answered.headers["cache-control"] == "no-store"
+    assert "http" not in text and TOKEN not in text
+    assert client.get("").headers["content-security-policy"] != policy  # a nonce is used once
+
+
+@pytest.mark.parametrize(
+    ("content", "into", "status", "sentence"),
+    [
+        (b"no picture, whatever it is called", "session_01", 415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)"),
+        (b"short", "session_01", 415, "a photograph"),
+        (b"", "session_01", 415, "a photograph"),
+        (b"%PDF-1.7 is a document", "session_01", 415, "a photograph"),
+        (b"\xff\xd8\xff", "../../elsewhere", 404, "a session or a control that is here"),
+        (b"\xff\xd8\xff", "session_02", 404, "a session or a control"),
+        (b"\xff\xd8\xff", "controls", 404, "a session or a control"),
+        (b"\xff\xd8\xff", "", 404, "a session or a control"),
+    ],
+)
+def test_what_is_no_photograph_or_goes_nowhere_leaves_nothing(client, tmp_path, content, into, status, sentence):
+    answered = client.send(content, into)
+    assert answered.status == status and sentence in answered.json["refused"]
+    assert files_in(tmp_path) == ["photos/photos.jsonl"]
+
+
+def test_names_that_come_along_mean_nothing(client, tmp_path, photos):
+    part = b'Content-Disposition: form-data; name="photo"; filename="../../../evil.jpg"'
+    form = b"--x\r\n" + part + b"\r\nContent-Type: image/jpeg\r\n\r\n" + photos[0] + b"\r\n--x--\r\n"
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    assert client.post("photos?into=session_01", form, headers).status == 415  # a form is no photograph
+    headers = {"Content-Disposition": "attachment; filename=../../evil.jpg", "Content-Type": "text/html"}
+    assert client.post("photos?into=session_01&name=../evil.jpg", photos[0], headers).status == 200
+    assert files_in(tmp_path) == ["photos/photos.jsonl", "photos/session_01/photo_0001.jpg"]
+
+
+def test_bytes_that_only_begin_like_a_photograph_are_listed_and_not_counted(client, photos):
+    cut = client.send(photos[0][:4000]).json
+    assert cut["photo"]["answer"] == "not counted" and cut["photo"]["code"] == "unreadable"
+    assert "copy it again from the camera" in cut["photo"]["advice"]
+    assert cut["state"]["photos"] == 1 and cut["state"]["judged"] == 0
+
+
+def test_the_same_bytes_in_another_place_are_no_second_photograph(client, photos):
+    assert client.send(photos[0]).status == 200
+    again = client.send(photos[0], "gray")
+    assert again.status == 409 and "session_01/photo_0001.jpg once more" in again.json["refused"]
+
+
+def test_a_new_session_is_begun_where_the_last_one_has_photographs(client, photos):
+    assert client.post("sessions").json["session"] == "session_01"
+    client.send(photos[0])
+    assert [client.post("sessions").json["session"] for _ in range(2)] == ["session_02", "session_02"]
+
+
+def test_sizes_and_numbers_end_somewhere(tmp_path, monkeypatch):
+    monkeypatch.setattr(album_module, "MOST_PHOTOS", 2)
+    album = Album(tmp_path / "photos")
+    with album.incoming("session_01") as incoming:
+        incoming.write(b"\xff\xd8\xff" + bytes(MOST_BYTES - 3))
+        with pytest.raises(NotTaken, match="at most 40 MB"):
+            incoming.write(b"x")
+        assert incoming.keep().stat().st_size == MOST_BYTES
+    with album.incoming("session_01") as second, pytest.raises(NotTaken, match="at most 2 photographs"):
+        second.write(b"\x89PNG\r\n\x1a\n1234")
+        album.incoming("session_01")
+
+
+def test_numbers_are_taken_once_whoever_takes_them(tmp_path):
+    ours, theirs = Album(tmp_path / "photos"), Album(tmp_path / "photos")  # two servers that know nothing of each other
+    with ours.incoming("session_01") as a, theirs.incoming("session_01") as b, ours.incoming("gray") as c:
+        for number, (incoming, head) in enumerate(
+            zip((b, a, c), (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"), strict=True)
+        ):
+            incoming.write(head + bytes([number]) * 12)
+        names = [incoming.keep().name for incoming in (b, a, c)]
+    assert names == ["photo_0002.jpg", "photo_0001.png", "photo_0003.jpg"]
+    assert [path.name for path in ours.photos()] == ["photo_0001.png", "photo_0002.jpg", "photo_0003.jpg"]
+
+
+def test_200_megabytes_are_refused_before_they_are_read(tmp_path, sheet):
+    """With their length said, none is; without, no more than the limit and what lies in sockets."""
+    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+        client = Client(address)
+        with closing(client.begin(("Content-Length", "200000000"), body=b"\xff\xd8\xff")) as connection:
+            answered = connection.getresponse()
+            assert answered.status == 413 and "one of 200 MB" in json.loads(answered.read())["refused"]
+        sent, block = 0, b"\xff\xd8\xff" + bytes((1 << 20) - 3)
+        with closing(client.begin(("Transfer-Encoding", "chunked"), body=b"")) as connection, pytest.raises(OSError):
+            for _ in range(200):
+                connection.send(b"%x\r\n%s\r\n" % (len(block), block))
+                sent += len(block)
+        assert MOST_BYTES - (1 << 20) < sent < MOST_BYTES + (16 << 20)
+    assert files_in(tmp_path) == ["photos/photos.jsonl"]
+
+
+def test_a_connection_that_is_lost_or_stalls_leaves_nothing_and_the_next_one_all(tmp_path, sheet, photos, monkeypatch):
+    monkeypatch.setattr(app_module, "STALLED_S", 1.0)
+    folder = tmp_path / "photos"
+    with gathered_in(folder, sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+        client, whole = Client(address), ("Content-Length", str(len(photos[0])))
+        lost, stalled = (client.begin(whole, body=photos[0][:-500]) for _ in range(2))
+        end = time.monotonic() + 20
+        while len(list(folder.rglob(".*.part"))) < 2:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        lost.close()
+        answered = stalled.getresponse()
+        assert answered.status == 408 and "send it again" in json.loads(answered.read())["refused"]
+        stalled.close()
+        while list(folder.rglob(".*.part")):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert files_in(folder) == ["photos.jsonl"]
+        assert client.send(photos[0]).json["photo"]["answer"] == "recognized"
+    assert (folder / "session_01" / "photo_0001.jpg").read_bytes() == photos[0]
+
+
+def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
+    (tmp_path / "letter.txt").write_text("mine")
+    with pytest.raises(Refused, match=r"this command's own output only .* with letter.txt"):
+        Album(tmp_path)
+
+
+def entry(azimuth_deg: float | None, px_per_mm: float) -> PhotoEntry:
+    geometry = Geometry(
+        residual_mm=0, px_per_mm=px_per_mm, tilt_deg=20, contrast=0.8, blur_px=1, corner_uncertainty_mm=0.1
+    )
+    pose = Pose(azimuth_uncertainty_deg=1, azimuth_deg=azimuth_deg)
+    return PhotoEntry(file="a", status="measured", photo_px=(1200, 900), geometry=geometry, pose=pose)
+
+
+def test_the_map_of_views_by_hand():
+    """Two conditions in three in the nearest third on the left, one far on the right; distances are 1 over scale."""
+    near_left, far_right = condition(-10.0, 4.0), condition(14.0, 1.0)
+    conditions = [ConditionClaim(**c) for c in (near_left, near_left, far_right)]
+    blind = ConditionClaim(**near_left | {"azimuth_deg": None})  # from behind: nobody can photograph that
+    shown = [entry(-9.0, 3.9), entry(-30.0, 6.0), entry(13.0, 1.35), entry(None, 2.0)]
+    views = map_views([*conditions, blind], shown, 12, 900.0)
+    assert views is not None
+    assert views.azimuth_deg == (-10.0, 2.0, 14.0) and views.px_per_mm == pytest.approx((4, 2, 4 / 3, 1))
+    assert views.wanted == ((8, 0), (0, 0), (0, 4))
+    assert views.photos == ((2, 0), (0, 1), (0, 0)) and views.elsewhere == 1
+    assert views.most_missing == (0, 0)
+    halved = map_views(conditions, [entry(-9.0, 7.8)], 12, 450.0)  # photographs of twice the promised size
+    assert halved is not None and halved.photos[0][0] == 1
+    full = map_views(conditions, [entry(-9.0, 3.9)] * 8 + [entry(13.0, 1.0)] * 4, 12, 900.0)
+    assert full is not None and full.most_missing is None
+    assert map_views([blind], shown, 12, None) is None
+
+
+def has_timer(_: object) -> None:
+    """As the process apart begins: photographs are measured in a main thread, where their time is limited."""
+    assert input.has_timer()
+    serve.ready(None)
+
+
+def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, sheet, photos, monkeypatch):
+    """With a process apart; what is in the folder is measured before there is an address."""
+    monkeypatch.setattr(serve, "ready", has_timer)
+    monkeypatch.setattr(serve, "options_of", lambda sheet, manifest, *_: options_of(sheet, manifest, [NET]))
+    addresses, answers, measured = [], [], []
+
+    def visit(address: str) -> None:
+        addresses.append(address)
+        answers.append(Client(address).send(photos[len(answers)]).status)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def begin(address: str) -> None:
+        threading.Thread(target=visit, args=(address,)).start()
+
+    def progress(done: int, total: int) -> None:
+        measured.append((done, total))
+
+    capture = partial(serve.serve_capture, sheet, tmp_path / "photos", on_photo=progress, on_address=begin)
+    reports = [capture(), capture()]
+    assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
+    assert answers == [200, 200] and addresses[0] == addresses[1]
+    assert (tmp_path / "photos" / ".capture.json").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_port_that_is_taken_is_not_waited_for():
+    with socket.create_server(("127.0.0.1", 0)) as other, serve._listening("127.0.0.1", other.getsockname()[1]) as ours:
+        assert ours.getsockname()[1] not in (0, other.getsockname()[1])
+
+
+def test_it_listens_on_this_machine_unless_the_local_network_is_asked_for(monkeypatch):
+    asked = []
+    monkeypatch.setattr(serve, "_own_address", lambda: asked.append("network") or "127.0.0.2")
+    for lan, host in ((False, "127.0.0.1"), (True, "127.0.0.2")):
+        with serve._listening(serve._host(lan), 0) as listener:
+            assert listener.getsockname()[0] == host
+    assert asked == ["network"]
+
+
+def test_sheets_without_a_promise_and_machines_without_the_libraries_are_refused(tmp_path, sheet, monkeypatch):
+    (tmp_path / "plain.json").write_text(dump_manifest(make_manifest()), encoding="utf-8")
+    with pytest.raises(Refused, match="Expected a sheet that promises something, got the design sheet TESTSHEET0"):
+        serve.serve_capture(tmp_path / "plain.json", tmp_path / "photos")
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    with pytest.raises(Refused, match=r"Starlette and uvicorn, got none: pip install 'patchproof\[capture\]'\."):
+        serve.serve_capture(sheet, tmp_path / "photos")
+    assert not (tmp_path / "photos").exists()
+
+
+def test_the_command_line_has_it_without_the_libraries():
+    code = "import sys; sys.modules['starlette'] = sys.modules['uvicorn'] = None; import patchproof.app.cli; "
+    code += "patchproof.app.cli.app(['capture', '--help'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "--lan" in done.stdout
+
+
+def test_a_phone_shows_the_answer_and_sends_again_what_a_lost_connection_cost(tmp_path, sheet, photos):
+    taken = tmp_path / "IMG.jpg"
+    taken.write_bytes(photos[2])
+    dark = tmp_path / "dark.jpg"
+    dark.write_bytes(photos[3])
+    with gathered_in(tmp_path / "photos", sheet) as gathered, listening(capture_app(gathered, TOKEN)) as address:
+        with Browser(tmp_path) as browser:
+            browser.call("Page.navigate", url=address)
+            browser.wait_for("document.querySelector('#into') && document.querySelector('#into').value")
+            browser.choose("#camera", taken)
+            said = browser.wait_for("document.querySelector('#answer').innerText")
+            assert said.startswith("recognized as bright") and "session_01/photo_0001.jpg" in said
+            assert browser.evaluate("document.querySelector('#answer img').naturalWidth") > 300
+            browser.call(
+                "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
+            )
+            browser.choose("#camera", dark)
+            browser.wait_for("document.querySelector('#queue').innerText.includes('not sent yet')")
+            browser.call(
+                "Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1
+            )
+            assert browser.wait_for("document.querySelector('#answer b').innerText == 'not recognized'")
+            assert browser.evaluate("document.querySelector('#queue').childElementCount") == 0
+            assert browser.evaluate("document.documentElement.scrollWidth") == 390
+            assert {urlsplit(url).netloc for url in browser.requested if url.startswith("http")} == {
+                urlsplit(address).netloc
+            }
+            assert not [t for t in browser.troubles if "ERR_INTERNET_DISCONNECTED" not in json.dumps(t)]
+    assert files_in(tmp_path / "photos")[1:] == ["session_01/photo_0001.jpg", "session_01/photo_0002.jpg"]
+    assert set(CONTROLS) == {"bare", "mean", "gray", "noise", "shuffled", "blank"}

@@ -1,0 +1,342 @@
+"""The whole journey on the built-in classifier, small: optimize → sheet → reprint → verify, by the commands a user
+types.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from conftest import SCENE
+from console import command
+
+from patchproof.base import geometry
+from patchproof.base.strict import shipped
+from patchproof.optimizer import run as run_module
+from patchproof.sheets.manifest import load_manifest
+from patchproof.sheets.raster import attached_manifest
+
+PHOTOS = 8
+
+
+@pytest.fixture(scope="module")
+def journey(tmp_path_factory):
+    """A folder with scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
+    folder = tmp_path_factory.mktemp("journey")
+    scene = SCENE.replace("[800, 600]", "[1200, 900]").replace("steps = 3", "steps = 10")
+    (folder / "scene.toml").write_text(scene, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:  # a tenth of the promise's views: what they cost is time
+        patch.setattr(run_module, "PROMISE_VIEWS", 40)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
+        assert command("optimize", folder / "scene.toml", "--out", folder / "run") == 0
+    assert command("sheet", folder / "run", "--out", folder / "sheet.pdf", "--check") == 0
+    pdf, run, photos = folder / "sheet.pdf", folder / "run", folder / "photos"
+    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--out", photos, "--jobs", 1) == 0
+    assert command("verify", photos, "--sheet", folder / "sheet.json", "--out", folder / "report") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(journey):
+    return json.loads((journey / "report" / "report.json").read_text())
+
+
+def test_every_file_of_the_contract_is_there(journey):
+    for name in ("design.png", "run.json", "steps.jsonl", "views.png", "checkpoint.safetensors"):
+        assert (journey / "run" / name).stat().st_size > 0, name
+    assert (journey / "report" / "report.html").stat().st_size > 10_000
+    assert len(list((journey / "photos").glob("*.jpg"))) == PHOTOS
+    manifest = load_manifest(journey / "sheet.json")
+    assert attached_manifest(journey / "sheet.pdf") == manifest
+    assert str(journey) not in (journey / "sheet.json").read_text()
+    assert str(journey).encode() not in (journey / "sheet.pdf").read_bytes()
+
+
+def test_photographs_are_judged_and_measured(report):
+    assert report["summary"]["judged"] == PHOTOS and report["summary"]["measured"] >= PHOTOS - 1
+    for photo in report["photos"]:
+        assert photo["scale_x"] is None and photo["scale_y"] is None  # a photograph alone cannot show it
+        assert set(photo["predictions"]) == {"builtin"}
+
+
+def test_design_corners_are_where_the_truth_says(journey, report):
+    """Half a millimeter in the median, 1.5 mm at worst, over the photographs that count as measured."""
+    truth = json.loads((journey / "photos" / "truth.json").read_text())
+    corners = geometry.rect_corners(load_manifest(journey / "sheet.json").design.rect_mm)
+    errors = []
+    for photo in report["photos"]:
+        if photo["status"] == "measured":
+            told, true = (np.array(entry["homography_px_from_mm"]) for entry in (photo, truth[photo["file"]]))
+            back = geometry.apply_homography(np.linalg.inv(true), geometry.apply_homography(told, corners))
+            errors.append(np.linalg.norm(back - corners, axis=1).max())
+    assert np.median(errors) < 0.5 and max(errors) < 1.5
+
+
+@pytest.fixture(scope="module")
+def controls(journey, tmp_path_factory):
+    """A folder of photographs of the bare object and of a gray control, under the conditions of the design's."""
+    folder = tmp_path_factory.mktemp("controls")
+    for control in ("bare", "gray"):
+        arguments = ("--run", journey / "run", "--n", PHOTOS, "--control", control, "--out", folder / control)
+        assert command("reprint", journey / "sheet.pdf", *arguments) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def again(journey, controls, tmp_path_factory):
+    """The report of the same photographs with the run at hand, beside the controls'."""
+    folder, sheet = tmp_path_factory.mktemp("again"), journey / "sheet.json"
+    with_run = ("--run", journey / "run", "--controls", controls, "--out", folder / "report")
+    assert command("verify", journey / "photos", "--sheet", sheet, *with_run) == 0
+    return json.loads((folder / "report" / "report.json").read_text())
+
+
+def test_forecasts_at_measured_views_are_what_photographs_show(report, again):
+    chances = np.array([photo["forecast"] for photo in again["photos"]])
+    seen = np.array([photo["predictions"]["builtin"]["recognized"] for photo in again["photos"]])
+    assert ((chances > 0) & (chances < 1)).all() and (np.abs(chances - seen) > 0.5).sum() <= 1
+    summary = again["summary"]["forecast"]
+    assert summary["photos"] == PHOTOS and summary["recognized"] == seen.sum()
+    assert summary["interval"][0] <= summary["recognized"] <= summary["interval"][1]
+    assert summary["brier"] == pytest.approx(np.mean((chances - seen) ** 2))
+    assert all(photo["forecast"] is None for photo in report["photos"]) and report["summary"]["forecast"] is None
+
+
+def test_an_effect_estimated_from_photographs_is_that_of_the_photographed_control(report, again):
+    """One photograph of the control at most is judged otherwise than its estimate."""
+    _, photographed = again["controls"]
+    estimated = {control["name"]: control for control in again["summary"]["estimated"]["controls"]}
+    assert set(estimated) == {"mean", "gray", "noise"} and again["summary"]["estimated"]["agree"] >= 0.8
+    gray = estimated["gray"]
+    assert abs(gray["rate"] - photographed["recognized"] / photographed["n"]) <= 1 / PHOTOS
+    assert gray["difference_interval"][0] <= photographed["difference"] <= gray["difference_interval"][1]
+    assert report["summary"]["estimated"] == again["summary"]["estimated"]
+
+
+def test_another_runs_forecasts_are_refused(journey, tmp_path, capsys):
+    scene = (journey / "scene.toml").read_text().replace("width_mm = 90", "width_mm = 91")
+    (tmp_path / "scene.toml").write_text(scene.replace("steps = 10", "steps = 1"), encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_module, "PROMISE_VIEWS", 8)
+        assert command("optimize", tmp_path / "scene.toml", "--out", tmp_path / "run") == 0
+    capsys.readouterr()
+    sheet, run = journey / "sheet.json", tmp_path / "run"
+    assert command("verify", journey / "photos", "--sheet", sheet, "--run", run, "--out", tmp_path / "report") == 1
+    said = capsys.readouterr().err
+    assert "Expected the run of sheet" in said and not (tmp_path / "report").exists()
+
+
+def test_the_promise_predicts_the_photographs_it_is_a_promise_of(journey, report):
+    """The conditions of these very photographs, rendered as for a promise: at most one in eight is judged otherwise."""
+    from patchproof.optimizer.problem import set_problem
+    from patchproof.optimizer.promise import shown_with_controls
+    from patchproof.optimizer.responses import responses
+    from patchproof.optimizer.run import load_run
+
+    run = load_run(journey / "run")
+    problem = set_problem(run.scene)
+    shown = shown_with_controls(problem, run.design, ())
+    answers = responses(problem, shown, run.scene.draw("reprint", PHOTOS))["design"]
+    seen = [photo["predictions"]["builtin"] for photo in report["photos"]]
+    differ = answers.recognized[0] != np.array([one["recognized"] for one in seen])
+    confidence = np.array([one["target_confidence"] for one in seen])
+    assert differ.mean() <= 1 / 8
+    assert abs(answers.confidence[0].mean() - confidence.mean()) < 0.05
+
+
+def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
+    """EXIF holds the 35 mm equivalent as a whole number, 2 % at 28 mm; distance is from the patch, not the object's
+    middle.
+    """
+    from patchproof.optimizer.run import load_run
+    from patchproof.scene.conditions import of_fields
+
+    scene = load_run(journey / "run").scene
+    truth = json.loads((journey / "photos" / "truth.json").read_text())
+    for photo in report["photos"]:
+        if photo["status"] != "measured":
+            continue
+        drawn = truth[photo["file"]]["conditions"]
+        conditions = of_fields({k: np.array([v]) for k, v in drawn.items() if k != "print_scale"})
+        pose = scene.camera_from_world(conditions)[0] @ scene.placement.world_from_piece
+        azimuth, _, distance = geometry.view_angles(pose, np.array(scene.placement.size_mm) / 2)
+        assert photo["azimuth_deg"] == pytest.approx(azimuth, abs=2)
+        if photo["focal"] == "confirmed":
+            assert photo["distance_mm"] == pytest.approx(distance, rel=0.04)
+        else:  # nearly frontal views, whose perspective tells crops from nothing
+            assert photo["distance_mm"] is None
+
+
+def test_the_sheet_is_the_same_bytes_when_made_twice(journey, tmp_path):
+    assert command("sheet", journey / "run", "--out", tmp_path / "again.pdf") == 0
+    assert (tmp_path / "again.pdf").read_bytes() == (journey / "sheet.pdf").read_bytes()
+    assert (tmp_path / "again.json").read_bytes() == (journey / "sheet.json").read_bytes()
+
+
+def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
+    small = shipped("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
+    assert "177.0, 262.4]" in small
+    (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "60.0, 60.0]"), encoding="utf-8")
+    pdf, run = tmp_path / "tiles.pdf", journey / "run"
+    # a control, for which no promise is made anew
+    assert command("sheet", run, "--out", pdf, "--template", tmp_path / "small.toml", "--control", "mean") == 0
+    manifest = load_manifest(tmp_path / "tiles.json")
+    scans, given = tmp_path / "scans", ("--scan-dpi", 120)
+    assert command("reprint", pdf, "--run", run, "--n", 1, "--out", scans, *given) == 0
+    sheet = ("--sheet", tmp_path / "tiles.json", "--models", "builtin", "--ledger", 0)
+    assert command("verify", scans, *sheet, "--out", tmp_path / "report", *given) == 0
+    photos = json.loads((tmp_path / "report" / "report.json").read_text())["photos"]
+    truth = json.loads((scans / "truth.json").read_text())
+    assert len(photos) == len(manifest.tiles) + 1 >= 3
+    for photo, tile in zip(photos[1:], manifest.tiles, strict=True):
+        assert photo["status"] == "measured" and photo["scale_x"] == pytest.approx(1, abs=0.003)
+        own = np.array(tile.page_from_design_mm)[:, 2] - np.array(manifest.tiles[0].page_from_design_mm)[:, 2]
+        corners = geometry.rect_corners(tile.cut_mm) - own
+        at = [
+            geometry.apply_homography(np.array(one["homography_px_from_mm"]), corners)
+            for one in (photo, truth[photo["file"]])
+        ]
+        assert np.abs(at[0] - at[1]).max() / 120 * 25.4 < 0.25
+
+
+def test_a_page_printed_too_small_shows_in_a_scan_and_in_the_ruler(journey, tmp_path):
+    sheet, run = journey / "sheet.json", journey / "run"
+    arguments = ("--run", run, "--n", 1, "--out", tmp_path / "scans", "--scan-dpi", 150, "--print-scale", "0.97")
+    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
+    assert command("verify", tmp_path / "scans", "--sheet", sheet, "--out", tmp_path / "scan", "--scan-dpi", 150) == 0
+    scanned = json.loads((tmp_path / "scan" / "report.json").read_text())
+    (photo,) = scanned["photos"]
+    assert photo["scale_x"] == pytest.approx(0.97, abs=0.003) and photo["scale_y"] == pytest.approx(0.97, abs=0.003)
+    assert photo["code"] == "scale_off" and scanned["summary"]["rate"] is None
+    (tmp_path / "photo").mkdir()
+    shutil.copy(journey / "photos" / "photo_0001.jpg", tmp_path / "photo")
+    arguments = ("--sheet", sheet, "--out", tmp_path / "ruler", "--ruler-mm", "97.1x97.3", "--ledger", 0)
+    assert command("verify", tmp_path / "photo", *arguments) == 0
+    (typed,) = json.loads((tmp_path / "ruler" / "report.json").read_text())["photos"]
+    assert (typed["scale_x"], typed["scale_y"]) == pytest.approx((0.971, 0.973))
+
+
+def test_control_photographs_test_the_effect(report, again):
+    """A carton is recognized with or without the patch: an effect is tested, and none is shown."""
+    bare, gray = again["controls"]
+    assert (bare["name"], gray["name"]) == ("bare", "gray")
+    for control in (bare, gray):
+        assert control["pairs"] == control["n"] == PHOTOS
+        assert control["difference"] == pytest.approx(again["summary"]["rate"] - control["recognized"] / PHOTOS)
+    assert bare["recognized"] >= PHOTOS - 1 and bare["shown"] is False
+    assert report["summary"]["effect"] == "not_tested" and again["summary"]["effect"] == "not_shown"
+
+
+def test_a_smaller_print_looks_like_a_farther_one(journey, tmp_path):
+    arguments = ("--run", journey / "run", "--n", 1, "--out", tmp_path / "photos", "--print-scale", "0.9x0.9")
+    assert command("reprint", journey / "sheet.pdf", *arguments) == 0
+    full, small = (
+        json.loads((folder / "truth.json").read_text())["photo_0001.jpg"]
+        for folder in (journey / "photos", tmp_path / "photos")
+    )
+    sides = []
+    for photo in (full, small):
+        corners = np.array(next(iter(photo["marker_corners_px"].values())))
+        sides.append(np.linalg.norm(corners[0] - corners[1]))
+    assert sides[1] / sides[0] == pytest.approx(0.9, rel=0.02)
+
+
+def test_evaluate_writes_fresh_rates(journey, capsys):
+    assert command("evaluate", journey / "run", "--n", 8) == 0
+    result = json.loads((journey / "run" / "evaluate.json").read_text())
+    assert result["n"] == 8 and set(result["models"]["builtin"]["controls"]) == {"bare", "mean", "gray", "noise"}
+    assert command("evaluate", journey / "run", "--n", 4) == 1  # not without --overwrite
+    assert "which exists: add --overwrite" in capsys.readouterr().err
+    assert json.loads((journey / "run" / "evaluate.json").read_text()) == result
+
+
+def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):
+    pdf, run = journey / "sheet.pdf", journey / "run"
+    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--out", tmp_path / "photos", "--jobs", 2) == 0
+    for path in (journey / "photos").iterdir():
+        assert (tmp_path / "photos" / path.name).read_bytes() == path.read_bytes()
+    written = []
+    for jobs in (1, 2):
+        assert command("evaluate", run, "--n", 8, "--jobs", jobs, "--overwrite") == 0
+        written.append((run / "evaluate.json").read_bytes())
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("optimize", "no.toml", "--out", "x"), "no file at no.toml"),
+        (("optimize", "{j}/scene.toml", "--out", "{j}/run"), "--overwrite"),
+        (("evaluate", "{j}"), "a finished run"),
+        (("sheet", "{j}/photos", "--out", "x.pdf"), "a finished run"),
+        (("sheet", "{j}/run", "--out", "{j}/sheet.pdf"), "which exists"),
+        (("sheet", "{j}/run", "--out", "x.pdf", "--template", "a5"), "a4"),
+        (("reprint", "{j}/sheet.json", "--run", "{j}/run", "--n", "1", "--out", "x"), "a PDF of a sheet"),
+        (("reprint", "{j}/sheet.pdf", "--run", "{j}/run", "--n", "1", "--out", "x", "--printer", "cotaed"), '"coated"'),
+        (("verify", "{j}/photos", "--sheet", "{j}/run/run.json", "--out", "x"), "run.json"),
+        (("verify", "{j}/photos", "--sheet", "{j}/nothing.json", "--out", "x"), "no file"),
+        (("verify", "{j}/nowhere", "--sheet", "{j}/sheet.json", "--out", "x"), "a folder of photographs"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "{j}/report"), "--overwrite"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "file:no.pt2"), "no.pt2"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "resnet"), '"resnet"'),
+    ],
+)
+def test_bad_input_ends_in_one_sentence_and_exit_code_1(journey, tmp_path, monkeypatch, capsys, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    assert command(*(argument.replace("{j}", str(journey)) for argument in arguments)) == 1
+    error = capsys.readouterr().err.strip()
+    assert sentence in error.splitlines()[-1] and error.splitlines()[-1].startswith("Expected ")
+    assert "Traceback" not in error
+    assert not (tmp_path / "x").exists() and not list(tmp_path.glob("*.pdf"))
+
+
+def test_a_folder_in_which_nothing_can_be_judged_exits_with_1_and_still_reports(journey, tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "note.jpg").write_text("this is no picture")
+    arguments = ("verify", tmp_path / "photos", "--sheet", journey / "sheet.json", "--out", tmp_path / "report")
+    assert command(*arguments) == 1
+    assert "got none" in capsys.readouterr().err
+    (photo,) = json.loads((tmp_path / "report" / "report.json").read_text())["photos"]
+    assert (photo["status"], photo["code"]) == ("rejected", "unreadable")
+
+
+def test_require_kept_makes_any_other_verdict_exit_with_1(journey, tmp_path):
+    few = tmp_path / "few"
+    few.mkdir()
+    for name in ("photo_0001.jpg", "photo_0002.jpg"):
+        shutil.copy(journey / "photos" / name, few)
+    sheet = ("--sheet", journey / "sheet.json", "--ledger", 0)
+    assert command("verify", few, *sheet, "--out", tmp_path / "a") == 0
+    assert command("verify", few, *sheet, "--out", tmp_path / "b", "--require", "kept") == 1
+    assert json.loads((tmp_path / "a" / "report.json").read_text())["summary"]["verdict"] == "cannot_tell"
+
+
+def test_bad_meshes_end_in_one_sentence_or_a_warning(data, tmp_path, capsys):
+    from patchproof.base.strict import Refused
+    from patchproof.mesh.load_mesh import load_mesh
+
+    names = sorted(path.name for path in (data / "meshes" / "bad").iterdir() if path.suffix in {".obj", ".glb", ".stl"})
+    refused = 0
+    for name in names:
+        mesh = data / "meshes" / "bad" / name
+        scene = tmp_path / f"{name}.toml"
+        scene.write_text(SCENE.replace("primitive:carton", str(mesh)), encoding="utf-8")
+        try:
+            assert load_mesh(mesh, 300, "y").warnings, f"{name} is taken as if it were whole"
+        except Refused:
+            refused += 1
+            assert command("optimize", scene, "--out", tmp_path / name) == 1
+            assert capsys.readouterr().err.strip().splitlines()[-1].startswith("Expected ")
+            assert not (tmp_path / name).exists()
+    assert refused >= 5 and len(names) == 20
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    import subprocess
+
+    heavy = "('torch', 'cv2', 'scipy', 'matplotlib')"
+    code = f"import sys, patchproof.app.cli\nsys.exit(any(m in sys.modules for m in {heavy}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

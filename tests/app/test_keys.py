@@ -1,0 +1,95 @@
+"""The page of all keys is what the settings classes say, and says all of it."""
+
+from __future__ import annotations
+
+import ast
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from console import lab_command
+
+import patchlab
+import patchproof
+from patchlab.keys import HEAD, documents
+from patchproof.app.cli.keys import DOCUMENTS, keys_page, meanings, tables
+from patchproof.base.strict import Refused, Strict
+from patchproof.sheets.template import QrCode
+
+ROOT = Path(__file__).resolve().parents[2]
+EVERY = {**DOCUMENTS, **documents()}
+
+
+def models() -> set[type[Strict]]:
+    return {model for _, settings in EVERY.values() for _, model in tables(settings)}
+
+
+def test_the_stored_page_is_what_is_printed():
+    for page, printed in (("keys", keys_page(DOCUMENTS)), ("lab_keys", keys_page(documents(), head=HEAD))):
+        stored = (ROOT / f".readme/{page}.md").read_text(encoding="utf-8")
+        assert stored == printed, "run: patchproof keys > .readme/keys.md; patchlab keys > .readme/lab_keys.md"
+
+
+def test_every_key_says_what_it_means():
+    silent = [
+        f"{model.__name__}.{key}"
+        for model in models()
+        for key, field in model.model_fields.items()
+        if key not in meanings(model)
+        and not (isinstance(field.annotation, type) and issubclass(field.annotation, Strict))  # has its own table
+    ]
+    assert not silent, "add a comment at the end of the line, or above it"
+
+
+def test_every_settings_class_is_on_the_page():
+    covered = models()
+    sources = [Path(package.__file__).parent for package in (patchproof, patchlab)]
+    for path in (path for source in sources for path in source.rglob("*.py") if "results" not in path.parts):
+        module = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and node.name.endswith(("Settings", "Template")):
+                settings = getattr(import_module(module), node.name)
+                assert any(issubclass(model, settings) for model in covered), f"{module}.{node.name}"
+
+
+def test_meanings_stand_beside_fields_or_above_them():
+    assert meanings(QrCode)["size_mm"] == "its side, without the quiet zone"
+    scene = EVERY["scene"][1]
+    view, camera = scene.model_fields["view"].annotation, scene.model_fields["camera"].annotation
+    assert meanings(view)["roll_deg"] == "of the camera about its axis"
+    assert meanings(camera)["photo_px"] == "Width and height of a whole photograph."  # above
+    inherited = meanings(EVERY["transfer"][1])
+    assert inherited["networks"] == "to train on and to test" and "lights" in inherited
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "| `length_mm` | number, > 0 | mm | none | a mesh's longest extent |",
+        '| `up` | `"y"`, `"z"` |  | `"z"` | the mesh file\'s axis that points up |',
+        "| `elevation_deg` | [low, high], -89 to 89 | ° | `[2, 27]` | of the camera above the horizontal |",
+        "| `white_balance` | number, 0 to 0.5 |  | `0.05` | largest error of the red and of the blue gain |",
+        "| `photo_px` | [2 integers, 64 to 20000] | px | `[1600, 1200]` | Width and height of a whole photograph. |",
+        "| `corners_mm` | list of [2 numbers], 2 or more | mm | required | top-left, one per marker |",
+        "| `swatch_mm` | number, ≥ 4 | mm | required | side; below 4 a phone's photograph of a whole page has too few "
+        "pixels |",
+        "| `views` | table of [low, high] |  | `{}` | Azimuths in degrees by name; without any, thirds of each scene's "
+        "own range. |",
+    ],
+)
+def test_rows(row):
+    assert row in [*keys_page(DOCUMENTS).splitlines(), *keys_page(documents()).splitlines()]
+
+
+def test_one_kind_of_file_is_printed_alone(capsys):
+    assert lab_command("keys", "promises") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("## promises\n") and "`path_traced`" in printed and "## scene" not in printed
+    with pytest.raises(Refused, match='did you mean "promises"'):
+        keys_page(documents(), "promise")
+
+
+def test_the_help_of_study_names_every_study(capsys):
+    assert lab_command("study", "--help") == 0
+    printed = capsys.readouterr().out
+    assert "  promises   Whether promised rates hold" in printed and "patchlab keys NAME" in printed

@@ -1,0 +1,277 @@
+"""Settings are strict: each mistake in a scene file is refused in one sentence that names it."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from patchproof.base import strict
+from patchproof.base.goal import Goal
+from patchproof.base.settings import SceneSettings, identifying, load_scene_settings
+from patchproof.base.strict import Refused, Strict, expand, nearest, shipped, validated
+from patchproof.sheets.manifest import Promise, Target
+
+SCENE = """
+[object]
+mesh = "primitive:mug"
+length_mm = 100
+[patch]
+width_mm = 40
+height_mm = 30
+[target]
+label = "jeep"
+models = ["builtin"]
+"""
+
+
+def scene(tmp_path, *changes: tuple[str, str], extra: str = "") -> Path:
+    text = SCENE
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "scene.toml").write_text(text + extra)
+    return tmp_path / "scene.toml"
+
+
+def refusal(path) -> str:
+    with pytest.raises(Refused) as error:
+        load_scene_settings(path)
+    text = str(error.value)
+    assert text.startswith("Expected ") and ", got " in text and text.endswith(".") and "\n" not in text
+    return text
+
+
+def test_the_shortest_scene_has_the_documented_defaults(tmp_path):
+    read = load_scene_settings(scene(tmp_path))
+    assert read.object.up == "z" and read.patch.side == "+x" and read.sheet.template == "a4"
+    assert read.view.azimuth_deg == (-60, 60) and read.camera.jpeg == (60, 95) and read.printer.profile == "coated"
+    assert (read.optimize.steps, read.optimize.views, read.target.goal) == (240, 4, "assist")
+    with pytest.raises(Exception, match="frozen"):
+        read.object.up = "y"
+
+
+def test_a_number_may_be_a_label(tmp_path):
+    assert load_scene_settings(scene(tmp_path, ('"jeep"', "609"))).target.label == 609
+
+
+def test_an_unknown_key_names_the_nearest(tmp_path):
+    assert 'got "patch.widht_mm": did you mean "width_mm"' in refusal(scene(tmp_path, ("width_mm", "widht_mm")))
+    assert 'did you mean "camera"' in refusal(scene(tmp_path, extra="[camrea]\nnoise = [0, 0]\n"))
+    assert "use one of: object, patch" in refusal(scene(tmp_path, extra="[qqq]\nx = 1\n"))
+
+
+def test_an_unknown_key_inside_lists_and_optional_tables_is_refused_too():
+    class Inner(Strict):
+        width: int = 0
+
+    class Outer(Strict):
+        rows: tuple[Inner, ...] = ()
+        named: dict[str, Inner] | None = None
+        maybe: Inner | None = None
+
+    wrong = {"widht": 1}
+    for data in ({"rows": [wrong]}, {"named": {"a": wrong}}, {"maybe": wrong}):
+        with pytest.raises(Refused, match='widht": did you mean "width"'):
+            validated(Outer, data, "file")
+
+
+def test_a_missing_key_is_named(tmp_path):
+    text = refusal(scene(tmp_path, ('label = "jeep"\n', "")))
+    assert '"target.label"' in text and "add target.label" in text
+    assert '"target"' in refusal(scene(tmp_path, ('[target]\nlabel = "jeep"\nmodels = ["builtin"]\n', "")))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("length_mm = 100", "", 'usable "object".*object takes length_mm together with mesh'),
+        ('mesh = "primitive:mug"\n', "", 'usable "object".*object takes one of mesh, photos or images'),
+        ("length_mm = 100", 'length_mm = 100\nphotos = "p"\nsheet = "s"', "object takes one of mesh, photos or images"),
+        ('mesh = "primitive:mug"\nlength_mm = 100', 'photos = "p"', "object takes sheet together with photos"),
+        ('mesh = "primitive:mug"\nlength_mm = 100', 'images = "p"', "object takes labels together with images"),
+        ("height_mm = 30\n", "", "patch takes width_mm and height_mm together"),
+        ("width_mm = 40\nheight_mm = 30\n", "", r"got others: add patch\.width_mm and patch\.height_mm\.$"),
+        ("height_mm = 30", "height_mm = 30\nepsilon = 0.1", "epsilon with textures only"),
+        ("height_mm = 30", 'height_mm = 30\nkind = "masked"', "one of mask, materials or faces"),
+        ("height_mm = 30", 'height_mm = 30\nmask = "m.png"', 'mask with kind = "masked" only'),
+        ("height_mm = 30", 'height_mm = 30\nkind = "texture"\nbend = true', "bend with patches only"),
+    ],
+)
+def test_keys_that_go_together_are_named(tmp_path, old, new, sentence):
+    assert re.search(sentence, refusal(scene(tmp_path, (old, new))))
+
+
+def test_a_texture_needs_a_mesh(tmp_path):
+    changes = (
+        ('mesh = "primitive:mug"\nlength_mm = 100', 'images = "p"\nlabels = "l"'),
+        ("[patch]", '[patch]\nkind = "texture"'),
+    )
+    assert 'name object.mesh, or leave out patch.kind = "texture"' in refusal(scene(tmp_path, *changes))
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "0", "-5", '"wide"'])
+def test_lengths_are_finite_positive_numbers(tmp_path, value):
+    assert "length_mm" in refusal(scene(tmp_path, ("length_mm = 100", f"length_mm = {value}")))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[view]\nazimuth_deg = [60, -60]",
+        "[view]\nazimuth_deg = [nan, 60]",
+        "[view]\nazimuth_deg = [1, 2, 3]",
+        "[view]\nazimuth_deg = 5",
+        "[view]\nelevation_deg = [0, 90]",
+        "[view]\ndistance_mm = [0, 100]",
+        "[view]\nfov_deg = 170",
+        "[view]\nlook_at = 'sky'",
+        "[light]\nambient = [-0.1, 0.5]",
+        "[camera]\nphoto_px = [16, 1200]",
+        "[camera]\njpeg = [0, 95]",
+        "[camera]\njpeg = [95, 60]",
+        "[camera]\nnoise = [0, 1.5]",
+        "[camera]\nwhite_balance = 0.6",
+        "[background]\ncolor = [0.5, 0.5, 1.1]",
+        "[background]\nimages = 'x'\ncolor = [0.5, 0.5, 0.5]",
+        "[light]\npoint = [1, 0.5]",
+        "[light]\npoint_distance_mm = [0, 100]",
+        "[light]\nsh2 = [0, 1.1]",
+        "[light]\nshininess = [0, 20]",
+        "[camera]\nvignetting = [0, 0.99]",
+        "[camera]\nmotion_px = [-1, 2]",
+        "[optimize]\nviews = 0",
+        "[view]\npatch_share = [0.1, 1.2]",
+        "[optimize]\nsteps = 0",
+        "[optimize]\nsteps = 1.5",
+        "[optimize]\noptimizer = 'sgd'",
+    ],
+)
+def test_each_wrong_value_is_refused_by_its_key(tmp_path, line):
+    text = refusal(scene(tmp_path, extra=line + "\n"))
+    table, key = line.split("]")[0][1:], line.split("\n")[1].split(" =")[0]
+    assert table in text and (key in text or table == "background")
+
+
+def test_a_reversed_range_says_both_ends(tmp_path):
+    assert "[low, high] with low <= high, not [60, -60]" in refusal(
+        scene(tmp_path, extra="[view]\nazimuth_deg = [60, -60]\n")
+    )
+
+
+def test_no_models_are_refused(tmp_path):
+    assert "target.models" in refusal(scene(tmp_path, ('["builtin"]', "[]")))
+
+
+def test_files_that_are_no_toml(tmp_path):
+    assert "no file at" in refusal(tmp_path / "none.toml")
+    (tmp_path / "a.toml").write_text("this is = = not toml")
+    assert "cannot be read" in refusal(tmp_path / "a.toml")
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
+    assert "cannot be read" in refusal(tmp_path / "b.toml")
+    assert "no file at" in refusal(tmp_path)
+
+
+def test_expand_paths_and_names(tmp_path, monkeypatch):
+    monkeypatch.setenv("PP_TEST_DIR", "/data")
+    absolute = str(tmp_path / "x" / "car.glb")
+    assert expand("car.glb", tmp_path / "x") == absolute and expand(absolute, Path("/elsewhere")) == absolute
+    assert expand("${PP_TEST_DIR}/car.glb", tmp_path) == "/data/car.glb"
+    assert expand("file:${PP_TEST_DIR}/net.pt2", tmp_path) == "file:/data/net.pt2"
+    assert expand("file:net.pt2", tmp_path) == f"file:{tmp_path / 'net.pt2'}"
+    assert expand("timm:vit@w.safetensors", tmp_path) == f"timm:vit@{tmp_path / 'w.safetensors'}"
+    assert expand("torchvision:vgg11@/data/w.safetensors", tmp_path) == "torchvision:vgg11@/data/w.safetensors"
+    kept = ("timm:hf-hub:timm/vit@main", "timm:vit@w.pth", "torchvision:resnet50", "timm:vit")
+    for name in ("builtin", "primitive:mug", *kept, "module:a.b"):
+        assert expand(name, tmp_path) == name
+    monkeypatch.delenv("PP_TEST_DIR")
+    with pytest.raises(Refused, match="the environment variable PP_TEST_DIR, got none"):
+        expand("${PP_TEST_DIR}/car.glb", tmp_path)
+
+
+def test_settings_keep_variables_unexpanded(tmp_path):
+    read = load_scene_settings(scene(tmp_path, ('"primitive:mug"', '"${NOWHERE}/a.glb"')))
+    assert read.object.mesh == "${NOWHERE}/a.glb"
+
+
+def test_refused_is_one_sentence_whatever_it_is_given():
+    text = str(Refused("a\n thing", "  another\tone", "do this."))
+    assert text == "Expected a thing, got another one: do this." and issubclass(Refused, ValueError)
+
+
+def test_nearest():
+    assert nearest("coatet", ["coated", "news"]) == 'did you mean "coated"'
+    assert nearest("zzz", ["coated", "news"]) == "use one of: coated, news"
+
+
+def test_values_in_messages_are_short():
+    data = {"object": {"mesh": "m", "length_mm": "9" * 500 + "x"}, "patch": {}, "target": {}}
+    with pytest.raises(Refused) as error:
+        validated(SceneSettings, data, "scene")
+    assert len(str(error.value)) < 300
+
+
+@pytest.mark.parametrize("folder", ["calibration", "print_templates"])
+def test_shipped_data_is_found_in_checkout_and_in_package(tmp_path, monkeypatch, folder):
+    assert shipped(folder).is_dir()
+    for root in (tmp_path / "site" / "patchproof", tmp_path / "checkout" / "src" / "patchproof"):
+        root.mkdir(parents=True)
+        monkeypatch.setattr(strict, "__file__", str(root / "base" / "strict.py"))
+        with pytest.raises(Refused, match=folder):
+            shipped(folder)
+        home = root if "site" in root.parts else root.parents[1]
+        (home / folder / "sub").mkdir(parents=True)
+        assert shipped(folder, "sub", "a.json") == home / folder / "sub" / "a.json"
+
+
+def test_numbers_stay_numbers(tmp_path):
+    read = load_scene_settings(scene(tmp_path))
+    assert (
+        math.isclose(read.object.length_mm, 100) and SceneSettings.model_validate_json(read.model_dump_json()) == read
+    )
+
+
+def test_keys_of_former_runs_are_forgotten_where_they_changed_nothing(tmp_path):
+    former = load_scene_settings(
+        scene(tmp_path, extra="[optimize]\nrefresh = 1\nmine = 0\nnps = 0\nin_gamut = false\nsteps = 7")
+    )
+    assert former.optimize.steps == 7
+    for key, value in (("mine", "8"), ("in_gamut", "true")):
+        with pytest.raises(Refused, match=key):
+            load_scene_settings(scene(tmp_path, extra=f"[optimize]\n{key} = {value}"))
+
+
+def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
+    plain, spelled = (load_scene_settings(scene(tmp_path, extra=text)) for text in ("", "[optimize]\nsteps = 240"))
+    other = load_scene_settings(scene(tmp_path, extra="[optimize]\nsteps = 241"))
+    assert identifying(plain) == identifying(spelled) != identifying(other)
+
+
+def test_settings_change_through_a_door_that_checks(tmp_path):
+    plain = load_scene_settings(scene(tmp_path))
+    changed = plain.changed(optimize={"steps": 3}, light={"gloss": (0.1, 0.2)})
+    assert (changed.optimize.steps, changed.light.gloss) == (3, (0.1, 0.2))
+    assert changed.changed(optimize={"steps": 240}, light={"gloss": (0, 0)}) == plain
+    for wrong, named in (({"steps": -3}, "steps"), ({"stepz": 3}, 'did you mean "steps"')):
+        with pytest.raises(Refused, match=named):
+            plain.changed(optimize=wrong)
+    with pytest.raises(Refused, match="optimice"):
+        plain.changed(optimice={"steps": 3})
+
+
+def test_a_goal_that_is_none_is_refused_wherever_it_stands(tmp_path):
+    with pytest.raises(Refused, match="goal"):
+        load_scene_settings(scene(tmp_path, ('label = "jeep"', 'label = "jeep"\ngoal = "assits"')))
+    with pytest.raises(Refused, match="goal"):
+        validated(Target, {"label": "jeep", "indices": [1], "goal": "confuse"}, "sheet.json")
+    assert [(str(goal), goal.sign) for goal in Goal] == [("assist", 1), ("deceive", -1)]
+
+
+def test_the_former_spelling_of_gray_is_read(tmp_path):
+    former = ("[patch]\n", '[patch]\nkind = "texture"\nstart = "grey"\n')
+    assert load_scene_settings(scene(tmp_path, former)).patch.start == "gray"
+    claim = {"rate": 0.5, "interval": [0.4, 0.6], "confidence": 0.5, "difference": 0.1, "difference_interval": [0, 0.2]}
+    target = {"label": "jeep", "indices": [1], "goal": "assist"}
+    model = {"name": "net", "sha256": None, "rate": 0.6, "interval": [0.5, 0.7], "confidence": 0.6}
+    promise = {"target": target, "models": [model], "rate": 0.6, "interval": [0.5, 0.7], "n": 400, "conditions": []}
+    assert list(validated(Promise, promise | {"controls": {"grey": claim}}, "sheet.json").controls) == ["gray"]

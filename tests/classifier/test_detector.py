@@ -1,0 +1,314 @@
+"""Detectors: boxes of meshes, what counts as seen, the words they share with classifiers, and the one that ships."""
+
+import importlib
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import patchproof as pp
+from patchlab.training import train_detector
+from patchlab.training.pictures import pictures
+from patchproof.base.geometry import intrinsics, project
+from patchproof.base.goal import Goal
+from patchproof.base.strict import Refused
+from patchproof.channel.boxes import MOST_POINTS, box_of, outermost
+from patchproof.classifier.builtin_detector import HERE, INPUT_PX
+from patchproof.classifier.detector import NOTHING, Detector, at_score, iou
+from patchproof.classifier.load import load_classifier
+from patchproof.classifier.precision import average_precision, findings, unsuppressed
+from patchproof.optimizer.goals import target_loss
+from patchproof.render.stage import set_stage
+from patchproof.render.views import see
+
+FOUR = [0.25, 0.25, 0.75, 0.75]
+
+
+def candidates(*rows):
+    """A network that gives the same candidates for every picture: (left, top, right, bottom), logits."""
+    table = torch.tensor([[*box, *logits] for box, logits in rows])
+    return lambda photos: table[None].expand(len(photos), -1, -1) + 0 * photos.mean()
+
+
+def detector(*rows, **kwargs):
+    return Detector("made", None, 8, ("cat", "dog"), candidates(*rows), **kwargs)
+
+
+def test_the_best_candidate_on_the_object_is_what_counts():
+    made = detector(([0, 0, 8, 8], [3.0, 9.0]), ([2, 2, 6, 6], [1.0, -2.0]), ([2, 2, 6, 5], [2.0, -4.0]))
+    photo, box = torch.rand(1, 3, 8, 8), np.array([FOUR])
+    # the first one's overlap is 16 / 64, the others' 1 and 3 / 4
+    assert made.logits(photo, box).tolist() == [[2.0, -2.0]]
+    assert made.logits(photo).tolist() == [[3.0, 9.0]]  # nobody knows where: anywhere
+    assert made.logits(photo, np.array([[0.9, 0.9, 1.0, 1.0]])).tolist() == [[NOTHING, NOTHING]]
+    logits = made.logits(photo, box)
+    assert made.confidence(logits, (0,)).item() == pytest.approx(1 / (1 + math.exp(-2)))
+    assert made.confidence(logits, (0, 1)).item() == made.confidence(logits, (0,)).item()  # the best, not the sum
+    assert made.recognized(logits, (0,)).item() and not made.recognized(logits, (1,)).item()
+
+
+@pytest.mark.parametrize(("share", "counts"), [(0.51, True), (0.49, False)])
+def test_half_an_overlap_is_the_last_that_counts(share, counts):
+    made = detector(([0, 0, 8 * share, 8], [4.0, 0.0]))
+    assert made.recognized(made.logits(torch.rand(1, 3, 8, 8), np.array([[0, 0, 1, 1]])), (0,)).item() is counts
+
+
+@pytest.mark.parametrize(("score", "counts"), [(0.7, True), (0.75, False)])
+def test_the_score_from_which_on_boxes_count_is_the_scene_s(score, counts):
+    made = at_score(detector(([2, 2, 6, 6], [1.0, 0.0])), score)  # a score of 0.731
+    assert made.recognized(made.logits(torch.rand(1, 3, 8, 8), np.array([FOUR])), (0,)).item() is counts
+    plain = pp.Classifier("plain", None, 8, ("a",), lambda x: x)
+    assert at_score(plain, score) is plain
+
+
+def test_losses_fall_where_the_goal_is_reached_and_keep_their_gradient():
+    made = detector(([0, 0, 8, 8], [0.0, 0.0]))
+    for logit in (-60.0, 0.0, 60.0):
+        logits = torch.tensor([[logit, 0.0]], requires_grad=True)
+        likely, rest = (term.item() for term in made.odds(logits, (0,)))
+        assert likely == pytest.approx(-math.log1p(math.exp(-logit)))
+        assert rest == pytest.approx(-math.log1p(math.exp(logit)))
+    for goal in Goal:
+        wrong = torch.tensor([[-60.0 * goal.sign, 0.0]], requires_grad=True)
+        (gradient,) = torch.autograd.grad(target_loss(made.odds(wrong, (0,)), goal).sum(), wrong)
+        assert gradient[0, 0].item() == pytest.approx(-goal.sign)
+
+
+def test_overlaps_are_those_of_counted_pixels():
+    rng = np.random.default_rng(0)
+    boxes = np.sort(rng.integers(0, 30, (40, 2, 2)), axis=1).reshape(40, 4)
+    truth = np.array([5, 7, 22, 19])
+    y, x = np.mgrid[:30, :30]
+
+    def cells(box):
+        return (x >= box[0]) & (x < box[2]) & (y >= box[1]) & (y < box[3])
+
+    counted = [(cells(b) & cells(truth)).sum() / max((cells(b) | cells(truth)).sum(), 1) for b in boxes]
+    ours = iou(torch.tensor(boxes)[None].float(), torch.tensor(truth)[None].float())[0]
+    np.testing.assert_allclose(ours, counted, atol=1e-6)
+
+
+def test_a_box_holds_every_pixel_of_the_object_and_no_more():
+    """Against the rasterizer: the object's own pixels in a bare view on a plain background."""
+    settings = {
+        "object": {"mesh": "python:spot", "length_mm": 300},
+        "patch": {"width_mm": 40, "height_mm": 40},
+        "target": {"label": 0, "models": ["builtin"]},
+        "camera": {"photo_px": [320, 240]},
+        "view": {"look_at_jitter": 0.15, "roll_deg": [-20, 20]},
+    }
+    scene = pp.make_scene(settings, trimesh.creation.box((3, 2, 1)))
+    stage, conditions = set_stage(scene), scene.draw("evaluate", 6)
+    for i, box in enumerate(scene.boxes(conditions)):
+        seen = see(stage, None, conditions[[i]], (200, 200))
+        rows, columns = np.divmod(seen.on_object.pixel.numpy(), 200)
+        drawn = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
+        assert np.abs(box * 200 - drawn).max() <= 1.0
+
+
+def test_many_points_and_few_give_the_same_box():
+    sphere = trimesh.creation.icosphere(5).vertices * 100.0
+    few = outermost(np.asarray(sphere))
+    assert len(sphere) > 10_000 and len(few) <= MOST_POINTS
+    pose = np.eye(4)
+    pose[:3, :3], pose[2, 3] = Rotation.from_euler("xyz", (0.3, 0.8, -0.5)).as_matrix(), 600
+    size = (400, 400)
+    whole, thinned = (box_of(points, pose, intrinsics(40, size), size) for points in (sphere, few))
+    assert np.abs(whole - thinned).max() < 0.01 * (whole[2] - whole[0])
+    assert len(outermost(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))) == 3  # flat meshes have no hull
+
+
+def test_boxes_are_clipped_and_nothing_in_view_has_none():
+    points, size = np.array([[-50.0, -50, 0], [50, 50, 0]]), (100, 80)
+    pose = np.eye(4)
+    pose[2, 3] = 10.0
+    np.testing.assert_array_equal(box_of(points, pose, intrinsics(60, size), size), [0, 0, 100, 80])
+    pose[2, 3] = -10.0  # behind the camera
+    np.testing.assert_array_equal(box_of(points, pose, intrinsics(60, size), size), 0)
+    pose[:3, 3] = 1000, 0, 10
+    np.testing.assert_array_equal(box_of(points, pose, intrinsics(60, size), size), 0)
+    assert project(intrinsics(60, size), pose, points).shape == (2, 2)
+
+
+def test_average_precision_by_hand():
+    """Three pictures, two of which show the object: hits of 0.9 and 0.6, a duplicate of 0.8, a false one of 0.7."""
+
+    def logit(score):
+        return math.log(score / (1 - score))
+
+    here, away = [0.0, 0, 10, 10], [50.0, 50, 60, 60]
+    rows = torch.tensor(
+        [
+            [[*here, logit(0.9)], [1.0, 0, 10, 10, logit(0.8)]],
+            [[*away, logit(0.7)], [*here, logit(0.6)]],
+            [[*here, -9.0], [*away, -9.0]],
+        ]
+    )
+    assert unsuppressed(rows[0, :, :4], rows[0, :, 4]).tolist() == [0]
+    found = findings(rows, [0], torch.tensor([here] * 3), [True, True, False])
+    assert [right for _, right in found] == [True, False, True]
+    assert average_precision(found, 2) == pytest.approx((1 + 2 / 3) / 2)
+    assert average_precision(found, 3) == pytest.approx((1 + 2 / 3) / 3)
+    assert average_precision([], 3) == 0
+    assert not any(right for _, right in findings(rows, [0], torch.tensor([here] * 3), [False] * 3))
+
+
+def test_suppression_agrees_with_opencv_s():
+    rng = np.random.default_rng(1)
+    corners = rng.uniform(0, 60, (80, 2))
+    boxes = np.concatenate([corners, corners + rng.uniform(5, 30, (80, 2))], 1)
+    logits = rng.normal(0, 2, 80)
+    scores = 1 / (1 + np.exp(-logits))
+    as_opencv = np.concatenate([corners, boxes[:, 2:] - corners], 1)
+    theirs = cv2.dnn.NMSBoxes(as_opencv.tolist(), scores.tolist(), 1 / (1 + math.exp(4.6)), 0.5)
+    assert unsuppressed(torch.tensor(boxes), torch.tensor(logits)).tolist() == list(np.ravel(theirs))
+
+
+class Found(torch.nn.Module):
+    """As torchvision's detectors: a list of dictionaries, here of one box whose score is the picture's brightness."""
+
+    def forward(self, photos):
+        box = torch.tensor([[2.0, 2, 6, 6]])
+        return [{"boxes": box, "labels": torch.tensor([1]), "scores": p.mean()[None]} for p in photos]
+
+
+def test_findings_of_any_number_become_candidates_with_gradients():
+    made = pp.detector_of(Found(), 8, ["none", "cat"])
+    photos = torch.full((2, 3, 8, 8), 0.75).requires_grad_()
+    logits = made.logits(photos, np.array([FOUR, [0, 0, 0.2, 0.2]]))
+    assert logits[0].tolist() == [NOTHING, pytest.approx(math.log(3))]
+    assert logits[1].tolist() == [NOTHING, NOTHING]
+    (gradient,) = torch.autograd.grad(logits.sum(), photos)
+    assert gradient[0].sum().item() == pytest.approx(1 / 0.75 + 1 / 0.25) and not gradient[1].any()
+
+
+class Blind(torch.nn.Module):
+    def forward(self, photos):
+        empty = photos.new_zeros(0)
+        return [{"boxes": empty.view(0, 4), "labels": empty.long(), "scores": empty} for _ in photos]
+
+
+def test_a_detector_that_finds_nothing_is_doubted_aloud():
+    with pytest.warns(UserWarning, match="finds nothing in smooth pictures"):
+        load_classifier(pp.detector_of(Blind(), 8, ["cat"]), HERE)
+
+
+def test_a_detector_with_another_number_of_labels_is_refused():
+    made = Detector("made", None, 8, ("cat", "dog", "owl"), candidates(([0, 0, 8, 8], [3.0, 9.0])))
+    with pytest.raises(Refused, match="3 logits for each picture, as there are labels"):
+        load_classifier(made, HERE)
+
+
+# ------------------------------------------------------------------------------------------------ the one that ships
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return load_classifier("builtin-detector", HERE)
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return pictures(10, 7_000_000, INPUT_PX)
+
+
+def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(shipped, fresh):
+    card = json.loads((HERE / "builtin_detector.json").read_text())
+    assert card["held_out_ap50"] >= 0.8 and (HERE / "builtin_detector.safetensors").stat().st_size < 5_000_000
+    found = train_detector.precision(train_detector.found_by_class(shipped.network, fresh), fresh)
+    assert shipped.least_score == card["least_score"]
+    assert found.mean() > card["held_out_ap50"] - 0.15  # ten views of one shape are alike
+
+
+@pytest.fixture
+def two_stage(monkeypatch):
+    """Proposals and names by two networks, as R-CNN: the user's own code."""
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "src/patchlab/results/detector")
+    return importlib.import_module("two_stage")
+
+
+def test_two_stages_find_fresh_objects_and_pass_gradients(two_stage, fresh):
+    made = two_stage.rcnn()
+    assert train_detector.scored(made.network, fresh).mean() >= 0.8
+    photo, box, index = fresh.images[:1].float() / 255, fresh.boxes[:1].numpy(), fresh.labels[:1].tolist()
+    before = made.logits(photo.requires_grad_(), box)[0, index]
+    (gradient,) = torch.autograd.grad(before.sum(), photo)
+    up, down = (made.logits(photo.detach() + step * gradient.sign(), box)[0, index] for step in (0.01, -0.01))
+    assert up > before > down  # not a difference to the last digit: where it is cut out has no gradient
+
+
+def test_crops_are_opencv_s(two_stage):
+    photo, box = torch.rand(1, 3, 128, 128), torch.tensor([[[30.0, 20.0, 90.0, 100.0]]])
+    side = two_stage.MARGIN * 80
+    scale = side / two_stage.CROP_PX
+    left, top = 60 - side / 2, 60 - side / 2
+    matrix = np.array([[scale, 0, left + scale / 2 - 0.5], [0, scale, top + scale / 2 - 0.5]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = two_stage.CROP_PX, two_stage.CROP_PX
+    theirs = cv2.warpAffine(photo[0].permute(1, 2, 0).numpy(), matrix, size, flags=flags, borderValue=(0.5,) * 3)
+    np.testing.assert_allclose(two_stage.crops(photo, box)[0].permute(1, 2, 0), theirs, atol=0.04)
+
+
+@pytest.mark.parametrize("name", ["builtin-detector", "module:two_stage.rcnn"])
+def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stage, monkeypatch):
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+    scene = pp.make_scene(
+        {
+            "object": {"mesh": "primitive:box_truck", "length_mm": 400},
+            "patch": {"width_mm": 120, "height_mm": 120, "side": "+x"},
+            "target": {"label": "box truck", "models": [name], "least_score": 0.4},
+            "camera": {"photo_px": [320, 240]},
+            "optimize": {"steps": 2},
+        }
+    )
+    run = pp.optimize(scene, tmp_path / "run", promise_views=8, controls=["bare"])
+    claim = run.promise.models[0]
+    assert claim.least_score == 0.4 and 3 < len(run.promise.outermost_mm) <= MOST_POINTS
+    pp.sheet(run, tmp_path / "sheet.pdf")
+    pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
+    found = pp.evaluate(run.folder, n=4)["models"][name]["ap50"]
+    assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
+    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=[name])
+    said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
+    assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
+    truth = scene.boxes(scene.draw("reprint", 3))
+    network = at_score(load_classifier(name, HERE), 0.4)
+    for photo, box in zip(report.photos, truth, strict=True):
+        answer = photo.predictions[name]
+        pixels = torch.tensor(np.asarray(Image.open(tmp_path / "photos" / photo.file).convert("RGB")))
+        logits = network.logits(pixels.permute(2, 0, 1)[None] / 255, box[None])
+        assert answer.target_confidence == pytest.approx(network.confidence(logits, (4,)).item(), abs=0.02)
+        assert answer.recognized == (answer.target_confidence >= 0.4)
+
+
+class Bright(torch.nn.Module):
+    """One candidate, whose logits are the picture's mean red and blue."""
+
+    def forward(self, photos):
+        box = photos.new_tensor([2.0, 2, 6, 6]).expand(photos.shape[0], 4)
+        return torch.cat([box, photos.mean((2, 3))[:, ::2]], 1)[:, None]
+
+
+@pytest.mark.parametrize(("kind", "refused"), [("detector", None), ("segmenter", 'kind, "classifier" or "detector"')])
+def test_an_exported_detector_says_so_in_its_json(tmp_path, kind, refused):
+    program = torch.export.export(
+        Bright(), (torch.rand(2, 3, 8, 8),), dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)
+    )
+    torch.export.save(program, tmp_path / "net.pt2")
+    card = {"input_px": 8, "labels": ["red", "blue"], "kind": kind}
+    (tmp_path / "net.json").write_text(json.dumps(card))
+    if refused:
+        with pytest.raises(Refused, match=refused):
+            load_classifier("file:net.pt2", tmp_path)
+        return
+    made, photo = load_classifier("file:net.pt2", tmp_path), torch.rand(1, 3, 8, 8)
+    assert isinstance(made, Detector)
+    torch.testing.assert_close(made.logits(photo, np.array([FOUR])), photo.mean((2, 3))[:, ::2])
+    assert made.logits(photo, np.array([[0, 0, 0.2, 0.2]])).tolist() == [[NOTHING, NOTHING]]

@@ -1,0 +1,155 @@
+"""Photographs that are one and the same count once; crops, screenshots and what nobody looks at are named."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic_photos import DESIGN_MM, save, view
+
+from patchproof.base.strict import Refused
+from patchproof.evidence.copies import without_copies
+from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.results import Geometry, PhotoEntry
+from patchproof.photo.quality import FrameLight
+from patchproof.photo.read import not_looked_at, read_photo
+from patchproof.report.photo_table import photos_csv
+from patchproof.report.summary import verdict_lines
+from patchproof.report.words import remarks
+from test_verify_run import shot, verified
+
+SIZE = (800, 600)
+
+
+def seen(name, azimuth=10.0, distance=550.0, elevation=5.0, roll=0.0, light=0.8, sha256=None, aside=0.0, flat=True):
+    """A measured photograph of the sheet from there, `aside` pixels off its place."""
+    matrix = view(azimuth, elevation, distance, roll, SIZE)
+    cosine = np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))
+    matrix = np.array([[1, 0, aside], [0, 1, 0], [0, 0, 1]]) @ matrix
+    geometry = Geometry(
+        residual_mm=0,
+        px_per_mm=824 / distance * cosine**0.5,
+        tilt_deg=float(np.degrees(np.arccos(cosine))),
+        contrast=light,
+        blur_px=1,
+        corner_uncertainty_mm=0,
+        homography_px_from_mm=matrix.tolist() if flat else None,
+    )
+    entry = PhotoEntry(file=name, status="measured", sha256=sha256, photo_px=SIZE, geometry=geometry)
+    return MeasuredPhoto(entry, True, light=FrameLight(np.full(3, light), np.zeros(3), light, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("same", "other"),
+    [
+        ({"azimuth": 11.0}, {"azimuth": 14.0}),
+        ({"roll": 1.0}, {"roll": 1.5}),
+        ({"elevation": 6.0}, {"azimuth": -10.0}),  # as much from the other side
+        ({"distance": 559.0}, {"distance": 565.0}),
+        ({"light": 0.83}, {"light": 0.85}),
+        ({"aside": 7.9}, {"aside": 8.1}),  # a hundredth of 800 px
+    ],
+)
+def test_two_shots_of_a_hand_held_camera_are_one_and_another_view_is_none(same, other):
+    first = seen("a")
+    for how, counted in ((same, False), (other, True)):
+        both = without_copies([first, seen("b", **how)], (0, 0), DESIGN_MM)
+        assert both[0] is first and both[1].counted == counted
+        assert both[1].entry.code == (None if counted else "copy")
+    elsewhere = without_copies([first, seen("b", **same)], (0, 1), DESIGN_MM)  # in another place and its light
+    assert elsewhere[1].counted
+
+
+def test_rolled_paper_is_known_by_its_figures_and_equal_bytes_wherever_they_lie():
+    rolled = [seen("a", flat=False), seen("b", azimuth=10.5, flat=False), seen("c", azimuth=20, flat=False)]
+    assert [photo.counted for photo in without_copies(rolled, (0, 0, 0), DESIGN_MM)] == [True, False, True]
+    files = [seen("a", sha256="f" * 64), seen("b", azimuth=30, sha256="f" * 64), seen("c", azimuth=30, sha256="e" * 64)]
+    kept = without_copies(files, (0, 1, 1), DESIGN_MM)
+    assert [photo.counted for photo in kept] == [True, False, True] and "a" in kept[1].entry.remark.advice
+    nothing = MeasuredPhoto(PhotoEntry(file="d", status="rejected"), False)
+    assert without_copies([nothing, nothing], (0, 0), DESIGN_MM) == [nothing, nothing]
+
+
+def test_no_two_of_many_drawn_views_are_taken_for_one():
+    """Ten sessions of 40 in one light, from the default ranges."""
+    rng, low, high = np.random.default_rng(0), (-60, 440, 2, -5), (60, 800, 27, 5)
+    photos = [seen(str(i), *rng.uniform(low, high), aside=rng.uniform(-20, 20)) for i in range(400)]
+    kept = without_copies(photos, [i // 40 for i in range(400)], DESIGN_MM)
+    assert all(photo.counted for photo in kept)
+
+
+def test_copies_of_one_photograph_prove_nothing_and_are_named(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    save(shot(), photos / "a.jpg")
+    for i in range(10):
+        shutil.copy(photos / "a.jpg", photos / f"b{i}.jpg")
+    Image.open(photos / "a.jpg").save(photos / "c.jpg", quality=70)  # saved anew
+    save(shot()[:, 100:700], photos / "d.jpg")  # a square: no other shape
+    save(shot(25, 500)[:, 200:], photos / "Screenshot_1.jpg")
+    for name in ("e.mp4", "f.DNG", "a.mov"):  # the last is the first photograph's second of video
+        (photos / name).write_bytes(b"x")
+    save(shot(), photos / "x.jpg")
+    (photos / "deep" / "deeper").mkdir(parents=True)
+    (photos / "x.jpg").rename(photos / "deep" / "deeper" / "x.jpg")
+    controls = tmp_path / "bare"
+    controls.mkdir()
+    for name in ("1.png", "2.png"):
+        save(np.tile(np.linspace(0, 255, 100).astype(np.uint8)[:, None], (100, 1, 3)), controls / name)
+    report = verified(photos, controls=controls)
+    codes = {photo.file: photo.code for photo in report.photos}
+    assert codes["a.jpg"] is None and {codes[f"b{i}.jpg"] for i in range(10)} == {codes["c.jpg"]} == {"copy"}
+    assert codes["Screenshot_1.jpg"] == "cropped" and codes["d.jpg"] is None
+    summary = report.summary
+    assert (summary.photos, summary.judged, summary.verdict) == (14, 3, "cannot_tell")
+    assert report.controls[0].n == 1
+    lines = "\n".join(verdict_lines(report))
+    for words in (
+        "copy: 10 (b0.jpg, b1.jpg, b2.jpg and 7 more): its bytes are those of a.jpg",
+        "copy: 1 (c.jpg): it shows what a.jpg shows",
+        "cropped: 1 (Screenshot_1.jpg): it is a crop or a screenshot",
+        "take still photographs): e.mp4",
+        "save them as JPEG): f.DNG",
+        "one folder for each session): deep/deeper",
+        "bare/2.png has the bytes of bare/1.png",
+    ):
+        assert words in lines
+    assert "a.mov" not in lines
+    table = photos_csv(report.model_dump(mode="json")["photos"])
+    assert table.count(",copy,") == 11 and '"its bytes are those of a.jpg' in table
+
+
+@pytest.mark.parametrize(
+    ("size", "tags", "name", "part"),
+    [
+        ((400, 300), {0xA002: 4000, 0xA003: 3000}, "a.jpg", False),  # all of it, made smaller
+        ((300, 400), {0xA002: 4000, 0xA003: 3000}, "a.jpg", False),
+        ((400, 297), {0xA002: 4000, 0xA003: 3000}, "a.jpg", False),  # within a percent, and a pixel
+        ((400, 296), {0xA002: 4000, 0xA003: 3000}, "a.jpg", True),
+        ((400, 300), {0x9286: b"ASCII\0\0\0Screenshot"}, "a.jpg", True),
+        ((400, 300), {}, "Screen Shot 1.jpg", True),
+        ((400, 300), {}, "a.jpg", False),
+    ],
+)
+def test_a_crop_and_a_screenshot_are_known_by_exif_and_name(tmp_path, size, tags, name, part):
+    exif = Image.Exif()
+    for key, value in tags.items():
+        exif.get_ifd(0x8769)[key] = value
+    Image.new("RGB", size).save(tmp_path / name, exif=exif)
+    assert read_photo(tmp_path / name).part == part
+
+
+def test_a_folder_of_raw_files_alone_is_refused_with_their_names(tmp_path):
+    (tmp_path / "a.cr3").write_bytes(b"x")
+    with pytest.raises(Refused, match=r"got none; raw files.*a\.cr3"):
+        verified(tmp_path)
+    assert not_looked_at(tmp_path / "nowhere") == []
+
+
+def test_codes_of_photographs_come_with_names_and_advice():
+    photos = [{"file": f"{i}.jpg", "code": "blurred", "advice": "hold still"} for i in range(5)]
+    photos += [{"file": "z.jpg", "code": "tilted", "advice": "turn"}, {"file": "y.jpg", "code": None, "advice": "-"}]
+    expected = [("blurred", "hold still", 5, "0.jpg, 1.jpg, 2.jpg and 2 more"), ("tilted", "turn", 1, "z.jpg")]
+    assert remarks(photos) == expected

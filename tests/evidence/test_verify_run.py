@@ -1,0 +1,375 @@
+"""Whole folders of photographs: every code, every count, and nothing that stops the batch."""
+
+from __future__ import annotations
+
+import functools
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from synthetic_photos import make_manifest, noisy_design, page_raster, photograph, save, some_design, view
+
+from patchproof.base.claims import wilson
+from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.base.strict import Refused
+from patchproof.channel.printer import identity_printer, load_printer
+from patchproof.classifier import Classifier
+from patchproof.evidence.appearance import _fitted_by_others, cells_fit
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.measure import measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.run import gather_evidence
+from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.evidence.task import Options
+from patchproof.photo.quality import FrameLight, shows_nothing
+from patchproof.photo.read import Photo
+
+
+def promise(conditions=()):
+    model = dict(name="net", sha256="ab" * 32, rate=0.9, interval=[0.85, 0.93], confidence=0.8)
+    target = dict(label="bright", indices=[0], goal="assist")
+    return dict(
+        target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=400, controls={}, conditions=conditions
+    )
+
+
+def brightness(photos):
+    level = photos.mean((1, 2, 3))
+    return torch.stack([level * 20, torch.full_like(level, 5.0)], 1)  # "bright" above a mean of 0.25
+
+
+NET = Classifier("net", "ab" * 32, 32, ("bright", "dark"), brightness)
+
+
+@functools.cache
+def raster(only_piece: bool, first_id: int = 0):
+    return page_raster(make_manifest(first_id=first_id), only_piece)
+
+
+def shot(azimuth=10, distance=550, only_piece=True, first_id=0, **look):
+    homography = view(azimuth, 5, distance, size_px=(800, 600))
+    return photograph(raster(only_piece, first_id), homography, (800, 600), fine=3, **{"blur_px": 0.5, **look})
+
+
+def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
+    manifest = manifest or make_manifest()
+    surface = surface_of(manifest)
+    promised = promised_of(manifest, surface, identity_printer())
+    return measure(view_of(Photo(srgb, focal_px), None), "a", surface, promised, promised_ranges(conditions), scan_dpi)
+
+
+def test_a_good_photo_is_measured_and_its_pose_is_right():
+    # 800×600 at 40° across the short side: focal length 300 / tan 20° = 824.2 px
+    look = measured(shot(30, 550, jpeg=92, noise=0.003), focal_px=824.2)
+    entry = look.entry
+    assert (entry.status, entry.code, entry.markers_found, look.counted) == ("measured", None, 8, True)
+    geometry, pose = entry.geometry, entry.pose
+    assert pose.azimuth_deg == pytest.approx(30, abs=0.5) and pose.distance_mm == pytest.approx(550, rel=0.01)
+    assert geometry.tilt_deg == pytest.approx(30.4, abs=1) and geometry.blur_px == pytest.approx(0.5, abs=0.2)
+    assert geometry.px_per_mm == pytest.approx(824.2 / 550 * np.sqrt(np.cos(np.radians(30.4))), rel=0.02)
+    assert entry.color.color_fit == "affine12" and entry.color.delta_e00_mean < 2.5 and entry.scale is None
+    assert geometry.contrast == pytest.approx(0.8, abs=0.05)
+
+
+def test_light_and_white_balance_are_no_color_difference_but_another_design_is():
+    plain = measured(shot()).entry.color.delta_e00_mean
+    tinted = measured(shot(light=np.array([0.8, 0.6, 0.45]))).entry.color.delta_e00_mean
+    assert tinted == pytest.approx(plain, abs=0.5)
+
+
+def test_another_design_is_seen():
+    assert measured(shot(), manifest=make_manifest(design=some_design(9))).entry.color.delta_e00_mean > 40
+
+
+def coated(srgb: np.ndarray) -> np.ndarray:
+    """What a shipped printer makes of sRGB H×W×3."""
+    seen = load_printer("coated").apply(torch.from_numpy(srgb).permute(2, 0, 1)[None].float())
+    return seen[0].permute(1, 2, 0).double().numpy()
+
+
+def weak(srgb: np.ndarray) -> np.ndarray:
+    """Magenta and yellow that lack density."""
+    return srgb_from_linear(linear_from_srgb(coated(srgb)) ** [1, 0.8, 0.55])
+
+
+def faded(srgb: np.ndarray) -> np.ndarray:
+    """Half way to gray, in light."""
+    light = linear_from_srgb(coated(srgb))
+    return srgb_from_linear((light + light.mean(-1, keepdims=True)) / 2)
+
+
+def dot_gain(srgb: np.ndarray) -> np.ndarray:
+    """Midtones a fourth too dark."""
+    return coated(srgb - srgb * (1 - srgb) / 4)
+
+
+@pytest.mark.parametrize(
+    ("design", "printed", "differs", "shown"),
+    [
+        ("smooth", coated, 0.0, 0.9),
+        ("smooth", dot_gain, 4.9, 2.4),
+        ("smooth", weak, 11.3, 5.7),
+        ("smooth", faded, 8.5, 1.2),  # what mixes light linearly is taken for the camera's
+        ("noisy", coated, 0.0, 1.5),  # cells of many colors differ by a share of a pixel
+        ("noisy", weak, 9.5, 5.0),
+    ],
+)
+def test_another_print_than_promised_is_seen_as_far_as_no_affine_map_explains_it(design, printed, differs, shown):
+    """ΔE00 of the prints themselves, and what a photograph says."""
+    sent = some_design() / 255 if design == "smooth" else noisy_design()
+    promise, hanging = coated(sent), printed(sent)
+    delta = ciede2000(*(lab_from_linear(linear_from_srgb(srgb)) for srgb in (promise, hanging)))
+    assert delta.mean() == pytest.approx(differs, abs=0.2)
+    manifests = [make_manifest(design=np.rint(srgb * 255).astype(np.uint8)) for srgb in (promise, hanging)]
+    srgb = photograph(page_raster(manifests[1], True), view(10, 5, 550, size_px=(800, 600)), (800, 600), 0.5, 0.003)
+    color = measured(srgb, manifest=manifests[0]).entry.color
+    assert color.color_fit == "affine12" and color.delta_e00_mean == pytest.approx(shown, abs=0.4)
+
+
+def light_on(paper: float) -> FrameLight:
+    return FrameLight(np.full(3, paper), np.zeros(3), paper, 0.0)
+
+
+def test_no_cell_is_fitted_to_itself():
+    """36 cells with noise of 0.05: a fit to themselves brings them nearer to the promise than they are."""
+    usable, errors = np.zeros((8, 8), bool), []
+    usable[1:-1, 1:-1] = True
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        promised = rng.uniform(0.05, 0.9, (8, 8, 3))
+        lit = promised + rng.normal(0, 0.05, promised.shape)
+        fit = cells_fit(lit[usable], promised[usable], light_on(1.0), np.zeros(3))
+        fitted = _fitted_by_others(lit, promised, usable, fit, light_on(1.0), np.zeros(3))
+        errors.append([np.sqrt(((cells - promised)[usable] ** 2).mean()) for cells in (lit, fit.apply(lit), fitted)])
+    truth, own, others = np.mean(errors, 0)
+    assert own < 0.98 * truth < truth < others < 1.15 * truth
+
+
+def test_gloss_on_part_of_the_design_does_not_turn_the_map():
+    promised = cv2.resize(linear_from_srgb(noisy_design()), (46, 46), interpolation=cv2.INTER_AREA)
+    lit = 0.5 * promised
+    lit[10:24, 5:19] += 0.25  # on 9 % of it
+    fit = cells_fit(lit.reshape(-1, 3), promised.reshape(-1, 3), light_on(0.5), np.zeros(3))
+    assert fit.name == "affine12" and fit.matrix == pytest.approx(np.column_stack([2 * np.eye(3), np.zeros(3)]))
+
+
+def test_gloss_on_the_design_is_left_out_and_counted():
+    plain = measured(shot(light=0.5)).entry
+    assert plain.color.glossy_share == 0 and plain.color.clipped_share == 0
+    srgb = shot(light=0.5)
+    spot = cv2.warpPerspective(
+        np.pad(np.full((42, 42), 0.25, np.float32), ((115, 140), (84, 84))),
+        np.array(plain.geometry.homography_px_from_mm),
+        srgb.shape[1::-1],
+    )
+    shiny = srgb_from_linear(linear_from_srgb(srgb / 255) + spot[..., None]) * 255
+    entry = measured(np.clip(shiny + 0.5, 0, 255).astype(np.uint8)).entry
+    assert entry.color.glossy_share == pytest.approx(0.09, abs=0.03) and entry.code is None
+    assert entry.color.delta_e00_mean < plain.color.delta_e00_mean + 0.8  # 2.5 with gloss in it
+
+
+@pytest.mark.parametrize("design", ["one gray", "grays"])
+def test_where_a_design_has_too_few_colors_paper_and_ink_fix_the_color(design):
+    srgb = noisy_design(colorful=False) if design == "grays" else np.full((140, 140, 3), 0.5)
+    manifest = make_manifest(design=np.rint(srgb * 255).astype(np.uint8))
+    tint, homography = np.array([0.8, 0.6, 0.45]), view(10, 5, 550, size_px=(800, 600))
+    photo = photograph(page_raster(manifest, True), homography, (800, 600), 0.5, light=tint)
+    color = measured(photo, manifest=manifest).entry.color
+    assert color.color_fit == "white_black" and color.delta_e00_mean < 2.5
+
+
+@pytest.mark.parametrize(
+    ("srgb", "status", "code"),
+    [
+        (lambda: np.full((300, 400, 3), 120, np.uint8), "rejected", "too_few_markers"),
+        (lambda: np.ascontiguousarray(shot()[:, ::-1]), "rejected", "mirrored"),
+        (lambda: shot(first_id=300), "rejected", "wrong_sheet"),
+        (lambda: np.concatenate([shot(), shot()], 1), "rejected", "several_sheets"),
+        (lambda: np.concatenate([shot(), shot(first_id=300)], 1), "rejected", "several_sheets"),
+        (lambda: shot(light=3.0), "judged", "clipped"),
+        (lambda: shot(82, 250), "judged", "tilted"),
+    ],
+)
+def test_each_trouble_has_its_code_and_advice(srgb, status, code):
+    look = measured(srgb())
+    assert (look.entry.status, look.entry.code) == (status, code)
+    assert look.entry.remark.advice and look.counted == (status != "rejected")
+
+
+def test_what_is_not_clipped_is_measured_even_where_paper_is():
+    color = measured(shot(light=2.0)).entry.color
+    assert color.clipped_share == pytest.approx(0.36, abs=0.03) and color.delta_e00_mean < 1
+
+
+def test_a_corner_of_the_piece_identifies_the_sheet_but_is_not_measured():
+    photo = shot(0, 400)
+    photo[:, 330:] = 120  # only the left markers stay
+    photo[200:] = 120
+    look = measured(photo)
+    assert (look.entry.status, look.entry.code, look.counted) == ("judged", "too_few_markers", True)
+
+
+def test_bent_paper_is_never_measured_as_flat():
+    import cv2
+
+    photo = shot(0, 400)
+    rows, columns = np.mgrid[0:600, 0:800].astype(np.float32)
+    bent = cv2.remap(photo, columns, rows + 14 * np.sin(columns / 90), cv2.INTER_LINEAR)
+    entry = measured(bent).entry
+    assert entry.status == "judged" or entry.geometry.residual_mm > 0.3
+
+
+def test_views_outside_of_the_promise_are_not_counted():
+    claims = make_manifest(
+        promise([dict(px_per_mm=s, tilt_deg=t, azimuth_deg=t, contrast=None, blur_px=None, recognized=True)
+                 for s, t in ((1.2, 0.0), (2.0, 30.0))])
+    ).promise.conditions  # fmt: skip
+    assert measured(shot(10, 550), claims).entry.code is None
+    for outside in (shot(10, 1100), shot(50, 450)):
+        look = measured(outside, claims)
+        assert (look.entry.status, look.entry.code, look.counted) == ("rejected", "out_of_range", False)
+
+
+def test_the_uncut_page_and_scans_are_measured_but_not_counted():
+    page = measured(shot(10, 900, only_piece=False))
+    assert page.entry.status == "measured" and not page.counted and page.entry.scale is None
+    for sx, sy, code in ((1.0, 1.0, None), (0.97, 0.965, "scale_off"), (1.003, 0.997, None)):
+        homography = np.diag([100 / 25.4 * sx, 100 / 25.4 * sy, 1.0])
+        homography[:2, 2] = 7.3, 4.9
+        scan = photograph(raster(False), homography, (860, 1200), blur_px=0.5, light=0.9, fine=3)
+        look = measured(scan, scan_dpi=100)
+        assert (look.entry.status, look.entry.code, look.counted) == ("measured", code, False)
+        scale = look.entry.scale
+        assert (scale.scale_x, scale.scale_y) == pytest.approx((sx, sy), abs=0.002)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    photos = tmp_path_factory.mktemp("photos")
+    for i in range(6):
+        save(shot(8 * i - 20, 500 + 20 * i, seed=i, noise=0.003), photos / f"b{i}.jpg")
+    (photos / "a.JPG").write_text("no picture")
+    save(np.full((200, 300, 3), 99, np.uint8), photos / "c.png")
+    (photos / "truth.json").write_text("{ broken")
+    (photos / "notes.txt").write_text("x")
+    (photos / ".hidden.jpg").write_text("x")
+    return photos
+
+
+def verified(folder, jobs=1, progress=lambda done, total: None, **options):
+    options = Options([NET], identity_printer(), **options)
+    return gather_evidence(folder, make_manifest(promise()), options, jobs=jobs, progress=progress)
+
+
+def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
+    calls = []
+    report = verified(folder, progress=lambda done, total: calls.append((done, total)))
+    assert [p.file for p in report.photos] == ["a.JPG", *(f"b{i}.jpg" for i in range(6)), "c.png"]
+    assert [p.code for p in report.photos] == ["unreadable", *[None] * 6, "too_few_markers"]
+    summary = report.summary
+    assert (summary.photos, summary.judged, summary.measured, summary.rate) == (8, 6, 6, 1.0)
+    # one of seven readable photographs shows no marker: more than 10 %
+    assert (summary.verdict, summary.effect, summary.ledger) == ("cannot_tell", "not_tested", None)
+    assert calls[-1] == (8, 8)
+    prediction = report.photos[1].predictions["net"]
+    assert prediction.label == "bright" and prediction.recognized
+    assert prediction.confidence == prediction.target_confidence > 0.5
+    assert report.photos[0].predictions == {} and report.photos[-1].predictions
+
+
+def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(folder, tmp_path):
+    """A network may have one answer for everything: pure noise, a black picture and a white one are no evidence."""
+    rng = np.random.default_rng(0)
+    always = Classifier("net", "ab" * 32, 32, ("bright", "dark"), lambda p: torch.tensor([[9.0, 0]]).expand(len(p), 2))
+    pictures = {
+        "noise": rng.integers(0, 256, (240, 320, 3)),
+        "faint": rng.normal(128, 3, (240, 320, 3)),
+        "black": np.zeros((240, 320, 3)),
+        "white": np.full((240, 320, 3), 255),
+    }
+    for name, picture in pictures.items():
+        save(picture.astype(np.uint8), tmp_path / f"{name}.png")
+
+    def report():
+        return gather_evidence(tmp_path, make_manifest(promise()), Options([always], identity_printer()))
+
+    nothing = report()
+    for photo in nothing.photos:
+        assert photo.predictions["net"].recognized
+        assert (photo.status, photo.code, photo.markers_found) == ("rejected", "too_few_markers", 0)
+    summary = nothing.summary
+    assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 0, None, "cannot_tell")
+    assert [(s.recognized, s.judged) for s in summary.sessions] == [(0, 0)] * len(summary.sessions)
+    (tmp_path / "b0.jpg").write_bytes((folder / "b0.jpg").read_bytes())  # beside one that shows the sheet
+    summary = report().summary
+    assert (summary.judged, summary.models["net"].interval) == (1, wilson(1, 1))
+    assert sum(s.recognized for s in summary.sessions) == 1 and summary.verdict == "cannot_tell"
+
+
+def test_two_processes_give_the_same_bytes_as_one(folder):
+    assert verified(folder, jobs=2).model_dump_json() == verified(folder).model_dump_json()
+
+
+def test_controls_decide_the_effect(folder, tmp_path):
+    for i in range(6):
+        save(half_lit(20 + i), tmp_path / f"b{i}.jpg")
+    evidence = verified(folder, controls=tmp_path)
+    assert evidence.summary.effect == "shown"
+    (control,) = evidence.controls
+    assert (control.recognized, control.n, control.pairs) == (0, 6, 6)
+
+
+def half_lit(code):
+    """A picture of something: two tones."""
+    picture = np.full((100, 100, 3), code, np.uint8)
+    picture[:, 50:] += 10
+    return picture
+
+
+def test_controls_that_show_nothing_never_count_and_are_named(folder, tmp_path):
+    """Lens caps, black frames and noise are no bare object: with them alone no effect is tested."""
+    rng = np.random.default_rng(0)
+    nothing = {
+        "b0": rng.integers(0, 256, (100, 100, 3)),
+        "b1": rng.normal(3, 2, (100, 100, 3)).clip(0, 255),
+        "b2": np.zeros((100, 100, 3)),
+        "b3": np.full((100, 100, 3), 255),
+    }
+    for name, picture in nothing.items():
+        save(picture.astype(np.uint8), tmp_path / f"{name}.jpg")
+    (tmp_path / "b9.jpg").write_bytes(b"no picture")
+    evidence = verified(folder, controls=tmp_path)
+    (control,) = evidence.controls
+    assert (control.n, control.shown, evidence.summary.effect) == (0, None, "not_tested")
+    said = evidence.summary.left_out
+    assert sum("one tone or noise" in sentence for sentence in said) == 4 and any("b9.jpg" in each for each in said)
+    save(half_lit(20), tmp_path / "b4.jpg")  # beside one of something
+    (control,) = verified(folder, controls=tmp_path).controls
+    assert (control.recognized, control.n) == (0, 1)
+
+
+@pytest.mark.parametrize(("contrast", "nothing"), [(1, True), (3, False)])
+def test_two_tones_show_something_from_a_code_or_two_on(contrast, nothing):
+    picture = np.full((240, 320, 3), 90, np.uint8)
+    picture[:, 160:] += contrast
+    assert shows_nothing(picture) is nothing
+
+
+def test_only_scans_have_no_rate(tmp_path):
+    homography = np.diag([4.0, 4.0, 1.0])
+    save(photograph(raster(False), homography, (860, 1200), light=0.9, fine=3), tmp_path / "scan.png")
+    summary = verified(tmp_path, scan_dpi=101.6).summary
+    assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 1, None, "cannot_tell")
+
+
+def test_folders_and_judges_that_will_not_do_are_refused_in_a_sentence(tmp_path):
+    for path, words in ((tmp_path / "gone", "no folder at"), (tmp_path, "got none")):
+        with pytest.raises(Refused, match=words):
+            verified(path)
+    save(np.zeros((50, 50, 3), np.uint8), tmp_path / "a.jpg")
+    other = Classifier("other", None, 32, ("bright", "dark"), brightness)
+    retrained = Classifier("net", "cd" * 32, 32, ("bright", "dark"), brightness)
+    for model, words in ((other, "the promise's own network net"), (retrained, "another file under that name")):
+        with pytest.raises(Refused, match=words):
+            gather_evidence(tmp_path, make_manifest(promise()), Options([model], identity_printer()))

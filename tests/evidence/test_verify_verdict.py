@@ -1,0 +1,187 @@
+"""The rule from counts to a verdict, by hand numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_photos import make_manifest
+
+from patchproof.base.goal import Goal
+from patchproof.evidence.ranges import matched_rate, promised_ranges, promised_side_px
+from patchproof.evidence.results import Geometry, PhotoEntry, Pose
+from patchproof.evidence.verdict import asked_rate, compare, effect_of, judge, kept_chance
+from patchproof.sheets.manifest import ConditionClaim, Promise
+
+
+def promise_of(rate: float, control: float = 0.0, goal: str = "assist", correlation: float = 0.0) -> Promise:
+    """A promise of 100 sessions of 6, whose rates are drawn from the beta distribution with that correlation."""
+    hits = [i < 600 * rate for i in range(600)]
+    if correlation:
+        strength, rng = 1 / correlation - 1, np.random.default_rng(5)
+        hits = (rng.random((100, 6)) < rng.beta(rate * strength, (1 - rate) * strength, (100, 1))).ravel().tolist()
+        rate = float(np.mean(hits))
+    claim = dict(interval=(0, 1), confidence=0.5)
+    empty = dict(px_per_mm=None, tilt_deg=None, azimuth_deg=None, contrast=None, blur_px=None)
+    return Promise(
+        target=dict(label="jeep", indices=(1,), goal=goal),
+        models=[dict(name="m", sha256=None, rate=rate, **claim)],
+        rate=rate,
+        interval=(0, 1),
+        n=600,
+        per_session=6 if correlation else 1,
+        controls={"bare": dict(rate=control, difference=rate - control, difference_interval=(-1, 1), **claim)},
+        conditions=[dict(recognized=hit, **empty) for hit in hits],
+    )
+
+
+def word(recognized: int, photos: tuple[int, ...], promise: Promise, without: int = 0) -> str:
+    return judge(recognized, photos, promise, without).verdict
+
+
+def test_the_rule_at_both_ends_of_the_interval():
+    low, high = prediction = promise_of(0.9).spread.counts((40,))
+    assert prediction == judge(36, (40,), promise_of(0.9)).prediction_interval and low < 36 < high
+    assert word(low - 1, (40,), promise_of(0.9)) == "broken"
+    assert word(low, (40,), promise_of(0.9)) == "cannot_tell"  # allowed for, and no proof
+    assert word(36, (40,), promise_of(0.9)) == word(40, (40,), promise_of(0.9)) == "kept"
+
+
+@pytest.mark.parametrize(
+    ("recognized", "photos", "rate", "control"), [(0, 40, 0.0875, 0.05), (1, 5, 0.2, 0.1), (40, 40, 0.9, 0.93)]
+)
+def test_what_proves_nothing_keeps_no_promise(recognized, photos, rate, control):
+    """None of 40 at 8.75 % promised; one of five at 20 %; all of 40 where the bare object is as good."""
+    assert word(recognized, (photos,), promise_of(rate, control)) == "cannot_tell"
+
+
+def test_a_rate_too_low_is_rarely_called_kept_and_the_promised_one_mostly():
+    """40 photographs in 4 sessions, 85 % promised; true rates of 85, 75, 70 and 65 %."""
+    rng, promise, photos = np.random.default_rng(0), promise_of(0.85, 0.3, correlation=0.05), (10,) * 4
+    words = [word(count, photos, promise) for count in range(41)]
+    for rate, most in ((0.75, 0.30), (0.70, 0.11), (0.65, 0.04)):
+        counts = rng.binomial(10, rng.beta(19 * rate, 19 * (1 - rate), (4000, 4))).sum(1)
+        assert np.mean([words[count] == "kept" for count in counts]) <= most
+    counts = rng.binomial(10, rng.beta(19 * 0.85, 19 * 0.15, (4000, 4))).sum(1)
+    assert np.mean([words[count] == "kept" for count in counts]) >= 0.60
+    assert kept_chance(promise, photos) == pytest.approx(
+        np.mean([words[c] == "kept" for c in counts]), abs=0.12
+    )  # which knows rate and spread
+
+
+@pytest.mark.parametrize(("goal", "rate", "control"), [("assist", 0.85, 0.3), ("deceive", 0.15, 0.7)])
+def test_the_chance_of_kept_is_that_of_all_counts_which_are_called_so(goal, rate, control):
+    for photos in ((40,), (10,) * 4, (5,)):
+        promise = promise_of(rate, control, goal, correlation=0.1)
+        words = [word(count, photos, promise) == "kept" for count in range(sum(photos) + 1)]
+        assert kept_chance(promise, photos) == pytest.approx(promise.spread.chances(photos) @ words, abs=1e-12)
+
+
+def test_photographs_in_one_place_prove_less():
+    promise = promise_of(0.85, 0.3, correlation=0.2)
+    chances = [kept_chance(promise, photos) for photos in ((40,), (10,) * 4, (5,) * 8)]
+    assert chances == sorted(chances) and chances[0] < 0.4 < chances[2]
+    assert "other places" in judge(33, (40,), promise).reason
+
+
+def test_deceive_is_the_mirror_image_of_assist():
+    for k in range(41):
+        mirrored = promise_of(0.1, 1.0, "deceive")
+        assert word(k, (40,), promise_of(0.9)) == word(40 - k, (40,), mirrored)
+    assert asked_rate(promise_of(0.1, 0.2, "deceive")) == pytest.approx(0.2)
+
+
+def test_fewer_than_five_or_too_many_without_markers_cannot_tell():
+    assert word(0, (4,), promise_of(0.9)) == "cannot_tell"
+    assert word(0, (5,), promise_of(0.9)) == "broken"
+    assert judge(0, (), promise_of(0.9)).prediction_interval is None
+    # 4 of 40 readable ones are 10 %, 5 of 41 are more
+    assert word(36, (36,), promise_of(0.9), 4) == "kept"
+    assert word(36, (36,), promise_of(0.9), 5) == "cannot_tell"
+
+
+def test_pairs_by_file_name_go_to_mcnemar():
+    patch = {f"{i}.jpg": True for i in range(10)}
+    control = {f"{i}.jpg": i < 4 for i in range(10)}
+    compared = compare(patch, "bare", control, Goal.assist)
+    # six discordant pairs, all one way: 2 · (1/2)⁶ = 0.03125
+    assert (compared.pairs, compared.p_value, compared.shown) == (10, pytest.approx(0.03125), True)
+    assert not compare(patch, "bare", control, Goal.deceive).shown
+    assert compare(control, "bare", patch, Goal.deceive).shown
+    control["4.jpg"] = True  # five pairs: 0.0625
+    assert not compare(patch, "bare", control, Goal.assist).shown
+
+
+def test_a_few_names_that_happen_to_be_equal_are_no_pairs():
+    patch = {f"a{i}.jpg": True for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
+    control = {f"b{i}.jpg": False for i in range(40)} | {f"{i}.jpg": True for i in range(6)}
+    assert compare(patch, "bare", control, Goal.assist).pairs == 0
+    assert compare(patch, "bare", control, Goal.assist).shown
+
+
+def test_different_names_go_to_newcombe():
+    patch, control = {f"a{i}": True for i in range(20)}, {f"b{i}": i < 5 for i in range(20)}
+    compared = compare(patch, "bare", control, Goal.assist)
+    assert compared.pairs == 0 and compared.p_value is None and compared.shown
+    assert compared.difference == pytest.approx(0.75) and compared.difference_interval[0] > 0
+
+
+def test_every_control_must_be_beaten_and_none_is_no_test():
+    patch = {f"{i}": True for i in range(10)}
+    good, bad = (
+        compare(patch, "bare", {f"{i}": False for i in range(10)}, Goal.assist),
+        compare(patch, "bare", patch, Goal.assist),
+    )
+    assert effect_of([good]) == "shown" and effect_of([good, bad]) == "not_shown"
+    assert effect_of([]) == effect_of([compare(patch, "bare", {}, Goal.assist)]) == "not_tested"
+    assert compare(patch, "bare", {}, Goal.assist).shown is None
+
+
+def conditions(scales, recognized):
+    rows = zip(scales, recognized, strict=True)
+    empty = dict(tilt_deg=None, azimuth_deg=None, contrast=None, blur_px=None)
+    return [ConditionClaim(px_per_mm=s, recognized=r, **empty) for s, r in rows]
+
+
+def entry(photo_px=None, pose=None, **figures):
+    rest = dict(residual_mm=0, px_per_mm=2, tilt_deg=0, contrast=1, blur_px=1, corner_uncertainty_mm=0)
+    geometry = Geometry(**rest | figures) if figures else None
+    return PhotoEntry(file="a.jpg", status="judged", photo_px=photo_px, geometry=geometry, pose=pose)
+
+
+def test_ranges_have_a_tenth_of_margin_and_ignore_what_is_unknown():
+    ranges = promised_ranges(conditions([1.0, 3.0], [True, True]))
+    # px_per_mm: 10 % of the width is 0.2; 10 % of the value 3 is 0.3, which is more
+    assert ranges.limits == {"px_per_mm": (pytest.approx(0.8), pytest.approx(3.3))}
+    assert ranges.violated(entry(px_per_mm=0.85, tilt_deg=89.0), True) is None
+    cannot = ranges.violated(entry(px_per_mm=0.7), True)
+    assert (cannot.code, cannot.figure) == ("out_of_range", 0.7) and "come closer" in cannot.advice
+    assert ranges.violated(entry(), True) is None
+
+
+def test_a_photograph_with_more_pixels_is_compared_at_the_promised_size():
+    ranges = promised_ranges(conditions([1.0, 3.0], [True, True]), side_px=1200)
+    assert ranges.violated(entry(px_per_mm=7.5, photo_px=(4000, 3000)), True) is None  # 3.0 at 1200 px
+    cannot = ranges.violated(entry(px_per_mm=9.0, photo_px=(3000, 4000)), True)
+    assert cannot.figure == pytest.approx(3.6) and "1200 px" in cannot.advice
+    assert promised_side_px(make_manifest()) is None
+
+
+def test_an_azimuth_leaves_the_range_only_where_it_is_sure_to():
+    """The promise covers up to 30 + 6°. At 40° by corners that know it to 3.9° it is outside, to 4.1° it may be in."""
+    claims = [
+        ConditionClaim(px_per_mm=1, tilt_deg=1, azimuth_deg=a, contrast=1, blur_px=1, recognized=True)
+        for a in (-30, 30)
+    ]
+    ranges = promised_ranges(claims)
+    at = [entry(px_per_mm=1, tilt_deg=1, pose=Pose(azimuth_deg=40, azimuth_uncertainty_deg=u)) for u in (3.9, 4.1)]
+    assert ranges.violated(at[0], True).code == "out_of_range"
+    assert ranges.violated(at[1], True) is None
+
+
+def test_the_matched_rate_is_that_of_the_nearest_conditions():
+    near, far = [1 + i / 1000 for i in range(20)], [5 + i / 1000 for i in range(20)]
+    claims = conditions(near + far, [True] * 20 + [False] * 20)
+    assert matched_rate([entry(px_per_mm=1.0)], claims) == 1.0
+    assert matched_rate([entry(px_per_mm=1.0), entry(px_per_mm=5.0)], claims) == 0.5
+    assert matched_rate([entry()], claims) is None and matched_rate([], claims) is None
+    assert matched_rate([entry(px_per_mm=1.0)], conditions([None], [True])) is None

@@ -1,0 +1,87 @@
+"""What a design is worth beside its best control: the word, the first line, the page, and who asks for better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from patchproof.app.cli import app
+from patchproof.report.summary import promise_lines
+from patchproof.sheets.content import PrintedPiece
+from patchproof.sheets.manifest import Promise
+from patchproof.sheets.piece import lay_out_piece
+
+
+def promise_of(rate: float, controls: dict[str, tuple[float, float, float]], goal: str = "assist") -> Promise:
+    """Controls are (rate, low, high), the ends of the design's difference to them."""
+    claim = {"interval": (0, 1), "confidence": 0.5}
+    return Promise(
+        target={"label": "jeep", "indices": (1,), "goal": goal},
+        models=[{"name": "m", "sha256": None, "rate": rate, **claim}],
+        rate=rate,
+        interval=(0, 1),
+        n=400,
+        controls={
+            name: {"rate": own, "difference": rate - own, "difference_interval": (low, high), **claim}
+            for name, (own, low, high) in controls.items()
+        },
+        conditions=(),
+    )
+
+
+def test_the_headline_compares_the_views_that_both_were_shown_in():
+    """Controls are shown in some of the views; the whole promise's rate beside theirs contradicts the difference."""
+    promise = promise_of(0.825, {"bare": (0.95, -0.24, 0.13)})
+    claim = promise.controls["bare"].changed(difference=-0.05)
+    headline = promise.changed(controls={"bare": claim}).headline
+    assert "90.0% beside 95.0% recognized in the same views, -5.0 points" in headline and "82.5" not in headline
+    assert "40.0% beside 20.0% recognized, +20.0 points" in promise_of(0.4, {"bare": (0.2, 0.1, 0.3)}).headline
+
+
+@pytest.mark.parametrize(
+    ("controls", "goal", "best", "worth"),
+    [
+        ({"bare": (0.4, 0.05, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "better"),
+        ({"bare": (0.4, 0.0, 0.2), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "no better"),
+        ({"bare": (0.6, -0.2, -0.01), "gray": (0.1, 0.3, 0.5)}, "assist", "bare", "worse"),
+        ({"bare": (0.8, -0.4, -0.2), "gray": (0.6, -0.2, -0.05)}, "deceive", "gray", "better"),
+        ({"bare": (0.8, -0.4, -0.2), "gray": (0.4, 0.05, 0.2)}, "deceive", "gray", "worse"),
+    ],
+)
+def test_the_hardest_control_decides_and_its_interval_says_the_word(controls, goal, best, worth):
+    promise = promise_of(0.5, controls, goal)
+    assert (promise.best_control, promise.worth) == (best, worth)
+    first = promise_lines(promise)[0]
+    assert first.startswith(f"{worth} than its best control ({best}): 50.0%")
+    assert ("before printing it" in first) == (worth != "better")
+
+
+def test_the_page_says_so_in_its_first_line():
+    piece = lay_out_piece((100, 100), 10, "A" * 10, "design")
+    design = np.full((8, 8, 3), 128, np.uint8)
+    kinds = [
+        PrintedPiece(piece, "A" * 10, "design", design, promise_of(0.5, {"bare": ends})).words["kind"]
+        for ends in ((0.4, 0.05, 0.2), (0.5, -0.1, 0.1), (0.6, -0.2, -0.05))
+    ]
+    assert kinds == ["design", "design, no better than bare", "design, worse than bare"]
+
+
+def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_path, monkeypatch):
+    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 60\nheight_mm = 60\n'
+        '[target]\nlabel = "mug"\nmodels = ["builtin"]\n[camera]\nphoto_px = [96, 96]\n'
+        "[optimize]\nsteps = 1\nviews = 1\n"
+    )
+
+    def run(name, *more):
+        return CliRunner().invoke(app, ["optimize", str(scene), "--out", str(tmp_path / name), *more])
+
+    asked = run("a", "--require", "better")
+    assert asked.exit_code == 1 and "no better than its best control" in asked.stdout
+    assert (tmp_path / "a" / "run.json").is_file()
+    assert run("b").exit_code == 0
+    assert run("c", "--require", "kept").exit_code == 2

@@ -1,0 +1,23 @@
+"""The detection benchmark's photographs are true to their sheets, and refinement shows in them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from patchlab.bench import detect
+from patchlab.bench.detect import find_fitted, find_plain, shoot, tried
+
+
+def test_fitted_borders_beat_plain_corners_on_known_photographs():
+    shots = [shoot((1200, 900), seed) for seed in range(2)]
+    fitted, plain = (tried(shots, find, 1000) for find in (find_fitted, find_plain))
+    off_px = np.median(fitted.errors_px)
+    assert fitted.share == 1 and off_px < 0.1 and off_px < 0.7 * np.median(plain.errors_px)
+
+
+def test_the_chart_has_a_series_per_size_and_one_default_each(monkeypatch):
+    monkeypatch.setattr(detect, "SIZES_PX", ((800, 600),))
+    monkeypatch.setattr(detect, "COARSEST", (500, 1000))
+    (chart,) = detect.charts(True, lambda *stage: None)
+    (points,) = chart.series.values()
+    assert [p.default for p in points] == [False, False, True, False] and len(chart.checks) == 2

@@ -1,0 +1,255 @@
+"""The operating envelope of a small scene: axes do what they say, windows are the photographs, the study is written."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from patchlab.study.study import run_study
+from patchlab.validation.envelope.axes import AXES, conditions_at, placed_at
+from patchlab.validation.envelope.fit import BEYOND
+from patchlab.validation.envelope.gains import gain_break, gains_of, has_effect
+from patchlab.validation.envelope.pages import figures
+from patchlab.validation.envelope.sweeps import EnvelopeSettings, cells
+from patchlab.validation.envelope.window import window
+from patchlab.validation.envelope.world import (
+    Measurement,
+    _Stages,
+    measured,
+    open_world,
+    piece_at,
+    recognized,
+)
+from patchproof.base import geometry
+from patchproof.base.claims import Estimate, paired_difference
+from patchproof.base.strict import Refused
+from patchproof.optimizer.run import optimize_scene
+from patchproof.render.photograph import photograph
+from patchproof.report.tables import drawn as drawing_of
+from patchproof.scene.conditions import with_values
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    import conftest
+
+    folder = tmp_path_factory.mktemp("envelope")
+    scene = conftest.SCENE.replace("steps = 3", "steps = 1").replace("views = 4", "views = 1")
+    (folder / "scene.toml").write_text(scene)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+        optimize_scene(folder / "scene.toml", folder / "run")
+    return open_world(folder / "run", None)
+
+
+def rows_of(path):
+    return list(csv.DictReader(path.read_text("utf-8").splitlines()))
+
+
+@pytest.fixture(scope="module")
+def drawn(world):
+    return world.scene.draw("evaluate", 4)
+
+
+def test_a_value_replaces_one_condition_and_leaves_the_others(drawn):
+    changed = with_values(drawn, jpeg=12.0)
+    assert changed.sensor.jpeg.tolist() == [12] * 4 and changed.sensor.jpeg.dtype == drawn.sensor.jpeg.dtype
+    assert np.array_equal(changed.sensor.blur_px, drawn.sensor.blur_px) and changed.pose.background.flags.writeable
+    assert with_values(drawn, blur_px=np.arange(4)).sensor.blur_px.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 88.0])
+def test_tilt_is_the_angle_from_the_patch_s_axis_and_keeps_its_direction(world, drawn, tilt_deg):
+    moved, frame = conditions_at(world.scene, drawn, {"tilt": tilt_deg}), world.scene.frame
+    before = geometry.orbit(drawn.pose.azimuth_deg, drawn.pose.elevation_deg, frame.normal, frame.up)
+    after = geometry.orbit(moved.pose.azimuth_deg, moved.pose.elevation_deg, frame.normal, frame.up)
+    assert np.degrees(np.arccos((after @ frame.normal).clip(-1, 1))) == pytest.approx(np.full(4, tilt_deg), abs=1e-5)
+    if tilt_deg:
+        sides = [np.arctan2(d @ frame.up, d @ frame.right) for d in (before, after)]
+        assert sides[0] == pytest.approx(sides[1])
+
+
+def test_curled_paper_keeps_its_lengths_and_its_middle(world):
+    flat, radius = world.scene.placement, 60.0
+    bent = placed_at(world.scene, {"curl": radius}).placement
+    assert bent.center_mm == pytest.approx(flat.center_mm, abs=0.05)
+    grid = bent.vertices_mm.reshape(33, 33, 3)
+    # chords of 32 arcs: 2 R sin(w / 64 R) each
+    chord = 2 * radius * np.sin(flat.size_mm[0] / 32 / 2 / radius)
+    assert np.linalg.norm(np.diff(grid, axis=1), axis=2) == pytest.approx(np.full((33, 32), chord))
+    height = (bent.vertices_mm - flat.center_mm) @ flat.normal
+    assert height.max() == pytest.approx(radius * (1 - np.cos(flat.size_mm[0] / 2 / radius))) and height.min() > -1e-9
+    with pytest.raises(Refused, match="a flat card to curl"):
+        placed_at(replace(world.scene, placement=bent), {"curl": 50.0})
+
+
+def test_gap_moves_the_piece_along_its_normal_and_size_shrinks_it(world):
+    flat = world.scene.placement
+    off = placed_at(world.scene, {"gap": 30.0}).placement
+    assert off.center_mm - flat.center_mm == pytest.approx(30 * flat.normal)
+    assert off.vertices_mm - flat.vertices_mm == pytest.approx(np.tile(30 * flat.normal, (4, 1)))
+    small = placed_at(world.scene, {"size": 0.5, "gap": 30.0}).placement
+    assert np.ptp(small.vertices_mm, axis=0).max() == pytest.approx(flat.size_mm[0] / 2)
+
+
+@pytest.mark.parametrize("quarters", [0.0, 1.0, 2.5, 4.0])
+def test_hidden_corners_cover_their_share_of_the_piece(world, quarters):
+    bare, hidden = (piece_at(world, {"hidden": q}, 1).srgb for q in (0.0, quarters))
+    assert float((hidden != bare).any(-1).float().mean()) == pytest.approx(quarters / 4, abs=0.01)
+
+
+def test_mismatch_begins_at_the_run_s_printer_and_is_the_other_one_at_one(world):
+    assert torch.equal(piece_at(world, {"mismatch": 0.0}, 0).srgb, piece_at(world, {}, 0).srgb)
+    other = world.other.apply(world.sheet.sent)[0].permute(1, 2, 0)
+    assert torch.allclose(piece_at(world, {"mismatch": 1.0}, 0).srgb, other, atol=1e-6)
+
+
+def test_the_gray_piece_is_the_printed_control_and_suffers_what_the_design_does(world):
+    design, gray = piece_at(world, {}, 0).srgb, piece_at(world, {}, 0, gray=True).srgb
+    middle = gray[len(gray) // 2, len(gray) // 2]
+    assert gray.shape == design.shape and float(middle.max() - middle.min()) < 0.05  # as this printer makes gray
+    assert not torch.equal(piece_at(world, {"mismatch": 1.0}, 0, gray=True).srgb, gray)
+    taped = [piece_at(world, {"hidden": 4.0}, 0, gray=is_gray).srgb for is_gray in (False, True)]
+    assert torch.equal(*taped)
+
+
+def test_a_window_shows_what_the_whole_photograph_shows_there(world, drawn):
+    one = with_values(drawn[:1], noise=0.0, blur_px=0.0)
+    stage, shown = _Stages(world).at({}), piece_at(world, {}, 0)
+    frame = window(stage, one)
+    (x, y), (width, height) = frame.origin_px, frame.size_px
+    assert width * height < 800 * 600 / 2 and x % 16 == y % 16 == 0
+    whole = photograph(stage, shown, one, (800, 600), jpeg=False)[..., y : y + height, x : x + width]
+    part = photograph(frame.stage, shown, one, frame.size_px, jpeg=False)
+    assert float((whole - part).abs().max()) < 1e-3
+
+
+def test_measuring_works_at_the_easy_end_and_says_why_not_at_the_hard_one(world, drawn):
+    points = [{}, {"tilt": 86.0}, {"blur": 12.0}, {"hidden": 4.0}]
+    plain, tilted, blurred, hidden = measured(world, points, drawn[:2])
+    assert all(one.status == "measured" and one.error_mm < 0.3 for one in plain)
+    for row in (tilted, blurred, hidden):
+        assert all(one.status != "measured" and one.code for one in row)
+    assert {one.code for one in hidden} == {"too_few_markers"}
+
+
+def test_points_see_common_conditions_whatever_their_neighbors_are(world, drawn):
+    points = [{"blur": 20.0}, {}, {"distance": 4000.0}, {"blur": 3.0}]
+    together = recognized(world, points, drawn)
+    alone = [recognized(world, [point], drawn) for point in points]
+    assert list(together) == ["design", "bare", "gray"]
+    for kind, hits in together.items():
+        assert np.array_equal(hits, np.concatenate([each[kind] for each in alone]))
+
+
+def test_the_study_writes_breaks_points_codes_and_one_page(world, tmp_path):
+    config = tmp_path / "envelope.toml"
+    config.write_text(
+        f'run = "{world.run.folder}"\nn = 4\nphotos = 2\nmap_n = 4\nmap_photos = 1\n'
+        'sweeps = [{axis = "blur", easy = 0.5, hard = 16, points = 3}]\n'
+        'maps = [{x = "hidden", y = "mismatch", points = 3}]\n'
+    )
+    finished = run_study("envelope", config, tmp_path / "out")
+    assert not finished.failed
+    assert [table.name for table in finished.tables] == ["breaks", "beyond", "sweeps", "maps"]
+    rows = rows_of(tmp_path / "out/envelope_sweeps.csv")
+    assert [float(row["value"]) for row in rows] == pytest.approx([0.5, 8**0.5, 16])
+    assert float(rows[0]["measured"]) == 1 and float(rows[2]["measured"]) == 0
+    (broken,) = rows_of(tmp_path / "out/envelope_breaks.csv")
+    assert 0.5 <= float(broken["measured_low"]) <= float(broken["measured"]) <= float(broken["measured_high"]) <= 16
+    maps = rows_of(tmp_path / "out/envelope_maps.csv")
+    assert len(maps) == 9 and {row["effect"] for row in maps} <= {"gains", "no effect"}
+    assert (tmp_path / "out/envelope_page.png").is_file()
+
+
+# ------------------------------------------------------------------------------------------------ beside controls
+
+
+def test_a_gain_is_over_the_control_that_is_hardest_to_beat_at_that_point():
+    design = np.array([[1] * 20, [1] * 20, [1] * 20], bool)
+    bare = np.array([[0] * 20, [0] * 15 + [1] * 5, [1] * 20], bool)
+    gray = np.array([[0] * 10 + [1] * 10, [0] * 20, [0] * 20], bool)
+    gains = gains_of(design, {"bare": bare, "gray": gray})
+    assert [gain.value for gain in gains] == [0.5, 0.75, 0.0] and [has_effect(gain) for gain in gains] == [1, 1, 0]
+    assert (gains[0].low, gains[0].high) == pytest.approx(paired_difference(design[0].tolist(), gray[0].tolist())[1])
+    # last that shows a gain and first that does not: of 20 conditions 5 more, and 3 more
+    assert has_effect(gains_of(design[:1], {"bare": bare[1:2] | (np.arange(20) >= 5)})[0])
+    assert not has_effect(gains_of(design[:1], {"bare": np.arange(20)[None] >= 3})[0])
+    assert not has_effect(gains_of(bare[:1], {"bare": design[:1]})[0])  # it does harm
+
+
+def test_a_gain_ends_between_the_last_point_with_one_and_the_first_without():
+    at, some, none = np.linspace(0, 1, 5), Estimate(0.3, 0.1, 0.5, 50), Estimate(0.1, 0.0, 0.2, 50)
+    ends = gain_break([some, some, none, none, some], at)
+    assert (ends.low, ends.value, ends.high, ends.rates) == (0.25, 0.375, 0.5, (0.3, 0.3))
+    assert gain_break([some] * 5, at).value == BEYOND and gain_break([none, *[some] * 4], at).value is None
+
+
+@pytest.fixture(scope="module")
+def blue_run(tmp_path_factory):
+    """Of a network that tells red from blue and has no other answer: of noise it says blue half of the time."""
+    import conftest
+
+    folder = tmp_path_factory.mktemp("blue")
+    scene = conftest.SCENE.replace('"carton"\nmodels = ["builtin"]', BLUE).replace("[800, 600]", "[96, 96]")
+    (folder / "scene.toml").write_text(scene.replace("steps = 3", "steps = 8").replace("[500, 900]", "[330, 340]"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+        optimize_scene(folder / "scene.toml", folder / "run")
+    return folder / "run"
+
+
+BLUE = '"blue"\nmodels = ["module:fake_networks.red_against_blue"]'
+
+
+def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is_recognized(
+    blue_run, tmp_path, monkeypatch
+):
+    unseen = Measurement("rejected", "too_few_markers", None)  # a search of noise for markers takes seconds
+    monkeypatch.setattr("patchlab.validation.envelope.sweeps.measured", lambda _, points, __: [[unseen]] * len(points))
+    config, out = tmp_path / "envelope.toml", tmp_path / "out"
+    config.write_text(
+        f'run = "{blue_run}"\nn = 16\nphotos = 1\nmap_n = 8\nmap_photos = 1\n'
+        'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 200, points = 3}]\n'
+        'maps = [{x = "noise", y = "mismatch", points = 3}]\n'
+    )
+    finished = run_study("envelope", config, out)
+    assert not finished.failed
+    noise, blur = np.reshape(rows_of(out / "envelope_sweeps.csv"), (2, 3))
+    for easy, _, hard in (noise, blur):
+        assert easy["effect"] == "gains" and float(easy["gain_low"]) > 0
+        assert hard["effect"] == "no effect" and float(hard["gain_low"]) <= 0 <= float(hard["gain_high"])
+    assert 0.2 < float(noise[2]["recognized"]) < 0.8
+    for row in rows_of(out / "envelope_breaks.csv"):
+        assert float(row["design gains_high"]) <= float(row["hard"]) and row["no effect at"]
+    cells = rows_of(out / "envelope_maps.csv")
+    assert {row["effect"] for row in cells if float(row["at x"]) == 16} == {"no effect"}
+    (page,) = figures(None, finished.results)
+    assert drawing_of(page.draw, (8, 6), "svg").decode().count("no effect<") == 2
+    assert "no effect" in (out / "envelope.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"sweeps": ({"axis": "tlit"},)}, 'did you mean "tilt"'),
+        ({"sweeps": ({"axis": "blur", "easy": 0.0},)}, "above 0"),
+        ({"maps": ({"x": "blur", "y": "blur"},)}, "two different axes"),
+    ],
+)
+def test_axes_and_ends_that_make_no_sense_are_refused(world, changed, match):
+    settings = EnvelopeSettings.model_validate({"run": str(world.run.folder)} | changed)
+    with pytest.raises(Refused, match=match):
+        cells(settings, world.run.folder)
+
+
+def test_every_axis_has_a_sweep_and_every_default_map_its_axes(world):
+    named = [cell.name for cell in cells(EnvelopeSettings(run="run"), world.run.folder.parent)]
+    assert [name for name in named if name.startswith("sweep-")] == [f"sweep-{name}" for name in AXES]
+    assert len(named) == len(AXES) + 6

@@ -1,0 +1,250 @@
+"""ONNX files as networks: what they answer, beside torch, onnx's own reference and the same weights in other forms."""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from archives import LABELS, ConvNeXt, ResNet, ViT, exported, seeded
+from archives import save as save_archive
+
+import patchproof as pp
+from patchproof.base.strict import Refused
+from patchproof.classifier import load_classifier
+from patchproof.classifier.builtin import load_builtin
+from patchproof.classifier.custom import classifier_of
+from patchproof.classifier.program import load_program
+from patchproof.networks.onnx_file import read_onnx
+from patchproof.networks.onnx_operators import OPERATORS, Operator
+from test_zoo import judged
+
+pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')
+
+import onnx_files
+from onnx.reference import ReferenceEvaluator
+
+
+class Prompted(ViT):
+    """CLIP's way: cosines with the embeddings of prompts, which are constants."""
+
+    def __init__(self):
+        super().__init__()
+        self.prompts = torch.nn.Parameter(torch.zeros(4, 4))
+
+    def forward(self, x):
+        seen, said = (torch.nn.functional.normalize(y, dim=-1) for y in (super().forward(x), self.prompts))
+        return 10 * seen @ said.T
+
+
+def written(folder: Path, network: torch.nn.Module, batch: int | None = None, dynamo: bool = False) -> Path:
+    """`network` for N×3×16×16, by one of torch's two exporters, of any N or of one."""
+    path = folder / "net.onnx"
+    sizes = {"dynamic_shapes": None if batch else ({0: torch.export.Dim("n", min=1, max=64)},), "verbose": False}
+    axes = {"input_names": ["x"], "dynamic_axes": None if batch else {"x": {0: "n"}}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of itself
+        pictures = (torch.rand(batch or 2, 3, 16, 16),)
+        torch.onnx.export(seeded(network), pictures, str(path), dynamo=dynamo, **(sizes if dynamo else axes))
+    path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
+    return path
+
+
+def answered(network, photos):
+    """Logits and the gradient of their squares."""
+    photos = photos.clone().requires_grad_()
+    logits = network(photos)
+    return logits.detach(), torch.autograd.grad(logits.square().sum(), photos)[0]
+
+
+def check_alike(network, truth, numbers=(1, 5)) -> None:
+    for number in numbers:
+        photos = torch.rand(number, 3, 16, 16, generator=torch.Generator().manual_seed(number))
+        for ours, theirs in zip(answered(network, photos), answered(truth, photos), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [None, 1])
+@pytest.mark.parametrize("make", [ResNet, ViT, ConvNeXt, Prompted])
+def test_logits_and_gradients_are_torchs(make, batch, tmp_path):
+    check_alike(load_program(written(tmp_path, make(), batch)).network, seeded(make()))
+
+
+def test_those_of_the_newer_exporter_with_weights_beside_it(tmp_path):
+    pytest.importorskip("onnxscript", reason="torch's newer exporter needs onnxscript")
+    path = written(tmp_path, ViT(), dynamo=True)
+    assert (tmp_path / "net.onnx.data").stat().st_size > 1000
+    classifier = load_program(path)
+    check_alike(classifier.network, seeded(ViT()), (3,))
+    with (tmp_path / "net.onnx.data").open("r+b") as data:
+        data.write(b"\1")
+    assert load_program(path).sha256 != classifier.sha256  # what is hashed is both files
+    (tmp_path / "net.onnx.data").unlink()
+    with pytest.raises(Refused, match=r"no file at .*net\.onnx\.data"):
+        load_program(path)
+
+
+def test_onnx_module_and_archive_of_the_same_weights_agree(tmp_path):
+    network = seeded(ResNet())
+    save_archive(tmp_path, exported(network))
+    names = [f"file:{written(tmp_path, network)}", "file:small.pt2", classifier_of(network, 16, LABELS)]
+    photos = torch.rand(5, 3, 40, 30)
+    (logits, gradient), *others = (answered(load_classifier(name, tmp_path).logits, photos) for name in names)
+    assert gradient.abs().max() > 1e-3
+    for other_logits, other_gradient in others:
+        torch.testing.assert_close(logits, other_logits, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(gradient, other_gradient, rtol=1e-4, atol=1e-4)
+
+
+def test_a_file_goes_from_a_scene_to_a_verdict(tmp_path):
+    builtin = load_builtin()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        axes = {"input_names": ["x"], "dynamic_axes": {"x": {0: "n"}}}
+        torch.onnx.export(builtin.network, (torch.rand(2, 3, 96, 96),), str(tmp_path / "b.onnx"), dynamo=False, **axes)
+    (tmp_path / "b.json").write_text(json.dumps({"input_px": 96, "labels": list(builtin.labels)}))
+    run, report = judged(tmp_path, "file:b.onnx", "carton")
+    assert run.promise.models[0].name == "file:b.onnx"
+    again = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "again", models=["builtin"])
+    pairs = [(a.predictions, b.predictions) for a, b in zip(report.photos, again.photos, strict=True) if a.predictions]
+    assert pairs
+    for ours, theirs in pairs:
+        assert ours["file:b.onnx"].target_confidence == pytest.approx(theirs["builtin"].target_confidence, abs=1e-4)
+
+
+def test_a_name_a_card_and_a_hash_are_as_for_archives(tmp_path):
+    path = onnx_files.save(tmp_path, onnx_files.small())
+    classifier = load_classifier("file:small.onnx", tmp_path)
+    assert (classifier.name, classifier.input_px, list(classifier.labels)) == ("file:small.onnx", 8, onnx_files.LABELS)
+    assert len(classifier.sha256) == 64 and not any(p.requires_grad for p in classifier.network.buffers())
+    path.with_suffix(".json").unlink()
+    with pytest.raises(Refused, match=r"no file at .*small\.json: write"):
+        load_program(path)
+    with pytest.raises(Refused, match=r'write "file:small\.onnx"'):
+        load_classifier("small.onnx", tmp_path)
+
+
+# --- each operator, beside onnx's reference ---
+
+UNARY = """Abs Ceil Cos Erf Exp Floor Neg Relu Sigmoid Sign Sin Tanh HardSwish Mish Softplus Elu LeakyRelu HardSigmoid
+GlobalAveragePool GlobalMaxPool Gelu Softmax LogSoftmax Flatten Transpose Dropout""".split()
+BODIES = [
+    *(f"y = {name}(x)" for name in UNARY),
+    *(f"a = Exp(x) y = {name}(a)" for name in ("Log", "Reciprocal", "Sqrt")),
+    *(f"y = {name}(x, C)" for name in "Add Sub Mul Div PRelu Max Min Sum".split()),
+    *(f"a = {name}(x, Zero) y = Cast<to=1>(a)" for name in "Equal Greater GreaterOrEqual Less LessOrEqual".split()),
+    *(f"y = {name}(x, [1, -1])" for name in "ReduceMean ReduceMax ReduceMin ReduceL2 ReduceSum ReduceProd".split()),
+    *(f"y = {name}<keepdims=0>(x)" for name in "ReduceMean ReduceMax ReduceMin ReduceSum".split()),
+    "y = ReduceMean<noop_with_empty_axes=1>(x)",
+    "a = Log(x) b = IsNaN(a) y = Cast<to=1>(b)",
+    "a = Less(x, Zero) b = Greater(x, Two) c = Or(a, b) d = Not(c) e = Or(a, d) f = And(e, d) y = Cast<to=1>(f)",
+    "y = Elu<alpha=0.5>(x)",
+    "y = LeakyRelu<alpha=0.3>(x)",
+    "y = HardSigmoid<alpha=0.1666667, beta=0.4>(x)",
+    'y = Gelu<approximate="tanh">(x)',
+    "y = Softmax<axis=1>(x)",
+    "y = Cast<to=7>(x)",
+    "a = Mul(x, Two) b = Cast<to=7>(a) y = Div(b, [-3])",
+    "a = Mul(x, Two) b = Cast<to=7>(a) y = Mod(b, [-3])",
+    "y = Mod<fmod=1>(x, Two)",
+    "y = Pow(x, Two)",
+    "a = Less(x, Zero) y = Where(a, C, x)",
+    "y = Clip(x, Zero, Two)",
+    "y = Clip(x, Two, Zero)",
+    "y = Clip(x, , Zero)",
+    "a = Neg(Two) y = Clip(x, a, Two)",
+    "y = MatMul(x, M)",
+    "a = Flatten<axis=3>(x) y = Gemm(a, M)",
+    "a = ReduceMean<keepdims=0>(x, [0, 1]) y = Gemm<transA=1, alpha=0.5, beta=2.0>(a, M, Two)",
+    'y = Einsum<equation="bchw,wk->bkch">(x, M)',
+    "y = Conv(x, W)",
+    "y = Conv<strides=[2,1], dilations=[1,2], pads=[1,0,2,3], kernel_shape=[3,3]>(x, W, F)",
+    "y = Conv<group=3, pads=[1,1,1,1]>(x, D)",
+    "y = Conv<group=3, strides=[2,2], pads=[0,0,1,1]>(x, D)",
+    "y = Conv<strides=[2,1], dilations=[1,2], pads=[1,0,2,3]>(x, W)",
+    "w = Mul(W, Two) y = Conv<pads=[1,0,2,3]>(x, w)",
+    "a = Reshape(x, [0, 0, 64]) w = Reshape(W, [4, 3, 9]) y = Conv(a, w)",
+    'y = Conv<auto_pad="VALID">(x, W)',
+    "y = MaxPool<kernel_shape=[3,3], strides=[2,2], pads=[1,1,1,1]>(x)",
+    "y = MaxPool<kernel_shape=[3,3], strides=[2,2], pads=[0,0,1,1]>(x)",
+    "y = MaxPool<kernel_shape=[3,3], strides=[2,2], ceil_mode=1>(x)",
+    "y = AveragePool<kernel_shape=[3,3], strides=[2,2], pads=[1,1,1,1]>(x)",
+    "y = AveragePool<kernel_shape=[3,3], pads=[0,1,1,1], count_include_pad=1>(x)",
+    "y = AveragePool<kernel_shape=[3,2], strides=[3,2], pads=[1,1,1,1], count_include_pad=1>(x)",
+    "y = BatchNormalization(x, S, P, S, P)",
+    "a = Transpose<perm=[0,2,3,1]>(x) y = LayerNormalization<epsilon=0.1>(a, S, P)",
+    "y = InstanceNormalization(x, S, P)",
+    "a = Identity(x) y = Relu(a)",
+    *(f"y = Reshape(x, {sizes})" for sizes in ([0, -1], [0, 0, 64], [-1, 8, 24])),
+    "y = Flatten<axis=2>(x)",
+    "a = GlobalAveragePool(x) y = Squeeze(a, [2, -1])",
+    "a = GlobalAveragePool(x) y = Squeeze(a)",
+    "y = Unsqueeze(x, [0, -1])",
+    "y = Transpose<perm=[2,0,3,1]>(x)",
+    "y = Concat<axis=-1>(x, x)",
+    "a, b = Split<axis=2, num_outputs=2>(x) y = Sub(b, a)",
+    "a, b = Split<axis=1>(x, [1, 2]) y = Concat<axis=1>(b, a)",
+    "y = Slice(x, [1, -3], [7, 100], [2, -1])",
+    "y = Slice(x, [-1, 6], [-9223372036854775807, 0], [2, 3], [-1, -2])",
+    "y = Slice(x, [5], [2], [3])",
+    "y = Gather<axis=2>(x, [1, -1, 0])",
+    "a = Squeeze([-2]) y = Gather<axis=1>(x, a)",
+    "a = Squeeze([0]) b = Squeeze([1]) s = Shape(x) n = Gather(s, a) y = Range(a, n, b)",
+    "p = Reshape([1], [-1, 1]) w = Gather<axis=0>(x, [0]) y = ScatterND(x, p, w)",
+    "a = ReduceMean(x, [2]) y = Expand(a, [2, 1, 3, 4, 8])",
+    "y = Tile(x, [1, 2, 1, 3])",
+    "y = Pad(x, [0, 0, 1, 2, 0, 0, 3, 0], Two)",
+    'y = Pad<mode="reflect">(x, [0, 0, 1, 2, 0, 0, 3, 1])',
+    'y = Pad<mode="edge">(x, [1, 2, 0, 3], , [2, 3])',
+    "s = Shape<start=1>(x) v = ConstantOfShape<value=float[1] {2.5}>(s) y = Add(x, v)",
+    "s = Shape(x) r = ReduceProd<keepdims=0>(s) y = Add(s, r)",
+    *(
+        f'y = Resize<mode="{mode}", coordinate_transformation_mode="{corners}", nearest_mode="floor">(x, , {factors})'
+        for factors in ([1.0, 1.0, 2.0, 2.0], [1.0, 1.0, 0.5, 2.0])
+        for mode, corners in (("nearest", "asymmetric"), ("linear", "half_pixel"), ("cubic", "half_pixel"))
+    ),
+    "a = Shape<end=2>(x) b = Concat<axis=0>(a, [11, 5]) "
+    'y = Resize<mode="linear", coordinate_transformation_mode="align_corners">(x, , , b)',
+]
+OTHER_OPSETS = [
+    (13, "y = ReduceMean<axes=[1, 3], keepdims=0>(x)"),
+    (13, "a, b = Split<axis=2>(x) y = Sub(b, a)"),
+    (21, "a = Concat<axis=1>(x, x, x, x) y = GroupNormalization<num_groups=2>(a, E, E)"),
+    (18, "a = Concat<axis=1>(x, x) y = GroupNormalization<num_groups=3>(a, S, P)"),
+]
+
+
+@pytest.mark.parametrize(("opset", "body"), [*((20, body) for body in BODIES), *OTHER_OPSETS])
+def test_an_operator_is_onnxs(opset, body):
+    made = onnx_files.model(body, opset)
+    pictures = np.random.default_rng(1).normal(size=(2, 3, 8, 8)).astype("f")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # logarithms of negative numbers
+        (expected,) = ReferenceEvaluator(made).run(None, {"x": pictures})
+    network, low, high = read_onnx(made.SerializeToString(), lambda: b"")
+    assert (low, high) == (1, 4096)
+    got = network(torch.from_numpy(pictures)).numpy()
+    assert (got.dtype, got.shape) == (expected.dtype, expected.shape)
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+    elsewhere = network.to("meta")(torch.empty(2, 3, 8, 8, device="meta"))  # constants follow to any device
+    assert elsewhere.shape == got.shape
+
+
+def test_what_archives_save_is_saved_here_too():
+    body = """a = Conv<group=3, pads=[0,0,1,1]>(x, D) b = Clip(a, Zero, Two) c = Conv(b, W) d = Conv(b, W)
+        e = Add(c, d) y = Relu(e)"""
+    network, *_ = read_onnx(onnx_files.model(body).SerializeToString(), lambda: b"")
+    names = [getattr(step.compute, "__name__", "") for step in network.steps]
+    assert names == [
+        "constant_pad_nd.default", "convolution.default", "_hardtanh_", "convolution.default", "convolution.default",
+        "add.Tensor", "relu_.default",
+    ]  # fmt: skip
+    assert network.steps[0].arguments[0].number < len(list(network.buffers()))  # not the pictures
+    network, *_ = read_onnx(onnx_files.model("y = Conv(x, W, F)").SerializeToString(), lambda: b"")
+    assert isinstance(network.steps[0].compute, Operator)  # which sends a short bias to the pictures' device
+
+
+def test_every_operator_of_the_table_is_tried():
+    tried = {node.op_type for body in BODIES for node in onnx_files.model(body).graph.node}
+    assert set(OPERATORS) <= tried | {"GroupNormalization"}

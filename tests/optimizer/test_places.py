@@ -1,0 +1,322 @@
+"""`place = "auto"`: where pieces can lie, which place is chosen, and that a run keeps it."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fake_networks import Bright
+from trimesh.triangles import closest_point
+
+import patchproof as pp
+from patchproof.app.plan.lines import geometry_lines, measured_lines
+from patchproof.app.plan.plan import measured_plan, plan_geometry
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Refused, validated
+from patchproof.classifier.load import load_classifier
+from patchproof.optimizer import place_files, places, run
+from patchproof.optimizer.place_files import read_place, save_place
+from patchproof.optimizer.places import choose_place, default_passes, place_lines
+from patchproof.scene.placement import WARN_OVERHANG_SHARE
+from patchproof.scene.places import APART, Ground
+from patchproof.scene.scene import needs_piece, needs_texture
+
+PLATE = (300, 300, 20)  # mm: its front fills the pictures
+STRAIGHT = {"azimuth_deg": [-5, 5], "elevation_deg": [-5, 5], "distance_mm": [300, 330], "look_at_jitter": 0}
+SETTINGS = {
+    "object": {"mesh": "python:plate", "length_mm": 300, "up": "y"},
+    "patch": {"place": "auto", "side": "+z", "width_mm": 60, "height_mm": 60},
+    "target": {"label": "bright", "models": ["module:fake_networks.bright"]},
+    "view": STRAIGHT,
+    "camera": {"photo_px": [64, 64]},
+    "optimize": {"steps": 2, "gamut": 0.0},
+}
+SHARP = {"camera__photo_px": [1600, 1200]}  # photographs in which small markers are read: a piece hardly larger
+
+
+def open_scene(base=".", mesh=None, seed=0, **changes):
+    """A plate in front of the camera, or another mesh; `table__key` changes a setting."""
+    data = {key: dict(value) for key, value in SETTINGS.items()}
+    for key, value in changes.items():
+        table, name = key.split("__")
+        data.setdefault(table, {})[name] = value
+    mesh = trimesh.creation.box(PLATE) if mesh is None else mesh
+    return pp.make_scene(data, mesh, base, seed)
+
+
+@pytest.fixture(autouse=True)
+def few_views_for_the_size_of_markers(monkeypatch):
+    monkeypatch.setattr("patchproof.scene.patch_scene.SCALE_VIEWS", 32)
+
+
+@pytest.fixture
+def a_small_run(monkeypatch, a_small_search):
+    """Such a search, and a promise and pictures to match."""
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
+    monkeypatch.setattr(place_files, "_SIDE_PX", 64)
+
+
+class Counted(Bright):
+    """Counts pictures on their way through, and gradients on their way back."""
+
+    def __init__(self):
+        super().__init__()
+        self.passes = 0
+
+    def forward(self, photos):
+        self.passes += len(photos)
+        if photos.requires_grad:
+            photos.register_hook(lambda gradient: self.count(len(gradient)))
+        return super().forward(photos)
+
+    def count(self, number):
+        self.passes += number
+
+
+@functools.cache
+def searched():
+    """The place that a whole search of a network chooses, and the passes of that network in it."""
+    network = Counted()
+    classifier = pp.classifier_of(network, 32, ["bright", "dark"], "python:bright")
+    network.passes = 0
+    load_classifier(classifier, Path())
+    doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
+    place = choose_place(open_scene(), models=[classifier])
+    return place, network.passes - doubting
+
+
+def test_the_place_is_where_the_network_looks():
+    """It looks at the picture's upper left quarter alone; as one faces +z, left is -x."""
+    place, _ = searched()
+    x, y, z = place.at
+    assert x < -30 and y > 30 and z == 10 and place.front == "+z"
+    assert place.candidates[0].at == place.at and place.candidates[0].draft is not None
+    gains = [candidate.draft for candidate in place.candidates if candidate.draft is not None]
+    assert gains == sorted(gains) and gains[0] < -0.1
+
+
+def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
+    monkeypatch.setattr(places, "PLACES", 8)
+    scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
+    assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
+
+
+def test_what_is_to_be_kept_free_is_kept_free(tmp_path):
+    """The four triangles of the plate's upper left quarter, and nothing else, are out of bounds."""
+    mesh = trimesh.creation.box(PLATE).subdivide()
+    middles = mesh.triangles_center
+    forbidden = np.flatnonzero((middles[:, 2] > 9) & (middles[:, 0] < 0) & (middles[:, 1] > 0))
+    (tmp_path / "free.txt").write_text("\n".join(map(str, forbidden)))
+    everywhere = Ground(open_scene(mesh=mesh, **SHARP)).spots(100)
+    rest = Ground(open_scene(tmp_path, mesh, patch__search={"keep_off_faces": "free.txt"}, **SHARP)).spots(100)
+    assert covers(everywhere, mesh, forbidden) and not covers(rest, mesh, forbidden) and len(rest) > 5
+
+
+def covers(spots, mesh, faces):
+    """Whether a piece's middle or a corner, drawn in by a tenth, lies over one of the faces."""
+    inner = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9], [0.5, 0.5]])
+    points = np.concatenate([spot.placement.world(inner * spot.placement.size_mm) for spot in spots])
+    triangles = mesh.triangles[faces]
+    over = [closest_point(triangles, np.broadcast_to(point, (len(faces), 3))) for point in points]
+    return bool((np.linalg.norm(np.array(over) - points[:, None], axis=2).min(1) < 1).any())
+
+
+def test_places_fit_are_apart_and_the_same_for_the_same_seed():
+    ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
+    scene = open_scene(mesh=ball, **small)
+    spots = Ground(scene).spots(12)
+    assert 3 < len(spots) <= 12
+    for spot in spots:
+        assert spot.placement.overhang_share <= WARN_OVERHANG_SHARE and not spot.placement.warnings
+    middles = np.array([spot.placement.center_mm for spot in spots])
+    distances = np.linalg.norm(middles[:, None] - middles, axis=2) + 1e9 * np.eye(len(spots))
+    assert distances.min() > APART * 30 / 2
+    assert [spot.at for spot in Ground(scene).spots(12)] == [spot.at for spot in spots]
+    other = Ground(open_scene(mesh=ball, seed=1, **small)).spots(12)
+    assert [spot.at for spot in other] != [spot.at for spot in spots]
+
+
+def test_a_gap_is_no_larger_than_asked():
+    ball, small = trimesh.creation.icosphere(4, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
+    least = min(spot.placement.gap_mm for spot in Ground(open_scene(mesh=ball, **small)).spots(12))
+    with pytest.raises(Refused, match=r"Expected a place for a piece of .* mm that views face, got none"):
+        Ground(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
+
+
+def test_a_piece_that_fits_only_in_one_spot_finds_it():
+    """A face hardly larger than the piece: points elsewhere on it move to where the piece does not overhang."""
+    size = Ground(open_scene(**SHARP)).size_mm
+    ground = Ground(open_scene(mesh=trimesh.creation.box((size[0] + 4, size[1] + 4, 300)), **SHARP))
+    moved = [ground._first(frame) for frame in ground._tried]  # before middles of sides take their places
+    assert [spot for spot in moved if spot is not None and np.abs(spot.at[:2]).max() < 4]
+
+
+def test_upright_means_no_turns():
+    free, upright = Ground(open_scene()), Ground(open_scene(patch__search={"upright": True}))
+    (spot, *_) = free.spots(1)
+    assert [turn.spin_deg for turn in free.turned(spot)] == [45] and not upright.turned(spot)
+
+
+def test_views_do_not_turn_with_the_place():
+    around = {"azimuth_deg": [-60, 60], "elevation_deg": [0, 60], "distance_mm": [600, 700]}
+    box = trimesh.creation.box((300, 300, 300))
+    scene = open_scene(mesh=box, **SHARP, **{f"view__{key}": value for key, value in around.items()})
+    conditions = scene.draw("train", 4)
+    poses = scene.camera_from_world(conditions)
+    for at_mm in ((150, 0, 0), (0, 150, 0), (20, 30, 150)):
+        hung = scene.at(at_mm, 45)
+        np.testing.assert_array_equal(hung.camera_from_world(conditions), poses)
+        np.testing.assert_array_equal(hung.frame.normal, [0, 0, 1])  # lights count from here, too
+        assert hung.settings.patch.place == "given" and hung.settings.view.front == "+z"
+    np.testing.assert_allclose(scene.at((150, 0, 0), 0).placement.normal, [1, 0, 0], atol=1e-12)
+
+
+def test_with_front_left_out_views_face_the_patch_as_before():
+    settings = SETTINGS | {"patch": {"at_mm": (100, 0, 0), "width_mm": 60, "height_mm": 60}}
+    scene = pp.make_scene(settings, trimesh.creation.box((200, 200, 200)))
+    np.testing.assert_allclose(scene.frame.normal, [1, 0, 0], atol=1e-12)
+
+
+def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
+    place, passes = searched()
+    assert place.passes == passes and place.run_share == place.passes / default_passes()
+    screens = (places.PLACES + 3 * places.TURNED) * 2 * places.SCREEN_VIEWS + places.SCREEN_VIEWS
+    drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
+    assert screens + drafts <= default_passes() / 4 and default_passes() / 5 < place.passes <= default_passes() / 4
+    assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
+
+
+def test_the_same_scene_gives_the_same_place(a_small_search):
+    assert choose_place(open_scene()) == choose_place(open_scene())
+
+
+def test_a_single_place_needs_no_runner_up(monkeypatch, a_small_search):
+    monkeypatch.setattr(places, "PLACES", 1)
+    place = choose_place(open_scene(patch__search={"upright": True}))
+    assert place.lead is None and len(place.candidates) == 1
+    assert "the only place" in place_lines(place)[1]
+
+
+def test_how_sure_the_choice_is_follows_from_the_paired_interval():
+    sure, unsure = places._lead(np.array([0.5, 0.6, 0.7, 0.6])), places._lead(np.array([0.5, -0.6, 0.7, -0.4]))
+    assert sure.sure and sure.value == pytest.approx(0.6) and sure.interval[0] > 0.4
+    assert not unsure.sure and unsure.interval[0] < 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"patch__kind": "texture"}, 'takes place = "auto" with kind = "patch" only'),
+        ({"patch__at_mm": [0, 0, 1]}, 'takes at_mm, offset_mm and spin_deg with place = "given" only'),
+        ({"patch__spin_deg": 5}, 'takes at_mm, offset_mm and spin_deg with place = "given" only'),
+        ({"patch__place": "given", "patch__search": {"upright": True}}, 'takes search with place = "auto" only'),
+        ({"view__look_at": "patch"}, "places share the views of patch.side"),
+        ({"view__front": "+x"}, "places share the views of patch.side"),
+        ({"object__mesh": None, "object__length_mm": None, "object__photos": "p", "object__sheet": "s"}, "only a mesh"),
+        ({"patch__search": {"keep_off": ["lamp"]}}, 'Expected the name of a material, got "lamp"'),
+        ({"patch__width_mm": 400}, "."),
+    ],
+)
+def test_what_cannot_be_searched_is_refused_in_one_sentence(changes, sentence):
+    with pytest.raises(Refused) as refused:
+        choose_place(open_scene(**changes))
+    assert sentence in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_scene_without_a_place_says_so_and_one_with_it_needs_no_search():
+    scene = open_scene()
+    for needs in (needs_piece, needs_texture):
+        with pytest.raises(Refused, match=r'Expected a scene whose piece has its place, got patch.place = "auto"'):
+            needs(scene)
+    with pytest.raises(Refused, match=r'Expected a scene with patch.place = "auto", got a mesh of 12 faces'):
+        choose_place(scene.at((0, 0, 10), 0))
+
+
+def scene_file(folder, **patch):
+    """A scene in a file, with the plate as a PLY beside it."""
+    trimesh.creation.box(PLATE).export(folder / "plate.ply")
+    data = {key: dict(value) for key, value in SETTINGS.items()}
+    data["object"]["mesh"], data["patch"] = "plate.ply", data["patch"] | patch
+    lines = []
+    for table, values in data.items():
+        lines += [f"[{table}]", *(f"{name} = {json.dumps(value)}" for name, value in values.items())]
+    (folder / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
+    return folder / "scene.toml"
+
+
+def no_search(*_, **__):
+    raise AssertionError("searched again")
+
+
+def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_path, monkeypatch, a_small_run):
+    path, out = scene_file(tmp_path), tmp_path / "run"
+    first = pp.optimize(path, out)
+    place = read_place(out)
+    assert first.scene.settings.patch.at_mm == place.at and (out / "place.png").stat().st_size > 500
+    monkeypatch.setattr(run, "choose_place", no_search)
+    loaded = pp.load_run(out)
+    np.testing.assert_array_equal(loaded.scene.placement.world_from_piece, first.scene.placement.world_from_piece)
+    assert loaded.scene.sheet_id == first.scene.sheet_id
+    design = (out / "design.png").read_bytes()
+    (out / "run.json").unlink()
+    again = pp.optimize(path, out, resume=True)
+    assert again.scene.sheet_id == first.scene.sheet_id and (out / "design.png").read_bytes() == design
+    with pytest.raises(Refused, match="Expected the place of this scene and seed, got one of another"):
+        pp.optimize(scene_file(tmp_path, width_mm=50), out, resume=True)
+    (out / "place.json").write_text("{")
+    with pytest.raises(Refused, match="Expected the record of a search"):
+        pp.optimize(scene_file(tmp_path), out, resume=True)
+
+
+def test_the_settings_of_a_run_are_a_scene_file_with_that_place(tmp_path, a_small_run):
+    chosen = pp.optimize(scene_file(tmp_path), tmp_path / "run")
+    details = json.loads((tmp_path / "run" / "run.json").read_text())
+    again = pp.make_scene(validated(SceneSettings, details["settings"], "run"), base=tmp_path)
+    assert again.sheet_id == chosen.scene.sheet_id
+
+
+def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
+    scene = open_scene()
+    spots = Ground(scene).spots(3)
+    laid = [spot.placement for spot in spots]
+    candidates = tuple(
+        places.Candidate(at=s.at, spin_deg=0, family=p.family, gap_mm=0, overhang_share=0, gray=0, outlook=0)
+        for s, p in zip(spots, laid, strict=True)
+    )
+    place = places.Place(
+        sheet_id=scene.sheet_id,
+        front="+z",
+        at=spots[0].at,
+        spin_deg=0,
+        lead=None,
+        passes=0,
+        run_share=0,
+        candidates=candidates,
+    )
+    save_place(place, scene.at(place.at, 0), tmp_path)
+    assert read_place(tmp_path, scene) == place
+    picture = place_files._picture(place, scene.at(place.at, 0)).getcolors(1 << 20)
+    shown = {color for _, color in picture}
+    assert {(253, 231, 37), (33, 145, 140), (68, 1, 84), (230, 0, 90)} <= shown
+
+
+def test_plan_reports_the_search(tmp_path, monkeypatch, a_small_run):
+    monkeypatch.setattr("patchproof.app.plan.plan.SELECT_VIEWS", 8)
+    plan = measured_plan(*plan_geometry(scene_file(tmp_path)), timing=False, views=2)
+    assert plan.place is not None and plan.surface.family == "card"
+    lines = [*geometry_lines(plan), *measured_lines(plan)]
+    assert f"chosen: at_mm = [{plan.place.at[0]:g}" in lines[lines.index("place") + 1]
+
+
+def test_middles_of_sides_that_views_face_are_places_however_the_piece_stands_there():
+    scene = open_scene()
+    spots = Ground(scene).spots(12)
+    named = [spot for spot in spots if isinstance(spot.at, str)]
+    assert spots[: len(named)] == tuple(named) and scene.settings.patch.side in [spot.at for spot in named]
+    hung = scene.at(named[0].at, 0.0)
+    assert hung.settings.patch.side == named[0].at and hung.settings.view.front == scene.settings.patch.side
+    np.testing.assert_allclose(hung.placement.center_mm, named[0].placement.center_mm)

@@ -1,0 +1,204 @@
+"""What is done a faster way to large photographs comes out as the slow way has it, and no sheet is lost to it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from synthetic_photos import PIECE_IDS, make_manifest, page_raster, photograph, view
+
+from patchproof.channel.printer import identity_printer
+from patchproof.classifier import center_square
+from patchproof.evidence import appearance
+from patchproof.evidence.camera import view_of
+from patchproof.evidence.classify import squares_of
+from patchproof.evidence.measure import identify, measure
+from patchproof.evidence.ranges import promised_ranges
+from patchproof.evidence.surface import promised_of, surface_of
+from patchproof.photo import colorfit, complete, detect, edges
+from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.complete import find_sheet
+from patchproof.photo.detect import LIGHT, cells_of, find_markers, luminance, refine
+from patchproof.photo.edges import fit_borders
+from patchproof.photo.limits import edges_in, squares_in
+from patchproof.photo.quality import CLIPPED_CODE
+from patchproof.photo.read import Photo
+from patchproof.photo.registration import _vagueness
+
+IDS = frozenset(PIECE_IDS)
+
+
+@pytest.fixture(scope="module")
+def piece():
+    return page_raster(make_manifest(), only_piece=True) * np.float32(0.97) + np.float32(0.02)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return surface_of(make_manifest())
+
+
+@pytest.mark.parametrize(("shape", "sizes"), [((200, 300), (96, 32)), ((301, 199), (96,)), ((33, 40), (33, 96))])
+def test_squares_are_those_that_networks_were_trained_with(shape, sizes):
+    srgb = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    slow = torch.from_numpy(srgb.astype(np.float32)).permute(2, 0, 1)[None] / 255
+    for size, fast in squares_of(srgb, sizes).items():
+        assert fast.flags.c_contiguous, "what is summed in another order has other last bits"
+        # 1e-5 is a four-hundredth of a code value; of 12 megapixels it is 8e-6, and no confidence moves by 2e-6
+        torch.testing.assert_close(torch.from_numpy(fast), center_square(slow, size)[0], atol=1e-5, rtol=0)
+
+
+def test_borders_do_not_depend_on_the_light_far_from_them_nor_on_other_markers(piece):
+    photo = photograph(piece, view(25, 10, 400, 8), blur_px=0.7, noise=0.01)
+    rough = find_markers(photo, IDS).corners_px
+    ids = sorted(rough)
+    quads, cells = np.array([rough[i] for i in ids]) + 0.8, cells_of(detect.DICTIONARY, ids)
+    together, whole = refine(photo, quads, cells), fit_borders(luminance(photo), quads, cells)
+    alone = [refine(photo, quads[[i]], cells[[i]])[0] for i in range(len(ids))]
+    assert len(ids) == 8 and all(b.fitted for b in whole)
+    for borders in (whole, alone):
+        for one, other in zip(together, borders, strict=True):
+            np.testing.assert_allclose(one.corners_px, other.corners_px, atol=1e-6, rtol=0)
+
+
+def test_a_sheet_too_small_for_the_first_levels_is_found_and_one_too_small_for_all_is_not(piece, surface, monkeypatch):
+    levels = []
+    inner = detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda level, *rest: levels.append(level.shape) or inner(level, *rest))
+    near = photograph(piece, view(0, 0, 800, 10, (800, 600)), (800, 600), blur_px=0.4)
+    far = np.full((1800, 2400, 3), 128, np.uint8)
+    far[900:1500, 1300:2100] = near
+    expected = find_sheet(near, IDS, surface.corners_mm).corners_px
+    levels.clear()
+    shown, _ = identify(far, surface)
+    assert shown.corners_px.keys() == expected.keys() == IDS and levels[0] == (450, 600) and len(levels) > 1
+    for marker_id, corners in shown.corners_px.items():
+        np.testing.assert_allclose(corners - [1300, 900], expected[marker_id], atol=0.01, rtol=0)
+    far[900:1500, 1300:2100] = 128
+    far[900:975, 1300:1400] = cv2.resize(near, (100, 75), interpolation=cv2.INTER_AREA)
+    with pytest.raises(CannotJudge, match="no marker is readable"):
+        identify(far, surface)
+
+
+@pytest.mark.parametrize("moved_px", [0, 2])
+def test_markers_that_are_predicted_are_completed_as_without_the_first_look(piece, surface, monkeypatch, moved_px):
+    """Blurred and far away, where the detector misses some; with predictions that are up to half a module off."""
+    photo = photograph(piece, view(30, 0, 560, 10), blur_px=1.5, noise=0.004)
+    predicted = complete._predicted
+
+    def off(*given):
+        quads = predicted(*given)
+        return quads and {i: quad + np.array([moved_px, -moved_px]) for i, quad in quads.items()}
+
+    monkeypatch.setattr(complete, "_predicted", off)
+    looked = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    monkeypatch.setattr(complete, "_HOPELESS", -2)
+    fitted = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    assert looked.keys() == fitted.keys() and len(looked) >= 6
+
+
+def test_outlines_have_no_more_points_than_pixels_have_edges():
+    rng = np.random.default_rng(0)
+    for share in np.linspace(0, 1, 40):
+        mask = (rng.random((23, 31)) < share).astype(np.uint8)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        assert sum(map(len, outlines)) <= edges_in(mask)
+    assert edges_in(np.ones((3, 4), np.uint8)) == 14
+
+
+def test_squares_among_noise_are_counted_as_without_taking_its_specks_off():
+    y, x = np.mgrid[:400, :400] % 40
+    picture = np.where((abs(y - 20) < 10) & (abs(x - 20) < 10), 40, 200) + np.random.default_rng(1).normal(
+        0, 6, y.shape
+    )
+    picture = np.clip(picture, 0, 255).astype(np.uint8)
+    count = squares_in(picture)
+    assert count > 60 and squares_in(picture, most=10) == count and squares_in(picture, most=20_000) == 0
+
+
+@pytest.mark.parametrize("step", [1, 3])
+def test_light_is_averaged_and_clipped_pixels_are_counted(step):
+    srgb = np.random.default_rng(0).integers(0, 256, (61, 40, 3), np.uint8)
+    srgb[:20, :20] = np.minimum(srgb[:20, :20], CLIPPED_CODE - 1)
+    height, width = 61 // step, 40 // step
+    blocks = srgb[: height * step, : width * step].reshape(height, step, width, step, 3)
+    clipped = (blocks.max(-1) >= CLIPPED_CODE).mean((1, 3))
+    means = appearance._reduced_light(srgb, step)
+    np.testing.assert_allclose(means[..., :3], LIGHT[blocks].mean((1, 3)), atol=1e-5)
+    np.testing.assert_allclose(means[..., 3], clipped, atol=1e-6)
+
+
+def test_colors_are_those_of_all_pixels(piece, surface, monkeypatch):
+    manifest = make_manifest()
+    photo = photograph(piece, view(20, 5, 300, size_px=(1600, 1200)), (1600, 1200), fine=2, blur_px=0.6, noise=0.005)
+    photo = view_of(Photo(photo, None), None)
+
+    def color():
+        promised = promised_of(manifest, surface, identity_printer())
+        return measure(photo, "a", surface, promised, promised_ranges(()), with_pictures=False).entry.color
+
+    reduced = color()
+    monkeypatch.setattr(appearance, "_SAMPLES", 1e6)
+    whole = color()
+    # the 12-megapixel photographs that were compared differ by 0.0125 at most
+    assert reduced.delta_e00_mean == pytest.approx(whole.delta_e00_mean, abs=0.03)
+    assert reduced.clipped_share == whole.clipped_share and reduced.glossy_share == whole.glossy_share
+
+
+@pytest.mark.parametrize(("azimuth_deg", "distance_mm", "blur_px"), [(0, 350, 0.6), (35, 500, 0.6), (20, 700, 1.2)])
+def test_a_reduced_picture_seen_through_one_window_gives_the_markers_of_three(
+    piece, surface, monkeypatch, azimuth_deg, distance_mm, blur_px
+):
+    sensor = {"fine": 2, "blur_px": blur_px, "noise": 0.01}
+    photo = photograph(piece, view(azimuth_deg, 5, distance_mm, size_px=(1600, 1200)), (1600, 1200), **sensor)
+    one = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    inner = detect._detect
+    monkeypatch.setattr(detect, "_detect", lambda picture, printed, whole_px, _: inner(picture, printed, whole_px))
+    three = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    assert one.keys() == three.keys() == IDS
+    for marker_id, corners in one.items():
+        np.testing.assert_allclose(corners, three[marker_id], atol=0.02, rtol=0)
+
+
+def test_a_first_round_that_only_nears_the_borders_leaves_them_where_they_were(piece, surface, monkeypatch):
+    photo = photograph(piece, view(25, 10, 400, 8), blur_px=0.7, noise=0.01)
+    nearing = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    monkeypatch.setattr(edges, "_SETTLED_PX", (1e-3, 1e-3))
+    settled = find_sheet(photo, IDS, surface.corners_mm).corners_px
+    assert nearing.keys() == settled.keys() == IDS
+    assert max(np.abs(nearing[i] - settled[i]).max() for i in IDS) < 2e-3
+
+
+def test_a_color_map_that_stops_where_it_settles_is_that_of_all_turns(monkeypatch):
+    rng = np.random.default_rng(0)
+    promised = rng.random((2000, 3))
+    seen = promised @ np.array([[0.6, 0.1, 0.02], [0.05, 0.7, 0.03], [0.01, 0.08, 0.5]]) + 0.03
+    seen += rng.standard_t(2, seen.shape) * 0.01
+    seen[:300] += 0.3  # gloss
+    stopped = colorfit.affine12(seen, promised)
+    monkeypatch.setattr(colorfit, "_SETTLED", 0)
+    turned = colorfit.affine12(seen, promised)
+    assert stopped is not None and turned is not None
+    np.testing.assert_allclose(stopped.apply(seen), turned.apply(seen), atol=5e-4)
+
+
+def test_how_vague_cells_are_and_how_well_codes_agree_are_numpy_s_own(piece):
+    rng = np.random.default_rng(0)
+    cells = rng.random((5, 30, 30), np.float32)
+    cells[0] = 0.5
+    cells[1] = np.linspace(0, 1, 30)  # texture along one side alone
+    vague = _vagueness(cells)
+    assert np.isinf(vague[:2]).all()
+    for cell, figure in zip(cells[2:], vague[2:], strict=True):
+        slopes = np.stack([slope.ravel() for slope in np.gradient(cell[5:-5, 5:-5])])
+        least = np.linalg.eigvalsh(np.cov(slopes, bias=True))[0]
+        assert figure == pytest.approx(cell.std() / np.sqrt(16 * least), rel=1e-4)
+    code = (rng.random((7, 7)) < 0.5).astype(float)
+    srgb = rng.integers(0, 256, (70, 70, 3), np.uint8)
+    quad = np.array([[0, 0], [70, 0], [70, 70], [0, 70]], float)
+    centers = np.mgrid[1:6, 1:6].reshape(2, -1) * 10 + 5
+    light = edges.sample(luminance(srgb), centers.T[:, ::-1].astype(float))
+    expected = np.corrcoef(light, code[1:-1, 1:-1].ravel())[0, 1]
+    assert complete._agreement(srgb, quad, code) == pytest.approx(expected, abs=1e-5)
+    assert complete._agreement(np.full_like(srgb, 9), quad, code) == -1

@@ -1,0 +1,290 @@
+"""The page stands alone, says what the report says, and has the same bytes each time."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import html
+import http.server
+import io
+import json
+import re
+import shutil
+import subprocess
+import threading
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from synthetic_photos import make_manifest
+
+from patchproof.base.claims import Estimate
+from patchproof.evidence.results import KEYS, Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
+from patchproof.report.images import delta_map, save_pictures
+from patchproof.report.photo_table import photos_csv
+from patchproof.report.results import Results, write_results
+from patchproof.report.tables import Drawing, Table
+from patchproof.report.write import write_report
+from test_verify_run import promise
+
+
+def some_report(verdict="kept"):
+    seen = Prediction(label="<b>bright</b>", confidence=0.8, target_confidence=0.8, recognized=True)
+    photos = [
+        PhotoEntry(
+            file=f"p{i}.jpg", status="measured", markers_found=8, residual_mm=0.02, px_per_mm=1.0 + i, tilt_deg=5.0 * i,
+            contrast=0.7, blur_px=0.6, corner_uncertainty_mm=0.05, delta_e00_mean=2.0, delta_e00_p95=4.0,
+            color_fit="affine12", clipped_share=0.0, glossy_share=0.0,
+            predictions={"net": seen}, sha256="f" * 64, scale_x=0.97, scale_y=0.971 + i / 1000,
+        )
+        for i in range(3)
+    ]  # fmt: skip
+    photos.append(PhotoEntry(file="bad.jpg", status="rejected", code="unreadable", advice="copy it again"))
+    summary = Summary(
+        photos=4, judged=3, measured=3, rate=1.0, interval=(0.44, 1.0), prediction_interval=(2, 3), verdict=verdict,
+        effect="not_tested", matched_rate=None, reason="3 of 3 photographs were recognized.",
+    )  # fmt: skip
+    origin = Origin(options={"ruler_mm": (97.1, 97.3)}, sha256={"network net": "e" * 64}, versions={"numpy": "1"})
+    controls = (Control("gray", 1, 3, (0.06, 0.79), 3, 0.67, (0.1, 0.9), 0.5, False),)
+    return Report(sheet_id="TESTSHEET0", photos=tuple(photos), summary=summary, controls=controls, origin=origin)
+
+
+def some_ledger():
+    steps = ("gamut", "print", "light_and_camera", "blur_and_noise", "photo")
+    shares = {
+        step: LedgerShare(share=share, interval=(share - 0.02, share + 0.02)).model_dump()
+        for step, share in zip(steps, (0.01, 0.2, 0.05, -0.02, 0.03), strict=True)
+    }
+    return {"shares": shares, "ideal": 0.9, "photo": 0.63, "photos": 12, "culprit": "print"}
+
+
+def pictures():
+    flat = np.full((40, 60, 3), 90, np.uint8)
+    kinds = {"photo": flat, "seen": flat, "fitted": flat, "promised": flat, "delta_e00": np.full((6, 6), 3.0)}
+    return {"p0.jpg": kinds}
+
+
+def written(out, verdict="kept"):
+    rest = dict(azimuth_deg=None, contrast=None, blur_px=None, recognized=True)
+    claims = [dict(px_per_mm=1.0 + i % 3, tilt_deg=float(i), **rest) for i in range(30)]
+    manifest = make_manifest(promise(claims)).model_dump(mode="json")
+    for file, kinds in pictures().items():
+        save_pictures(out / "pictures", file, kinds)
+    return write_report(some_report(verdict).model_dump(mode="json"), manifest, out, some_ledger())
+
+
+class Tags(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.links, self.open, self.kinds = [], [], set()
+
+    def handle_starttag(self, tag, attrs):
+        self.kinds.add(tag)
+        self.links += [value for name, value in attrs if name in {"src", "href", "xlink:href"}]
+
+
+def test_the_page_asks_nothing_of_the_network_and_runs_no_script(tmp_path):
+    text = written(tmp_path).read_text()
+    tags = Tags()
+    tags.feed(text)
+    assert tags.links and all(link.startswith(("data:image/", "#")) for link in tags.links)
+    assert not tags.kinds & {"script", "link", "iframe"}
+    assert not re.search(r"url\((?!#)|@import", text)
+
+
+def test_the_page_says_what_the_report_says_and_escapes_it(tmp_path):
+    text = written(tmp_path).read_text()
+    for words in (
+        "Promise kept",
+        "TESTSHEET0",
+        "p2.jpg",
+        "unreadable",
+        "copy it again",
+        "&lt;b&gt;bright",
+        "not measured",
+        "3 of 3 photographs were recognized.",
+        "97.1, 97.3",
+        "e" * 64,
+        "f" * 64,
+        "numpy 1",
+        "+67 points",
+    ):
+        assert words in text
+    assert "<b>bright" not in text and "Promise broken" not in text
+    assert text.count("<svg") == 4  # tilt, pixels per mm, print scale, ledger
+
+
+def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recognized(tmp_path):
+    report = some_report()
+    rejected = report.photos[-1].changed(predictions=report.photos[0].predictions)
+    manifest = make_manifest(promise()).model_dump(mode="json")
+    words = "<span>recognized</span>", "<span>not counted</span>"
+    for photos, word in ((report.photos[:1], words[0]), ((rejected,), words[1])):
+        write_report(report.changed(photos=photos).model_dump(mode="json"), manifest, tmp_path, None)
+        page = (tmp_path / "report.html").read_text("utf-8")
+        assert [each for each in words if each in page] == [word]
+
+
+def test_json_is_the_report_and_nothing_else(tmp_path):
+    written(tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text()) == some_report().model_dump(mode="json")
+    again = Report.model_validate_json((tmp_path / "report.json").read_text())
+    assert again.photos == some_report().photos and again.model_dump_json() == some_report().model_dump_json()
+    assert sorted(p.name for p in (tmp_path / "pictures").iterdir())[0] == "p0.jpg.delta_e00.png"
+
+
+def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(tmp_path):
+    written(tmp_path)
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "report.csv").read_text(encoding="utf-8"))))
+    photos = some_report().photos
+    assert [row["file"] for row in rows] == [photo.file for photo in photos]
+    assert (
+        float(rows[2]["scale_y"]) == photos[2].scale.scale_y
+        and rows[3]["scale_y"] == ""
+        and rows[3]["code"] == "unreadable"
+    )
+    assert rows[0]["net label"] == "<b>bright</b>" and float(rows[0]["net confidence"]) == 0.8
+    names = set(KEYS) - {"homography_px_from_mm", "predictions"}
+    assert (
+        names <= rows[0].keys()
+        and {f"homography_px_from_mm_{i}{j}" for i in range(3) for j in range(3)} <= rows[0].keys()
+    )
+
+
+def test_csv_holds_no_formula():
+    entry = some_report().photos[0].model_dump(mode="json")
+    entry |= {"file": "=1+1.jpg", "homography_px_from_mm": ((1, 2, 3), (4, 5, 6), (7, 8, 9.5))}
+    (row,) = csv.DictReader(io.StringIO(photos_csv([entry])))
+    assert row["file"] == "'=1+1.jpg" and row["homography_px_from_mm_22"] == "9.5"
+
+
+def test_the_same_report_has_the_same_bytes(tmp_path):
+    assert written(tmp_path / "a").read_bytes() == written(tmp_path / "b").read_bytes()
+
+
+def test_a_sheet_without_a_promise_has_a_page_too(tmp_path):
+    summary = Summary(
+        photos=0, judged=0, measured=0, rate=None, interval=None, prediction_interval=None, verdict="cannot_tell",
+        effect="not_tested", matched_rate=None,
+    )  # fmt: skip
+    report = Report(sheet_id="TESTSHEET0", photos=(), summary=summary)
+    page = write_report(report.model_dump(mode="json"), make_manifest().model_dump(mode="json"), tmp_path)
+    assert "Cannot tell" in page.read_text()
+
+
+def test_difference_maps_have_one_scale_and_show_what_was_not_measured():
+    cells = np.array([[0.0, 20.0], [200.0, np.nan]])
+    colors = delta_map(cells, 2)
+    assert (colors[0, 1] == colors[1, 0]).all() and colors[0, 0].sum() > colors[0, 1].sum()
+    assert colors[1, 1, 3] == 0 and colors[0, 0, 3] == 255
+
+
+PROBE = """<script>addEventListener("load", () => {  // before the frame's own: by now every fetch has ended
+const all = [...document.querySelectorAll("main *")].filter(e => !e.closest("pre, svg, .scroll > *"));
+const wide = all.filter(e => e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName);
+const small = all.filter(e => e.innerText && parseFloat(getComputedStyle(e).fontSize) < 11).length;
+const broken = [...document.images].filter(i => i.loading != "lazy" && (!i.complete || !i.naturalWidth)).length;
+const fetched = performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"));
+document.title = JSON.stringify({wide, small, broken, fetched, width: document.documentElement.scrollWidth,
+  inner: innerWidth, images: document.images.length, errors: window.troubles});
+});</script></body>"""
+EARLY = "<head><script>window.troubles = []; window.onerror = m => { window.troubles.push(String(m)) }</script>"
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *arguments):
+        pass
+
+
+def seen_in_browser(page, width_px, tmp_path):
+    """What a browser says of the page in a frame of that width, since a headless window is never narrower than 500."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here to look at the page")
+    probe = page.read_text(encoding="utf-8").replace("<head>", EARLY, 1).replace("</body>", PROBE)
+    (tmp_path / "probe.html").write_text(probe, encoding="utf-8")
+    (tmp_path / "frame.html").write_text(
+        f"<link rel=icon href='data:,'><iframe src='probe.html' width='{width_px}' height='800' style='border:0'"
+        " onload='document.title = this.contentDocument.title'></iframe>"
+    )
+    flags = f"--headless --no-sandbox --disable-gpu --no-first-run --user-data-dir={tmp_path / 'user'} --dump-dom"
+    flags += " --disable-background-networking --disable-component-update --disable-sync --disable-quic"
+    handler = functools.partial(Quiet, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:  # of a file: page, failed loads are lost
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/frame.html"
+        done = subprocess.run([browser, *flags.split(), address], capture_output=True, timeout=60)
+        server.shutdown()
+    title = re.search(r"<title>(\{.*?\})</title>", done.stdout.decode())
+    assert title is not None, done.stderr.decode()[-500:]
+    return json.loads(html.unescape(title[1]))
+
+
+def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways_or_asking_anybody(tmp_path):
+    seen = seen_in_browser(written(tmp_path), 390, tmp_path)
+    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == []
+    assert seen["images"] == 5 and seen["broken"] == 0 and seen["small"] == 0
+    assert seen["errors"] == [] and seen["fetched"] == []
+
+
+def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(tmp_path):
+    page = written(tmp_path)
+    bad = "<div style='width:900px'>x</div><img src='gone.png'><script>nothing.at.all</script></main>"
+    page.write_text(page.read_text(encoding="utf-8").replace("</main>", bad), encoding="utf-8")
+    seen = seen_in_browser(page, 390, tmp_path)
+    assert seen["width"] > 390 and seen["wide"] == ["DIV"] and seen["broken"] == 1
+    assert len(seen["errors"]) == 1 and len(seen["fetched"]) == 1
+
+
+class Alternatives(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.texts = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.texts.append(dict(attrs)["alt"])
+
+
+def results_page(folder):
+    """A study's page with two figures of one title and a wide table."""
+    head = ("object", *(f"setting {i}" for i in range(12)))
+    table = Table("cells", "Every cell", head, tuple(("mug", *[Estimate(0.5, 0.4, 0.6, 100)] * 12) for _ in range(40)))
+    figures = [Drawing(name, "Rates", lambda figure: figure.subplots().plot([1, 2])) for name in "ab"]
+    write_results(folder, Results("study", "toy", "Toys.", "40 cells", {}, [table], figures, {}, {}))
+    return folder / "toy.html"
+
+
+def test_every_picture_has_words_of_its_own(tmp_path):
+    kinds = pictures()["p0.jpg"]
+    save_pictures(tmp_path / "pictures", "p1.jpg", kinds)
+    for page, count in ((written(tmp_path), 10), (results_page(tmp_path), 2)):
+        tags = Alternatives()
+        tags.feed(page.read_text())
+        assert len(tags.texts) == len(set(tags.texts)) == count and all(tags.texts)
+    text = (tmp_path / "report.html").read_text()
+    named = re.findall(r'<div role="img" aria-label="([^"]+)"><svg', text)
+    assert len(named) == len(set(named)) == text.count("<svg") == 4
+
+
+def test_a_studys_page_begins_with_its_figure_and_its_wide_table_scrolls_on_a_phone(tmp_path):
+    page = results_page(tmp_path)
+    text = page.read_text()
+    assert text.index("<img") < text.index("<table")
+    seen = seen_in_browser(page, 390, tmp_path)
+    assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == [] and seen["broken"] == 0
+
+
+def test_a_report_of_fifty_photographs_prints_on_a_few_pages(tmp_path):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here to print the page")
+    report = some_report()
+    photos = [report.photos[0].changed(file=f"{i}.jpg", sha256=f"{i:064x}") for i in range(50)]
+    manifest = make_manifest(promise()).model_dump(mode="json")
+    page = write_report(report.changed(photos=tuple(photos)).model_dump(mode="json"), manifest, tmp_path)
+    flags = f"--headless --no-sandbox --disable-gpu --no-first-run --user-data-dir={tmp_path / 'user'}"
+    out = tmp_path / "printed.pdf"
+    subprocess.run([browser, *flags.split(), f"--print-to-pdf={out}", page.as_uri()], capture_output=True, timeout=60)
+    pages = len(re.findall(rb"/Type\s*/Page\b", out.read_bytes()))
+    assert 2 <= pages <= 6

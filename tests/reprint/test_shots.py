@@ -1,0 +1,42 @@
+"""The shot plan against simulation by the judge's own comparison, and where no number of photographs is enough."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from patchproof.base.goal import Goal
+from patchproof.evidence.verdict import EACH, KEPT, compare, kept_chance
+from patchproof.reprint.shots import fewest, paired_power, plan_shots, unpaired_power
+from test_verify_verdict import promise_of
+
+
+@pytest.mark.parametrize(("rates", "n"), [((0.9, 0.4), 20), ((0.7, 0.5), 60)])
+def test_power_is_what_the_judge_finds_in_simulation(rates, n):
+    rng, paired, unpaired, trials = np.random.default_rng(0), 0, 0, 1500
+    for _ in range(trials):
+        a, b = (rng.random(n) < rate for rate in rates)
+        left = {str(i): bool(x) for i, x in enumerate(a)}
+        paired += compare(left, "bare", {str(i): bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+        unpaired += compare(left, "bare", {f"c{i}": bool(x) for i, x in enumerate(b)}, Goal.assist).shown
+    # three standard errors of 1500 trials
+    assert paired_power(*rates, n) == pytest.approx(paired / trials, abs=0.04)
+    assert unpaired_power(*rates, n) == pytest.approx(unpaired / trials, abs=0.04)
+
+
+def test_the_plan_s_sessions_are_enough_and_one_less_is_not():
+    promise = promise_of(0.85, 0.2, correlation=0.1)
+    sessions = plan_shots(promise).sessions
+    assert kept_chance(promise, (EACH,) * sessions) >= KEPT > kept_chance(promise, (EACH,) * (sessions - 1))
+    assert plan_shots(promise_of(0.3, 0.28, correlation=0.2)).sessions is None
+    ways = plan_shots(promise).ways
+    assert [way.chance for way in ways[:4]] == sorted(way.chance for way in ways[:4])
+    assert np.ptp(ways[0].allowed) > np.ptp(ways[3].allowed)
+
+
+def test_the_hardest_control_decides_and_small_differences_cannot_be_shown():
+    plan = plan_shots(promise_of(0.9, 0.3))
+    assert plan.control == "bare" and 5 <= plan.unpaired <= plan.paired < 40
+    assert plan_shots(promise_of(0.5, 0.5)).paired is None
+    assert plan_shots(promise_of(0.1, 0.8, goal="deceive")).control == "bare"
+    assert fewest(lambda n: n >= 9) == 9 and fewest(lambda n: False) is None

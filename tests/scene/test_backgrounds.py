@@ -1,0 +1,156 @@
+"""Places behind the object: each file for one part only, procedural ones where files are few, a known one for all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from patchproof.base.sessions import in_sessions, spread_of
+from patchproof.base.settings import BackgroundSettings
+from patchproof.scene import patterns
+from patchproof.scene import rooms as module
+from patchproof.scene.backgrounds import ENOUGH, FEW, RARE, ROOMS, load_backgrounds
+from patchproof.scene.rooms import PLACE_PX, place
+from patchproof.scene.scene import make_scene
+
+STREAMS = ("train", "select", "promise", "evaluate")
+
+
+def folder_of(tmp_path, count):
+    """Pictures of one color each, which is their number."""
+    (tmp_path / "places").mkdir()
+    for i in range(count):
+        Image.new("RGB", (8, 8), (i, 0, 0)).save(tmp_path / "places" / f"{i:03d}.png")
+    return load_backgrounds(BackgroundSettings(images="places"), tmp_path)
+
+
+def shown(backgrounds, stream):
+    """The numbers of files, and of procedural places, that a stream may show, and the share of views with files."""
+    chosen = backgrounds.chosen(stream, (np.arange(40_000) + 0.5) / 40_000)
+    pictures = [backgrounds.pictures[int(each * len(backgrounds.pictures))] for each in chosen]
+    real = [int(p[0, 0, 0]) for p in pictures if not isinstance(p, int)]
+    return set(real), {p for p in pictures if isinstance(p, int)}, len(real) / len(pictures)
+
+
+@pytest.mark.parametrize("count", [1, 4, FEW, 200])
+def test_no_place_is_in_two_parts_and_every_part_has_enough(tmp_path, count):
+    backgrounds = folder_of(tmp_path, count)
+    parts = {stream: shown(backgrounds, stream) for stream in STREAMS}
+    files = [file for own, _, _ in parts.values() for file in own]
+    made = [number for _, own, _ in parts.values() for number in own]
+    assert sorted(files) == list(range(count)) and len(set(made)) == len(made)
+    for stream, (own, rooms, _) in parts.items():
+        enough = ENOUGH if stream in ("train", "select") else RARE
+        assert rooms <= set(ROOMS[stream]) and bool(rooms) == (len(own) < enough) and len(own) + len(rooms) >= ENOUGH
+    assert shown(backgrounds, "reprint") == parts["evaluate"]
+    assert bool(backgrounds.notes) == (count < FEW)
+    if count == FEW:  # three of them: in training as often as four procedural ones each, else one view in fifty each
+        assert parts["promise"][2] == pytest.approx(3 / RARE, abs=1e-3)
+        assert parts["train"][2] == pytest.approx(16 / (16 + len(ROOMS["train"])), abs=1e-3)
+    if count == 200:
+        assert len(parts["promise"][0]) == 60
+        assert {stream for stream in STREAMS if parts[stream][1]} == {"select", "evaluate"}
+
+
+def test_a_promise_knows_another_place_for_every_session_and_says_which_share_one(tmp_path):
+    for count, least in ((0, 98), (10, 93)):
+        (tmp_path / str(count)).mkdir()
+        backgrounds = folder_of(tmp_path / str(count), count) if count else load_backgrounds(BackgroundSettings(), None)
+        chosen = backgrounds.chosen("promise", np.random.default_rng(0).random(100))
+        assert len(np.unique(chosen)) >= least
+    hits = [True] * 4 + [False] * 4 + [True, True, False, False] * 2
+    assert in_sessions(hits, 4, (0, 1, 1, 3)) == ([4, 2, 2], [4, 8, 4])
+    assert in_sessions(hits, 4) == ([4, 0, 2, 2], [4, 4, 4, 4])
+    # sessions of one place say less of the rate than as many of places of their own
+    hits = [True] * 4 + [False] * 4
+    together, apart = (spread_of(*in_sessions(hits * 20, 4, places)).rate for places in ((0, 1) * 20, ()))
+    assert np.ptp(together) > 2 * np.ptp(apart)
+
+
+def test_a_picture_that_is_named_and_a_color_are_known_places(tmp_path):
+    folder_of(tmp_path, 3)
+    for settings in ({"images": "places/001.png"}, {"color": (0.2, 0.2, 0.2)}):
+        backgrounds = load_backgrounds(BackgroundSettings(**settings), tmp_path)
+        assert len(backgrounds.pictures) == 1 and not backgrounds.notes
+        assert all((backgrounds.chosen(stream, np.array([0.1, 0.9])) == 0.5).all() for stream in STREAMS)
+
+
+def test_without_any_word_places_are_procedural_and_always_the_same():
+    backgrounds = load_backgrounds(BackgroundSettings(), None)
+    assert all(isinstance(each, int) for each in backgrounds.pictures) and not backgrounds.notes
+    for number in (0, 1):
+        picture = place(number)
+        assert picture.shape == (PLACE_PX, PLACE_PX, 3) and picture.dtype == np.uint8 and picture.std() > 1
+        assert np.array_equal(picture, place(number))
+    assert not np.array_equal(place(0), place(2))
+
+
+def test_a_session_s_photographs_share_print_light_camera_and_place_and_nothing_else():
+    scene = make_scene(
+        {
+            "object": {"mesh": "primitive:carton", "length_mm": 300},
+            "patch": {"width_mm": 120, "height_mm": 120},
+            "target": {"label": "carton", "models": ["builtin"]},
+            "camera": {"motion_px": [0, 4], "vignetting": [0, 0.5]},
+            "light": {"point": [0, 1], "sh2": [0, 0.3], "gloss": [0, 0.1]},
+        }
+    )
+    drawn = scene.draw("promise", 12, per_session=4)
+    alone = scene.draw("promise", 12)
+    of_session = [getattr(drawn.light, name) for name in vars(drawn.light)]
+    of_session += [getattr(drawn.print, name) for name in ("dot_gain", "density", "black")]
+    of_session += [drawn.sensor.white_balance, drawn.sensor.vignetting, drawn.sensor.jpeg]
+    of_session += [drawn.pose.background[:, [0, 1, 4]]]
+    for values in of_session:
+        rows = values.reshape(3, 4, -1)
+        assert (rows == rows[:, :1]).all() and len(np.unique(rows[:, 0], axis=0)) == 3
+    own = [drawn.pose.azimuth_deg, drawn.pose.distance_mm, drawn.pose.background[:, 2], drawn.sensor.exposure_ev]
+    own += [drawn.sensor.blur_px, drawn.sensor.noise, drawn.sensor.motion_px, drawn.sensor.noise_seed]
+    assert all(len(np.unique(values)) == 12 for values in own)
+    np.testing.assert_array_equal(drawn.pose.azimuth_deg, alone.pose.azimuth_deg)
+    part = scene.draw("promise", 5, start=6, per_session=4)  # the last of one session and the first of the next
+    np.testing.assert_array_equal(part.light.ambient, drawn.light.ambient[6:11])
+
+
+def test_promises_of_another_scene_meet_other_draws_and_evaluations_the_same():
+    settings = {
+        "object": {"mesh": "primitive:carton", "length_mm": 300},
+        "patch": {"width_mm": 120, "height_mm": 120},
+        "target": {"label": "carton", "models": ["builtin"]},
+    }
+    one, other = make_scene(settings), make_scene(settings | {"optimize": {"steps": 10}})
+    for stream, same in (("promise", False), ("evaluate", True), ("train", True)):
+        pair = [scene.draw(stream, 8).pose.azimuth_deg for scene in (one, other)]
+        assert np.array_equal(*pair) == same
+
+
+def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
+    """So that a place stays the same whatever shows in it: all that is random is drawn before a texture is made."""
+    places = [module.place(number) for number in range(0, 40, 2)]
+
+    def at_once(rng, px):
+        picture = patterns.drawn_texture(rng, px)()
+        return lambda: picture
+
+    monkeypatch.setattr(module, "drawn_texture", at_once)
+    assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
+    for seed in range(60):  # every pattern
+        rng = np.random.default_rng(seed)
+        later = patterns.drawn_texture(rng, 32)
+        drawn = rng.bit_generator.state
+        assert np.array_equal(later(), later()) and rng.bit_generator.state == drawn
+
+
+def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch):
+    places = [module.place(number) for number in range(0, 40, 2)]
+    monkeypatch.setattr(module, "_passing", lambda aim, ends: np.arange(aim.shape[1]))
+    assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 80, 800])
+@pytest.mark.parametrize("px", [30, 64])
+def test_pixels_have_their_nearest_point_whether_it_was_asked_for_or_not(count, px):
+    points = np.random.default_rng(count).random((count, 2)) * px
+    far = np.linalg.norm(np.argwhere(np.ones((px, px)))[:, None] - points, axis=2)
+    assert np.array_equal(patterns._nearest(points, px).ravel(), far.argmin(1))

@@ -1,0 +1,152 @@
+"""Draws: within their ranges, repeatable, and five streams that share nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from patchproof.base.color import lab_from_linear, tinted_white
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import validated
+from patchproof.scene.conditions import draw, fields_of, with_poses_of
+
+SETTINGS = validated(
+    SceneSettings,
+    {
+        "object": {"mesh": "primitive:carton", "length_mm": 300},
+        "patch": {"width_mm": 50, "height_mm": 50},
+        "target": {"label": "carton", "models": ["builtin"]},
+    },
+    "test",
+)
+STREAMS = ("train", "select", "promise", "reprint", "evaluate")
+
+
+def rows(stream, n=256, seed=0, start=0):
+    fields = fields_of(draw(SETTINGS, stream, n, seed, start))
+    names = ("azimuth_deg", "distance_mm", "exposure_ev", "jpeg")
+    return np.stack([*(fields[name] for name in names), fields["background"][:, 2]], 1)
+
+
+def test_every_value_lies_in_its_range():
+    drawn, view = draw(SETTINGS, "promise", 2000, 0), SETTINGS.view
+    for values, (low, high) in (
+        (drawn.pose.azimuth_deg, view.azimuth_deg),
+        (drawn.pose.elevation_deg, view.elevation_deg),
+        (drawn.pose.distance_mm, view.distance_mm),
+        (drawn.light.ambient, SETTINGS.light.ambient),
+        (drawn.sensor.blur_px, SETTINGS.camera.blur_px),
+        (drawn.sensor.jpeg, SETTINGS.camera.jpeg),
+    ):
+        assert low <= values.min() and values.max() <= high
+        assert values.min() < low + 0.02 * (high - low) + 1 and values.max() > high - 0.02 * (high - low) - 1
+    assert np.abs(drawn.pose.look_at_offset).max() <= view.look_at_jitter
+    assert (drawn.sensor.white_balance[:, 1] == 1).all()
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_a_draw_depends_on_its_index_alone(stream):
+    np.testing.assert_array_equal(rows(stream, 40), rows(stream, 100)[:40])
+    np.testing.assert_array_equal(rows(stream, 15, start=25), rows(stream, 40)[25:])
+    assert not np.array_equal(rows(stream), rows(stream, seed=1))
+
+
+def test_streams_share_nothing():
+    seen: set[tuple] = set()
+    seeds = set()
+    for stream in STREAMS:
+        for seed in range(3):
+            new = {tuple(row) for row in rows(stream, seed=seed)}
+            assert not seen & new
+            seen |= new
+            noise = set(draw(SETTINGS, stream, 256, seed).sensor.noise_seed.tolist())
+            assert not seeds & noise
+            seeds |= noise
+
+
+def test_sobol_covers_a_range_more_evenly_than_independent_draws():
+    def unevenness(stream):
+        counts = np.histogram(draw(SETTINGS, stream, 256, 0).pose.azimuth_deg, 32, SETTINGS.view.azimuth_deg)[0]
+        return counts.std()
+
+    assert unevenness("train") == 0 and unevenness("promise") > 1.5
+
+
+EVERYTHING = SETTINGS.model_copy(
+    update={
+        "light": SETTINGS.light.model_copy(
+            update={"point": (0.2, 0.9), "sh2": (0.1, 0.4), "gloss": (0.01, 0.1), "shininess": (10.0, 90.0)}
+        ),
+        "camera": SETTINGS.camera.model_copy(update={"motion_px": (0.0, 12.0), "vignetting": (0.0, 0.4)}),
+        "printer": SETTINGS.printer.model_copy(
+            update={"paper_white": (0.92, 1.03), "paper_b": (-8, 7), "misregistration_mm": (0, 0.3), "scale": (0.95, 1)}
+        ),
+    }
+)
+ADDED = (
+    *("point", "point_azimuth_deg", "point_elevation_deg", "point_distance_mm", "sh2", "gloss", "shininess"),
+    *("motion_px", "motion_deg", "vignetting"),
+)
+
+
+def test_lamp_gloss_motion_and_vignetting_fill_their_ranges():
+    drawn, light, camera = fields_of(draw(EVERYTHING, "train", 1024, 0)), EVERYTHING.light, EVERYTHING.camera
+    ranges = (light.point, (-90, 90), (10, 80), light.point_distance_mm, light.sh2, light.gloss, light.shininess)
+    for name, (low, high) in zip(ADDED, (*ranges, camera.motion_px, (0, 180), camera.vignetting), strict=True):
+        share = (drawn[name] - low) / (high - low)
+        assert 0 <= share.min() < 0.01 and 0.99 < share.max() <= 1, name
+        assert (np.histogram(share, 16, (0, 1))[0] == 64).all(), name  # Sobol points: every bin alike
+    off = fields_of(draw(SETTINGS, "train", 64, 0))
+    assert not any(off[name].any() for name in ("point", "sh2", "gloss", "motion_px", "vignetting"))
+
+
+def test_terms_that_are_on_leave_the_other_draws_as_they_were():
+    on, off = (fields_of(draw(settings, "promise", 50, 3)) for settings in (EVERYTHING, SETTINGS))
+    for name in ("azimuth_deg", "ambient", "background", "dot_gain", "black", "jpeg", "noise_seed"):
+        np.testing.assert_array_equal(on[name], off[name])
+
+
+def test_paper_misregistration_and_scale_fill_their_ranges_and_are_off_by_default():
+    drawn, off = draw(EVERYTHING, "promise", 2000, 0), draw(SETTINGS, "promise", 50, 0)
+    length = np.linalg.norm(drawn.print.misregistration_mm, axis=2)
+    np.testing.assert_allclose(length[:, 0], length[:, 1])  # both planes as far, each in its own direction
+    assert 0.95 <= drawn.pose.printed_scale.min() < 0.951 and 0.999 < drawn.pose.printed_scale.max() <= 1
+    assert 0 <= length.min() < 0.001 and 0.299 < length.max() < 0.3001
+    red, blue = np.arctan2(drawn.print.misregistration_mm[..., 1], drawn.print.misregistration_mm[..., 0]).T
+    assert abs(np.corrcoef(red, blue)[0, 1]) < 0.07 and np.abs(drawn.print.misregistration_mm.mean(0)).max() < 0.01
+    assert (
+        not off.print.misregistration_mm.any() and (off.print.paper == 1).all() and (off.pose.printed_scale == 1).all()
+    )
+
+
+def test_tinted_paper_has_the_lab_color_it_is_asked_for():
+    white = tinted_white(np.array([1.0, 1.0, 0.5]), np.array([-8.0, 7.0, 0.0]))
+    np.testing.assert_allclose(lab_from_linear(white)[:2], [[100, 0, -8], [100, 0, 7]], atol=2e-4)
+    np.testing.assert_allclose(white[2], 0.5, atol=1e-6)
+
+
+def test_coefficients_of_uneven_light_are_independent_standard_normals():
+    drawn = draw(EVERYTHING, "promise", 4000, 0).light.sh2_coefficients
+    assert drawn.shape == (4000, 8) and np.abs(drawn).max() < 3.1
+    np.testing.assert_allclose(drawn.mean(0), 0, atol=0.06)
+    np.testing.assert_allclose(np.cov(drawn.T), np.eye(8), atol=0.07)
+
+
+def test_no_two_columns_move_together():
+    drawn = fields_of(draw(EVERYTHING, "train", 1024, 0))
+    columns = [drawn[name] for name in (*ADDED, "azimuth_deg", "distance_mm", "ambient", "blur_px")]
+    columns = np.corrcoef([*columns, *drawn["sh2_coefficients"].T])
+    assert np.abs(columns - np.eye(len(columns))).max() < 0.1
+
+
+def test_poses_are_kept_while_the_rest_is_drawn_anew():
+    poses, new = draw(EVERYTHING, "train", 12, 0), draw(EVERYTHING, "train", 12, 0, start=12)
+    kept = with_poses_of(new, poses)
+    pose = {"azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background", "printed_scale"}
+    kept, *both = (fields_of(conditions) for conditions in (kept, poses, new))
+    for name, values in kept.items():
+        source, other = both if name in pose else both[::-1]
+        np.testing.assert_array_equal(values, source[name])
+        assert not np.array_equal(values, other[name]), name
+    with pytest.raises(ValueError, match="12 conditions cannot take the poses of 3"):
+        with_poses_of(new, poses[:3])

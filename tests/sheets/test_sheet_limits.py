@@ -1,0 +1,75 @@
+"""A sheet's PDF from somebody else is drawn within bounds of memory and time, whatever it holds."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pikepdf
+import pytest
+
+from patchproof.base import input as bounds
+from patchproof.base.strict import Refused
+from patchproof.sheets import raster
+from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.raster import page_pixels
+
+needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
+
+
+def test_a_page_of_too_many_pixels_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
+    page = tmp_path / "s.pdf"
+    blank_sheet("blank_a4", page)
+    width, height = page_pixels(page, 1, 30).shape[1::-1]
+    monkeypatch.setattr(raster, "MOST_PX", width * height)
+    assert page_pixels(page, 1, 30).shape == (height, width, 3)
+    monkeypatch.setattr(raster, "MOST_PX", width * height - 1)
+    with pytest.raises(Refused, match=rf"million in all, got {width} × {height}: lower"):
+        page_pixels(page, 1, 30)
+
+
+def forms_in_forms(path: Path, levels: int) -> None:
+    """A page on which a rectangle is drawn ten to the power of so many levels times."""
+    pdf = pikepdf.new()
+    page = pdf.add_blank_page(page_size=(200, 200))
+    form = {"Type": pikepdf.Name.XObject, "Subtype": pikepdf.Name.Form, "BBox": [0, 0, 200, 200]}
+    inner = pdf.make_stream(b"0 0 1 rg 1 1 90 90 re f", **form)
+    for _ in range(levels):
+        resources = pikepdf.Dictionary(XObject=pikepdf.Dictionary(F=inner))
+        inner = pdf.make_stream(b"/F Do " * 10, Resources=resources, **form)
+    page.Contents = pdf.make_stream(b"/F Do")
+    page.Resources = pikepdf.Dictionary(XObject=pikepdf.Dictionary(F=inner))
+    pdf.save(path)
+
+
+@needs_timer
+def test_a_page_that_takes_too_long_is_refused_and_left_behind(tmp_path, monkeypatch):
+    """Five levels take 1 s, and nothing interrupts PDFium; the next page waits for it."""
+    monkeypatch.setattr(bounds, "SECONDS", 0.3)
+    forms_in_forms(tmp_path / "few.pdf", 3)
+    blue = page_pixels(tmp_path / "few.pdf", 1, 72)
+    assert (blue[150, 50] == [0, 0, 255]).all()
+    forms_in_forms(tmp_path / "many.pdf", 5)
+    before = time.process_time()
+    with pytest.raises(Refused, match=r"a page that is soon drawn, got .*, which takes more than 0\.3 s of processor"):
+        page_pixels(tmp_path / "many.pdf", 1, 72)
+    assert time.process_time() - before < 0.7
+    monkeypatch.setattr(bounds, "SECONDS", 10.0)
+    assert (page_pixels(tmp_path / "few.pdf", 1, 72) == blue).all()
+
+
+@needs_timer
+def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
+    """What is drawn ten thousand million times is not waited for."""
+    forms_in_forms(tmp_path / "endless.pdf", 10)
+    code = (
+        "import sys; from patchproof.base import input; from patchproof.sheets.raster import page_pixels;"
+        "from patchproof.base.strict import Refused; input.SECONDS = 0.2\n"
+        "try: page_pixels(sys.argv[1])\nexcept Refused: sys.exit(7)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "endless.pdf")]
+    done = subprocess.run(command, capture_output=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (7, b"")
