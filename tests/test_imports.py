@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "calibrate": {"base", "sheets", "photo", "channel"},
     "evidence": {"base", "sheets", "photo", "channel", "classifier"},
     "report": {"base"},
-    "reprint": {
+    "reprints": {
         *("base", "sheets", "photo", "channel", "mesh", "scene", "render", "optimizer", "evidence", "report"),
     },
 }

@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import conftest  # noqa: F401 - finds helpers of other rooms where this is a program
 import numpy as np
 import pytest
 
@@ -30,7 +31,7 @@ LATE = """
     kornia.enhance kornia.filters matplotlib.figure matplotlib.backends.backend_agg scipy.stats.qmc scipy.spatial jinja2
     pikepdf pypdfium2 reportlab.pdfgen.canvas segno safetensors.torch fuzz test_optimize test_verify_run fake_networks
     toy_studies patchlab.study.study patchproof.report.write
-    patchproof.app.verify patchproof.optimizer.run patchproof.reprint.run_sheet patchproof.reprint.reprint
+    patchproof.app.verify patchproof.optimizer.run patchproof.reprints.run_sheet patchproof.reprints.reprint
     patchproof.classifier.builtin patchproof.classifier.custom patchproof.report.plots"""
 
 
@@ -59,7 +60,7 @@ def verify(base: Path, out: Path, again: bool) -> None:
 
 def sheet(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer.run import load_run
-    from patchproof.reprint.run_sheet import sheet_of
+    from patchproof.reprints.run_sheet import sheet_of
 
     out.mkdir(exist_ok=True)
     sheet_of(load_run(base / "run"), out / "sheet.pdf", control="gray")  # without its plan of photographs
@@ -67,7 +68,7 @@ def sheet(base: Path, out: Path, again: bool) -> None:
 
 def reprint(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer.run import load_run
-    from patchproof.reprint.reprint import reprint
+    from patchproof.reprints.reprint import reprint
 
     reprint(base / "sheet.pdf", load_run(base / "run"), 3, out)
 

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from patchproof.render.photograph import photograph as photograph
     from patchproof.render.stage import Stage as Stage
     from patchproof.render.stage import set_stage as set_stage
-    from patchproof.reprint.reprint import reprint as reprint
-    from patchproof.reprint.run_sheet import sheet_of as sheet
+    from patchproof.reprints.reprint import reprint as reprint
+    from patchproof.reprints.run_sheet import sheet_of as sheet
     from patchproof.scene.conditions import Conditions as Conditions
     from patchproof.scene.scene import Scene as Scene
     from patchproof.scene.scene import load_scene as load_scene
@@ -75,9 +75,9 @@ _HOME = {
     "make_scene": "scene.scene:make_scene",
     "optimize": "optimizer.run:optimize_scene",
     "photograph": "render.photograph:photograph",
-    "reprint": "reprint.reprint:reprint",
+    "reprint": "reprints.reprint:reprint",
     "set_stage": "render.stage:set_stage",
-    "sheet": "reprint.run_sheet:sheet_of",
+    "sheet": "reprints.run_sheet:sheet_of",
     "verify": "app.verify:verify_photos",
 }
 

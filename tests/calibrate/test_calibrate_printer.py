@@ -39,8 +39,8 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import Photo, read_photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprint.inkjets import DRIVERS, draw_inkjet
-from patchproof.reprint.page_photos import chart_manifest, photograph_page, printed_page
+from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
+from patchproof.reprints.page_photos import chart_manifest, photograph_page, printed_page
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import make_scene
 from patchproof.sheets.chart import chart_colors

@@ -18,7 +18,7 @@ import patchproof as pp
 from patchproof.app.begin.new import _model
 from patchproof.base.strict import Refused
 from patchproof.classifier import load_classifier, zoo
-from patchproof.reprint.hung_sheet import Hanging
+from patchproof.reprints.hung_sheet import Hanging
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network")  # doubts: weights are noise
 

@@ -12,11 +12,11 @@ import torch
 from fake_networks import RedAgainstBlue
 from PIL import Image
 
+from patchlab import cli
 from patchlab.harden.attacks import margin, survives_pgd
 from patchlab.harden.folder import HardenSettings, harden_images, tables, too_strong
 from patchlab.harden.harden import harden, moved, squares
 from patchlab.study.study import Cell, Result, Work, run_study
-from patchproof.app import cli
 from patchproof.base.strict import Refused, validated
 from patchproof.classifier.network import Classifier
 from patchproof.photo.read import read_photo

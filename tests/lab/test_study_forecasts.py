@@ -6,7 +6,7 @@ import pytest
 
 from patchlab.study.study import Cell, Result
 from patchlab.validation import forecasts
-from patchproof.reprint import retake
+from patchproof.reprints import retake
 from test_study_promises import small_study
 
 SETTINGS = forecasts.ForecastsSettings(scenes=("a",), networks=("builtin",))

@@ -538,7 +538,7 @@ def test_gradients_need_no_compiler_of_torch_s(tmp_path):
 import sys
 import numpy as np, torch
 import patchproof as pp
-from patchproof.classifier import windows
+from patchproof.networks import windows
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, shown_with_controls

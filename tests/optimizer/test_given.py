@@ -22,7 +22,7 @@ from patchproof.optimizer import run as run_module
 from patchproof.optimizer.given import fit, import_folder, import_patch
 from patchproof.optimizer.run import load_run
 from patchproof.report.coco import PATCH
-from patchproof.reprint.run_sheet import sheet_of
+from patchproof.reprints.run_sheet import sheet_of
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.piece import DICTIONARY, marker_image
 from patchproof.sheets.raster import attached_manifest

@@ -11,10 +11,10 @@ from conftest import SCENE
 
 from patchproof.base.settings import load_scene_settings
 from patchproof.base.strict import Refused
-from patchproof.reprint.hung import hang
-from patchproof.reprint.run_sheet import _wrapped
-from patchproof.reprint.shots import shot_sections
-from patchproof.reprint.tape import tapes
+from patchproof.reprints.hung import hang
+from patchproof.reprints.run_sheet import _wrapped
+from patchproof.reprints.shots import shot_sections
+from patchproof.reprints.tape import tapes
 from patchproof.scene.placement import patch_frame
 from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
 from patchproof.sheets.template import load_template

@@ -127,7 +127,7 @@ def load_art() -> tuple[Any, Any]:
     try:
         attack, wrapper = import_module("art.attacks.evasion"), import_module("art.estimators.classification")
     except (ImportError, RuntimeError):  # the latter of a torchvision that was built for another torch
-        do = 'pip install "patchproof[peers]", or leave art out of peers'
+        do = 'pip install "patchproof[lab]", or leave art out of peers'
         raise Refused("the Adversarial Robustness Toolbox", "none", do) from None
     return attack.AdversarialPatchPyTorch, wrapper.PyTorchClassifier
 

@@ -55,7 +55,7 @@ class PeersSettings(GridSettings):
     """How long designs are trained stands in each scene's [optimize]; every method has as many passes."""
 
     seeds: Seeds = (0, 1, 2)  # of the scenes' draws
-    # What ours is held against: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[peers]"`).
+    # What ours is held against: signed steps; a patch pasted flat; that of ART (`pip install "patchproof[lab]"`).
     peers: Annotated[tuple[Peer, ...], Field(min_length=1)] = PEERS
     n: Count = 400  # conditions per cell, of the evaluate stream
 
@@ -190,7 +190,7 @@ def peers_chart(settings: PeersSettings, results: Sequence[Result]) -> Chart:
         seconds = [result.answers["seconds"] for result in results]
         cost = median([each[name] / each["ours"] for each in seconds])
         points.append(Point(name, cost, loss, name == "ours"))
-    missing = "" if "art" in settings.peers else ' ART is not installed (`pip install "patchproof[peers]"`): left out.'
+    missing = "" if "art" in settings.peers else ' ART is not installed (`pip install "patchproof[lab]"`): left out.'
     return Chart(
         name="demo",
         title="Ours and its peers on the demo's scene, for as many passes",

@@ -22,8 +22,8 @@ from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.color_ladder import Map, choose, difference, distinct, kinds_of_maps
 from patchproof.report.tables import Table
-from patchproof.reprint.inkjets import DRIVERS, draw_inkjet
-from patchproof.reprint.page_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
+from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
+from patchproof.reprints.page_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
 
 SWATCHES = (6, 48, 96)
 TARGETS = {48: 2.5, 96: 1.8}

@@ -22,7 +22,7 @@ from patchproof.optimizer.responses import ask
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.report.tables import Table
-from patchproof.reprint.hung_sheet import take_photo
+from patchproof.reprints.hung_sheet import take_photo
 from patchproof.scene.conditions import Conditions
 
 SIDES_PX = (96, 128, 192, 224, 384)  # and the default's

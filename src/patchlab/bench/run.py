@@ -51,6 +51,7 @@ def _results(name: str, quick: bool, charts: list[Chart]) -> Results:
     about = machine()
     tables = [table for chart in charts for table in (points_table(chart), *chart.tables)]
     return Results(
+        program="patchlab",
         kind="bench",
         name=name,
         about="What each setting costs and how far off it is, measured on this machine.",

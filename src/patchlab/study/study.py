@@ -177,6 +177,7 @@ def carry_out(study: Study, settings: Strict, base: Path, out: str | Path, work:
     results = tuple(Result(cell, kept[cell.name], out) for cell in cells if cell.name in kept)
     tables = tuple(study.tables(settings, results)) if results else ()
     page = Results(
+        program="patchlab",
         kind="study",
         name=study.name,
         about=study.about,

@@ -37,7 +37,7 @@ from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.views import Views, see
 from patchproof.report.tables import Table
-from patchproof.reprint.path_traced import photograph_traced
+from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
 
 ALL = "all"

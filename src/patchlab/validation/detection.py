@@ -34,7 +34,7 @@ from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Table
-from patchproof.reprint.hung_sheet import HungSheet, hang_piece, jpeg_of
+from patchproof.reprints.hung_sheet import HungSheet, hang_piece, jpeg_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import load_scene, needs_patch

@@ -46,7 +46,7 @@ from patchproof.optimizer.promise import CONTROLS, shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.reprint.hung_sheet import hang_piece
+from patchproof.reprints.hung_sheet import hang_piece
 from patchproof.scene.patch_scene import OpenScene
 from patchproof.scene.scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece

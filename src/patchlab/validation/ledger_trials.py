@@ -40,8 +40,8 @@ from patchproof.optimizer.run import load_run
 from patchproof.render.photograph import expose
 from patchproof.render.views import Views, see
 from patchproof.report.tables import Table
-from patchproof.reprint.hung_sheet import HungSheet, hang_own, jpeg_of
-from patchproof.reprint.inkjets import draw_inkjet
+from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
+from patchproof.reprints.inkjets import draw_inkjet
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.scene import PieceScene
 

@@ -61,7 +61,7 @@ def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
     """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
     from patchproof.optimizer.given import import_patch
     from patchproof.optimizer.run import optimize_scene
-    from patchproof.reprint.run_sheet import sheet_of
+    from patchproof.reprints.run_sheet import sheet_of
 
     scene = scene_of(base, cell.values)
     scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
@@ -78,8 +78,8 @@ def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path,
     """The folder with sessions of photographs of folder/sheet.pdf, or of a control in its place and under the same
     conditions.
     """
-    from patchproof.reprint.hung_sheet import Hanging
-    from patchproof.reprint.reprint import reprint
+    from patchproof.reprints.hung_sheet import Hanging
+    from patchproof.reprints.reprint import reprint
 
     out, n = folder / ("photos" if control is None else control), settings.sessions * settings.photos
     how = Hanging(path_traced=settings.path_traced, control=control)

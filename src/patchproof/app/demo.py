@@ -15,8 +15,8 @@ from patchproof.base.output import new_folder
 from patchproof.base.settings import behind
 from patchproof.optimizer.run import optimize_scene
 from patchproof.report.summary import promise_lines, verdict_lines
-from patchproof.reprint.reprint import reprint
-from patchproof.reprint.run_sheet import sheet_of
+from patchproof.reprints.reprint import reprint
+from patchproof.reprints.run_sheet import sheet_of
 
 PHOTOS, SESSIONS = 48, 12
 OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")

@@ -35,7 +35,7 @@ from patchproof.report.coco import PATCH, Labeled, coco_json
 from patchproof.report.images import save_pictures, stem_of
 from patchproof.report.results import versions_of
 from patchproof.report.write import write_report
-from patchproof.reprint.retake import retaker
+from patchproof.reprints.retake import retaker
 from patchproof.sheets.manifest import Manifest, load_manifest
 
 _JOURNAL = "photos.jsonl"

@@ -38,7 +38,7 @@ CONTROL_VIEWS = 2  # of each session: of one, differences would be known to ± 6
 CONTROLS = ("bare", "mean", "gray", "noise")
 # Of a difference, in half widths of its interval: the least that settles it before the end. Of 3,000 simulated controls
 # as good as a design of 80 and 95 %, 6.0 and 4.0 % were told from it, and 5.2 and 3.9 % if all were shown to the end;
-# intervals of real differences held in 95.7 to 97.1 % (`python tests/test_promise_stops.py`).
+# intervals of real differences held in 95.7 to 97.1 % (`python tests/optimizer/test_promise_stops.py`).
 SETTLED = 1.25
 
 
@@ -132,7 +132,7 @@ def _looks(total: int, per_session: int) -> list[int]:
     """Where the parts of a promise begin and end that may stop between them. Of 1,000 simulated promises each, of rates
     from 85 to 99 % to ± 4 points, the intervals of those that looked so held in 93.5 to 97.1 %, of full ones in 94.4 to
     96.4 %; a first look after two fifths, then one every fifth, saved 1 to 20 % more views, but held in 91.9 % of one
-    kind (`python tests/test_promise_stops.py`).
+    kind (`python tests/optimizer/test_promise_stops.py`).
     """
     sessions = math.ceil(total / per_session)
     return [0, *sorted({min(total, math.ceil(sessions * part) * per_session) for part in (0.5, 0.75, 1)})]

@@ -24,8 +24,8 @@ _LIBRARIES = ("patchproof", "torch", "numpy")
 
 @dataclass(frozen=True)
 class Results:
-    """A page's content. `kind` ("study", "bench") heads it, `extent` says how much was done, `failed` are sentences by
-    what they are about; `more` stands in the JSON alone.
+    """A page's content. `program` and `kind` ("patchlab", "study") head it, `extent` says how much was done,
+    `failed` are sentences by what they are about; `more` stands in the JSON alone.
     """
 
     kind: str
@@ -37,6 +37,7 @@ class Results:
     figures: Sequence[Drawing]
     failed: Mapping[str, str]
     more: Mapping[str, Any]
+    program: str = "patchproof"
 
 
 def write_results(folder: Path, results: Results) -> None:

@@ -37,7 +37,7 @@ from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, relit, see
-from patchproof.reprint.hung_sheet import HungSheet, hang_own, jpeg_of
+from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.scene import Scene, needs_mesh, needs_piece
 

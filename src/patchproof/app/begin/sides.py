@@ -15,7 +15,7 @@ import numpy as np
 from patchproof.base.strict import Side
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.stage import Stage
-from patchproof.reprint.hung import straight_picture
+from patchproof.reprints.hung import straight_picture
 from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.patch_scene import PatchScene

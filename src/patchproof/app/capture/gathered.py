@@ -28,7 +28,7 @@ from patchproof.evidence.results import PhotoEntry, Report
 from patchproof.evidence.run import report_of, with_forecast
 from patchproof.evidence.task import Options, Task, task_of
 from patchproof.optimizer.run import load_run
-from patchproof.reprint.retake import retaker
+from patchproof.reprints.retake import retaker
 from patchproof.sheets.manifest import Manifest, load_manifest
 
 

@@ -19,7 +19,7 @@ from patchproof.evidence.results import PhotoEntry
 from patchproof.evidence.verdict import EACH
 from patchproof.report.images import data_uri
 from patchproof.report.words import VERDICTS, headline_of, worth_sentence
-from patchproof.reprint.shots import sessions_line
+from patchproof.reprints.shots import sessions_line
 
 _LATEST = 12  # photographs with advice
 _USUAL_SESSIONS = 4  # where no number of them would do

@@ -133,7 +133,7 @@ def sheet(
     from patchproof.base.output import check_file
     from patchproof.base.settings import behind
     from patchproof.optimizer.run import load_run
-    from patchproof.reprint.run_sheet import blank_page, sheet_of, sheet_of_several
+    from patchproof.reprints.run_sheet import blank_page, sheet_of, sheet_of_several
     from patchproof.sheets.shop import shop_lines
     from patchproof.sheets.template import template_lines
     from patchproof.sheets.write import check_sheet, manifest_paths
@@ -193,10 +193,10 @@ def reprint(
 ) -> None:
     """Print the PDF in simulation, put it back on the object, and photograph it."""
     from patchproof.optimizer.run import load_run
-    from patchproof.reprint.hung_sheet import Hanging
-    from patchproof.reprint.page_photos import reprint_pages
-    from patchproof.reprint.reprint import reprint as reprint_sheet
-    from patchproof.reprint.reprint import scan
+    from patchproof.reprints.hung_sheet import Hanging
+    from patchproof.reprints.page_photos import reprint_pages
+    from patchproof.reprints.reprint import reprint as reprint_sheet
+    from patchproof.reprints.reprint import scan
 
     scale = pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:

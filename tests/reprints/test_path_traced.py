@@ -18,9 +18,9 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import lens_frame
-from patchproof.reprint import path_traced
-from patchproof.reprint.path_traced import Optics, draw_optics, photograph_traced
-from patchproof.reprint.traced_light import sky_directions, sky_radiance
+from patchproof.reprints import path_traced
+from patchproof.reprints.path_traced import Optics, draw_optics, photograph_traced
+from patchproof.reprints.traced_light import sky_directions, sky_radiance
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 

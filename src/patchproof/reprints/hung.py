@@ -24,7 +24,7 @@ from patchproof.render.photograph import shade
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import relit, see
-from patchproof.reprint.tape import Tape, tapes
+from patchproof.reprints.tape import Tape, tapes
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene

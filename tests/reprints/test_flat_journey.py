@@ -29,8 +29,8 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprint.hung_sheet import HungSheet, sent_pixels, take_photo
-from patchproof.reprint.run_sheet import sheet_of
+from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
+from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.patch_scene import PatchScene, load_mesh_scene
 from patchproof.scene.placement import place_card

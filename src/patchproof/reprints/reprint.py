@@ -29,8 +29,8 @@ from patchproof.base.workers import Workers, open_workers, result_of, sharing
 from patchproof.channel.printer import Printer
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import Labeled, coco_json
-from patchproof.reprint.hung_sheet import AS_MADE, Hanging, HungSheet, hang, sheet_scene
-from patchproof.reprint.run_sheet import sheet_of
+from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, hang, sheet_scene
+from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import Conditions
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import page_pixels

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from patchproof.base.strict import Refused
 from patchproof.optimizer.run import Run
-from patchproof.reprint.hung import hang
-from patchproof.reprint.shots import shot_sections
-from patchproof.reprint.tape import tapes
+from patchproof.reprints.hung import hang
+from patchproof.reprints.shots import shot_sections
+from patchproof.reprints.tape import tapes
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import patch_frame
 from patchproof.scene.scene import PieceScene, needs_patch, needs_piece

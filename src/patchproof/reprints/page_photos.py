@@ -29,7 +29,7 @@ from patchproof.channel.light import Lamp, Lighting, irradiance
 from patchproof.channel.printer import load_printer
 from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
-from patchproof.reprint.hung_sheet import Hanging
+from patchproof.reprints.hung_sheet import Hanging
 from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import hash_order

@@ -31,8 +31,8 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.coco import PATCH
-from patchproof.reprint.path_traced import photograph_traced
-from patchproof.reprint.run_sheet import sheet_of
+from patchproof.reprints.path_traced import photograph_traced
+from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import PieceScene, Scene, needs_piece

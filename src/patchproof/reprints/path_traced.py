@@ -35,7 +35,7 @@ from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.views import backgrounds, lens_frame
-from patchproof.reprint.traced_light import lights
+from patchproof.reprints.traced_light import lights
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.scene import needs_mesh, needs_patch, needs_piece

@@ -7,7 +7,7 @@ import pytest
 
 from patchproof.base.goal import Goal
 from patchproof.evidence.verdict import EACH, KEPT, compare, kept_chance
-from patchproof.reprint.shots import fewest, paired_power, plan_shots, unpaired_power
+from patchproof.reprints.shots import fewest, paired_power, plan_shots, unpaired_power
 from test_verify_verdict import promise_of
 
 
