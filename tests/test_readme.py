@@ -120,7 +120,7 @@ def interval(value: float, low: float, high: float) -> str:
     return f"{100 * value:+.1f} [{100 * low:.1f}, {100 * high:.1f}]".replace("+0.0", "0.0").replace("-0.0", "0.0")
 
 
-@pytest.mark.parametrize("page", [README, NOTEBOOK, NOTEBOOK.parent / "keys.md", CONTRIBUTING], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [README, NOTEBOOK, ROOT / ".readme" / "keys.md", CONTRIBUTING], ids=lambda p: p.name)
 def test_pictures_and_files_that_pages_name_exist(page):
     for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target

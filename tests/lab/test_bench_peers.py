@@ -192,7 +192,7 @@ def test_art_itself_goes_where_the_goal_is(scene_file):
 def test_a_missing_art_is_said_before_anything_is_trained(scene_file, without_art, tmp_path):
     config = tmp_path / "study.toml"
     config.write_text('scenes = ["scene.toml"]\n')
-    with pytest.raises(Refused, match=r'Toolbox, got none.*patchproof\[peers\]", or leave art out of peers'):
+    with pytest.raises(Refused, match=r'Toolbox, got none.*patchproof\[lab\]", or leave art out of peers'):
         run_study("peers", config, tmp_path / "out")
     assert not (tmp_path / "out" / "cells").exists()
 
