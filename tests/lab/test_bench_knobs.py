@@ -13,7 +13,7 @@ from patchlab.bench.paper import PIECE_MM, corners_mm, drawn_sheet
 from patchlab.bench.world import demo_problem
 from patchproof.base.claims import Estimate
 from patchproof.base.settings import OptimizeSettings
-from patchproof.optimizer import loop
+from patchproof.optimizer import expectation, loop
 
 
 def quiet(stage, done, total):
@@ -54,8 +54,8 @@ def test_one_front_spans_all_series():
 
 def test_views_are_counted_as_the_loop_sees_them(problem, monkeypatch):
     seen = []
-    score = loop.score
-    monkeypatch.setattr(loop, "score", lambda *a: seen.append(len(a[1])) or score(*a))
+    score = expectation.score
+    monkeypatch.setattr(expectation, "score", lambda *a: seen.append(len(a[1])) or score(*a))
     monkeypatch.setattr(loop, "SELECT_AFTER", 6)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
     train.trained(problem.trained_by(OptimizeSettings(views=3, steps=2)), [2])

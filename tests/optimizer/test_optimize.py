@@ -20,7 +20,7 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, validated
 from patchproof.base.workers import Workers, can_fork, threads
 from patchproof.classifier.network import Classifier
-from patchproof.optimizer import loop, run
+from patchproof.optimizer import loop, run, training_views
 from patchproof.optimizer.goals import target_loss, total_variation
 from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -141,11 +141,11 @@ def test_however_a_gradient_explodes_adam_moves_by_a_few_step_sizes(tmp_path, ex
     problem = set_problem(scene_with(tmp_path, optimize__step_size=0.01))
     state = start(problem)
     for _ in range(100):
-        state = loop._descend(
-            state, torch.randn(state.design.shape, generator=torch.Generator().manual_seed(0)), problem
+        state = loop._update(
+            problem, state, torch.randn(state.design.shape, generator=torch.Generator().manual_seed(0))
         )
     state = replace(state, design=torch.full_like(state.design, 0.5))
-    moved = (loop._descend(state, torch.full_like(state.design, explosion), problem).design - 0.5).abs().max()
+    moved = (loop._update(problem, state, torch.full_like(state.design, explosion)).design - 0.5).abs().max()
     assert bool(torch.isfinite(moved)) and float(moved) < 0.0317
 
 
@@ -364,44 +364,50 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     """A step of 5 views, the selection, promise and controls, and the search for a place among three; nor does it what
     of the five poses a process keeps.
     """
-    monkeypatch.setattr(loop, "POSES", 5)
+    monkeypatch.setattr(training_views, "MIN_POSES", 5)
     scene = toml(tmp_path / "scene.toml", optimize__steps=4, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with threads(1):
-        for jobs, kept_px in ((1, loop.KEPT_PX), (3, loop.KEPT_PX), (2, 0)):
-            monkeypatch.setattr(loop, "KEPT_PX", kept_px)
+        for jobs, kept_px in ((1, training_views.CACHE_PX), (3, training_views.CACHE_PX), (2, 0)):
+            monkeypatch.setattr(training_views, "CACHE_PX", kept_px)
             optimize_scene(scene, tmp_path / str(jobs), jobs=jobs)
     assert same_files(tmp_path / "1", tmp_path / "3", files) and same_files(tmp_path / "1", tmp_path / "2", files)
 
 
 def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "POSES", 6)
+    monkeypatch.setattr(training_views, "MIN_POSES", 6)
     scene = scene_with(tmp_path, optimize__steps=10)
-    drawn, trained = scene.draw("train", 40), loop.trained_on(scene)
-    assert loop.new_share(scene) == 12 / 40  # a quarter of 40 views, in whole steps of four
+    drawn, trained = scene.draw("train", 40), training_views.training_conditions(scene)
+    assert training_views.new_pose_share(scene) == 12 / 40  # a quarter of 40 views, in whole steps of four
     for name, rounds in (("azimuth_deg", True), ("distance_mm", True), ("background", False)):
         values, own = getattr(trained.pose, name), getattr(drawn.pose, name)
         assert np.array_equal(values[:12], own[:12]) and np.array_equal(values[36:], own[:4] if rounds else own[36:])
     trained, drawn = fields_of(trained), fields_of(drawn)
     alike = {name for name, values in drawn.items() if np.array_equal(trained[name], values)}
     assert alike >= {"ambient", "light_azimuth_deg", "dot_gain", "exposure_ev", "noise_seed", "background"}
-    assert loop.new_share(SimpleNamespace(HAS_OBJECT=False, settings=scene.settings)) == 1, "pictures are all of a view"
-    monkeypatch.setattr(loop, "POSES", 240)
-    assert loop.new_share(scene) == 1
-    assert np.array_equal(loop.trained_on(scene).pose.azimuth_deg, drawn["azimuth_deg"])
+    assert training_views.new_pose_share(SimpleNamespace(HAS_OBJECT=False, settings=scene.settings)) == 1, (
+        "pictures are all of a view"
+    )
+    monkeypatch.setattr(training_views, "MIN_POSES", 240)
+    assert training_views.new_pose_share(scene) == 1
+    assert np.array_equal(training_views.training_conditions(scene).pose.azimuth_deg, drawn["azimuth_deg"])
 
 
 def test_only_views_that_fit_are_kept(tmp_path, monkeypatch):
     problem = set_problem(scene_with(tmp_path))
-    monkeypatch.setattr(loop, "POSES", 24)
-    monkeypatch.setattr(loop, "KEPT_PX", 5 * loop.TOGETHER * problem.training_px**2)
+    monkeypatch.setattr(training_views, "MIN_POSES", 24)
+    monkeypatch.setattr(training_views, "CACHE_PX", 5 * training_views.VIEWS_PER_TASK * problem.training_px**2)
     drawn, seen = problem.scene.draw("train", 24), []
-    monkeypatch.setattr(loop, "seen", lambda problem, drawn: seen.append(len(drawn)) or problem.see(None, drawn, 16))
-    kept = loop._Kept(problem, drawn)
+    monkeypatch.setattr(
+        training_views,
+        "training_views",
+        lambda problem, drawn: seen.append(len(drawn)) or problem.see(None, drawn, 16),
+    )
+    cache = training_views.ViewCache(problem, drawn)
     for first in (0, 4, 8, 12, 16, 20, 0, 4, 8, 12, 16, 20):
-        kept.lit(first, drawn[first : first + 2])
-    assert seen == [2 * loop.AHEAD, 4, 2], "the last pair is seen twice"
-    assert not kept._ahead, "what is not kept is seen once"
+        cache.views(first, drawn[first : first + 2])
+    assert seen == [2 * training_views.STEPS_AHEAD, 4, 2], "the last pair is seen twice"
+    assert not cache._ahead, "what is not kept is seen once"
 
 
 def test_an_odd_view_counts_as_much_as_those_that_are_seen_together(tmp_path):

@@ -24,12 +24,14 @@ from patchproof.base.settings import OptimizeSettings
 from patchproof.base.strict import Refused, Side, Strict
 from patchproof.base.workers import sharing
 from patchproof.classifier.network import Classifier
+from patchproof.optimizer.expectation import gradient_in_views
 from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import draft, gradient_of, part_of, seen, start, views_seen
+from patchproof.optimizer.loop import draft, start, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import fewest_passes
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.training_views import training_views
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import At, OpenScene
@@ -226,10 +228,9 @@ class _Search:
 
 def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:
     """The loss of gray, and the decrease that its gradient promises."""
-    views, gray = seen(problem, conditions), start(problem).design
-    gradient, (part,), _ = gradient_of(problem, gray, lambda printed: [part_of(problem, printed, views)])
-    coarse = problem.subject.levels(gradient)[-1]
-    return part.loss, _REACH * float(coarse.abs().sum()) * gradient.numel() / coarse.numel()
+    answer = gradient_in_views(problem, start(problem).design, [training_views(problem, conditions)])
+    coarse = problem.subject.levels(answer.gradient)[-1]
+    return answer.loss, _REACH * float(coarse.abs().sum()) * answer.gradient.numel() / coarse.numel()
 
 
 def _drafted(conditions: Conditions, held_out: Conditions, problem: Problem) -> np.ndarray:

@@ -14,10 +14,11 @@ import torch
 import patchproof as pp
 from patchlab.bench.effort import _scene
 from patchproof.base.workers import keep_freed_memory
-from patchproof.optimizer.loop import start, step_on, trained_on
+from patchproof.optimizer.loop import start, step_on
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.responses import responses
+from patchproof.optimizer.training_views import training_conditions
 
 LABELS, SEEDS, JUDGED = ("box truck", "chair", "mailbox"), range(6), 300
 
@@ -25,7 +26,7 @@ LABELS, SEEDS, JUDGED = ("box truck", "chair", "mailbox"), range(6), 300
 def measured(label: str, seed: int) -> dict:
     """A line of the table."""
     scene = pp.make_scene(_scene(label, 240).settings.changed(optimize={"seed": seed}))
-    problem, drawn, again = set_problem(scene), scene.draw("train", 960), trained_on(scene)
+    problem, drawn, again = set_problem(scene), scene.draw("train", 960), training_conditions(scene)
     kept = replace(again, pose=replace(again.pose, background=drawn.pose.background[np.arange(960) % 240]))
     shown = {}
     for name, conditions in (("each", drawn), ("again", again), ("kept", kept)):

@@ -18,7 +18,7 @@ from torch import nn
 
 import patchproof as pp
 from patchproof.base.workers import keep_freed_memory
-from patchproof.optimizer import loop
+from patchproof.optimizer import loop, training_views
 from patchproof.optimizer.problem import set_problem
 
 ROUNDS, STEPS = 16, 4  # the first is to warm up
@@ -70,7 +70,7 @@ def measured(name: str, scene: str, processes: int) -> dict:
     asked = pp.load_scene(f"{scene}.toml").settings.changed(optimize={"steps": ROUNDS * STEPS})
     scene = pp.make_scene(asked)
     problem = replace(set_problem(scene, models=models), jobs=processes)
-    loop.POSES = 0  # a quarter of the views
+    training_views.MIN_POSES = 0  # a quarter of the views
     pictures = torch.rand(4, 3, problem.training_px, problem.training_px)
     problem.see(None, scene.draw("train", 256), 16)  # makes the places that training knows, once
     running, rounds = loop.steps(problem), []

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.strict import Strict
-from patchproof.optimizer.loop import new_share
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.training_views import new_pose_share
 from patchproof.render.photograph import expose, windows_of
 from patchproof.render.pixels import Shown
 from patchproof.render.raster import rasterize
@@ -78,7 +78,7 @@ def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[s
     """Milliseconds of each part of one step, in the order of the loop."""
     design = design.clone().requires_grad_()
     parts, views = _see_ms(problem, problem.subject.shown(design.detach()), conditions)
-    share = new_share(problem.scene)
+    share = new_pose_share(problem.scene)
     parts = {name: ms * share for name, ms in parts.items()}
     clock = _Clock(problem.device)
     shown = problem.subject.shown(design)

@@ -1,0 +1,190 @@
+"""Expectation over transformations: the mean loss of a design over drawn conditions, and its gradient.
+
+In: a `Problem` and its conditions. Out: `Expectation`, one object that answers for a design whatever the number of
+processes behind it. The design is printed once for all views of a step; each process photographs some of the views,
+asks the networks, and sends back the gradient at what is printed. These are added in the views' order, so that the
+number of processes changes no byte, and go back through the printer here.
+
+Source: Athalye et al. 2018, "Synthesizing robust adversarial examples", eq. 2 and 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from patchproof.base.workers import sharing
+from patchproof.optimizer.pixels import as_pixels, from_pixels
+from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.training_views import (
+    ViewCache,
+    pose_count,
+    task_conditions,
+    training_conditions,
+    training_views,
+)
+from patchproof.render.photograph import expose, windows_of
+from patchproof.render.views import Views
+from patchproof.scene.conditions import Conditions
+
+SELECT_CHUNK = 4  # selection views that a process renders together
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Means over a step's views, and the gradient 3×h×w of their mean loss at the design; what the settings charge a
+    design for is not in it.
+    """
+
+    gradient: Tensor
+    loss: float
+    confidence: float
+    rate: float
+    pictures: Tensor | None = field(default=None, repr=False)
+
+
+class _ViewsAnswer(NamedTuple):
+    """What some of a step's views say of what is printed: means over them, and the gradient at its texels."""
+
+    count: int
+    loss: float
+    confidence: float
+    rate: float
+    gradient: np.ndarray
+    pictures: np.ndarray | None
+
+
+class _TrainTask(NamedTuple):
+    """Texels as printed, and views to train in: their first pose, their conditions, whether to send pictures back."""
+
+    printed: np.ndarray
+    pose: int
+    conditions: Conditions
+    pictures: bool
+
+
+class _SelectTask(NamedTuple):
+    """Texels as printed, and the first of some selection views."""
+
+    printed: np.ndarray
+    first: int
+
+
+class Expectation:
+    """Answers for designs, in the views of a run's steps and in the fixed ones of its selection set."""
+
+    def __init__(self, problem: Problem, conditions: Conditions, selection_views: int, ask: Callable[[list], list]):
+        self._problem, self._conditions, self._selection_views = problem, conditions, selection_views
+        self._ask, self._poses = ask, pose_count(problem.scene)
+
+    def gradient(self, design: Tensor, step: int, pictures: bool = False) -> Answer:
+        """The mean loss and its gradient at a design 3×h×w, in the views of step number `step`, counted from 0."""
+        views = self._problem.scene.settings.optimize.views
+        tasks = task_conditions(self._conditions[step * views : (step + 1) * views])
+
+        def ask(printed: Tensor) -> list[_ViewsAnswer]:
+            sent = printed.cpu().numpy()
+            poses = [(step * views + row) % self._poses for row, _ in tasks]
+            return self._ask([_TrainTask(sent, p, rows, pictures) for p, (_, rows) in zip(poses, tasks, strict=True)])
+
+        return _mean_answer(self._problem, design, ask)
+
+    def selection(self, design: Tensor) -> tuple[float, float]:
+        """Mean loss and rate of a design, in the 8-bit pixels that would go to the printer, in the selection views."""
+        pixels = from_pixels(as_pixels(design), self._problem.device)
+        sent = self._problem.subject.printed(pixels).cpu().numpy()
+        answers = self._ask([_SelectTask(sent, first) for first in range(0, self._selection_views, SELECT_CHUNK)])
+        loss, rate = (sum(values) / len(values) for values in zip(*answers, strict=True))
+        return loss, rate
+
+
+@contextmanager
+def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation]:
+    """The expectation over a run's training conditions, by as many processes as the problem has; `selection` are the
+    conditions of its selection set.
+    """
+    conditions = training_conditions(problem.scene)
+    worker = _Worker(problem, conditions, selection)
+    with sharing(worker.answer, problem.jobs, in_turn=True) as (workers, share):
+        yield Expectation(problem, conditions, len(selection), lambda tasks: workers.map(share, tasks))
+
+
+class _Worker:
+    """What each process keeps between steps: the views that it has rendered."""
+
+    def __init__(self, problem: Problem, conditions: Conditions, selection: Conditions):
+        self._problem, self._cache = problem, ViewCache(problem, conditions)
+        self._selected = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
+
+    def answer(self, task: _TrainTask | _SelectTask) -> _ViewsAnswer | tuple[float, float]:
+        printed = torch.as_tensor(task.printed, device=self._problem.device)
+        if isinstance(task, _SelectTask):
+            return _loss_and_rate(self._problem, printed, self._selected(task.first))
+        return _views_answer(self._problem, printed, self._cache.views(task.pose, task.conditions), task.pictures)
+
+
+def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) -> Answer:
+    """The mean loss and its gradient at a design 3×h×w in these views, all in this process."""
+    return _mean_answer(problem, design, lambda printed: [_views_answer(problem, printed, each) for each in views])
+
+
+def score(
+    problem: Problem, pictures: Tensor, conditions: Conditions, windows: np.ndarray | None = None
+) -> tuple[Tensor, float, float]:
+    """Mean loss over classifiers and pictures N×3×H×W of these conditions; mean confidence and rate of the same.
+    Outside of `windows`, N×4 pixels (left, top, right, bottom), the pictures' gradient is not asked for.
+    """
+    losses, confidence, rate, boxes = [], 0.0, 0.0, problem.boxes(conditions)
+    for classifier, indices in zip(problem.classifiers, problem.indices, strict=True):
+        logits = classifier.logits(pictures, boxes, windows)
+        losses.append(problem.losses(classifier, logits, indices).mean())
+        confidence += float(classifier.confidence(logits.detach(), indices).mean())
+        rate += float(classifier.recognized(logits.detach(), indices).double().mean())
+    count = len(losses)
+    return torch.stack(losses).mean(), confidence / count, rate / count
+
+
+def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Sequence[_ViewsAnswer]]) -> Answer:
+    """Print the design once, ask views of it, and take their mean gradient back through the printer."""
+    design = design.detach().requires_grad_()
+    printed = problem.subject.printed(design)
+    answers = ask(printed.detach())
+    shares = [answer.count / sum(each.count for each in answers) for answer in answers]
+
+    def mean(values):
+        return sum(share * value for share, value in zip(shares, values, strict=True))
+
+    at_printed = torch.as_tensor(mean(answer.gradient for answer in answers), device=problem.device)
+    # a product to derive, since torch imports SymPy when it is handed a gradient to begin with (networks/windows.py)
+    (gradient,) = torch.autograd.grad((printed * at_printed).sum(), design)
+    pictures = [torch.as_tensor(answer.pictures) for answer in answers if answer.pictures is not None]
+    return Answer(
+        gradient,
+        mean(answer.loss for answer in answers),
+        mean(answer.confidence for answer in answers),
+        mean(answer.rate for answer in answers),
+        torch.cat(pictures) if pictures else None,
+    )
+
+
+def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: bool = False) -> _ViewsAnswer:
+    """Photograph what is printed in these views, ask the networks, and derive their mean loss."""
+    printed = printed.detach().requires_grad_()
+    photos = expose(views, problem.subject.showing(printed))
+    loss, confidence, rate = score(problem, photos, views.conditions, windows_of(views))
+    (gradient,) = torch.autograd.grad(loss, printed)
+    kept = photos.detach().cpu().numpy() if pictures else None
+    return _ViewsAnswer(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), kept)
+
+
+@torch.no_grad()
+def _loss_and_rate(problem: Problem, printed: Tensor, views: Views) -> tuple[float, float]:
+    loss, _, rate = score(problem, expose(views, problem.subject.showing(printed)), views.conditions)
+    return float(loss), rate
