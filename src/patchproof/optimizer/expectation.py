@@ -53,7 +53,7 @@ class Answer:
 class _ViewsAnswer(NamedTuple):
     """What some of a step's views say of what is printed: means over them, and the gradient at its texels."""
 
-    count: int
+    views: int
     loss: float
     confidence: float
     rate: float
@@ -156,7 +156,7 @@ def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Seque
     design = design.detach().requires_grad_()
     printed = problem.subject.printed(design)
     answers = ask(printed.detach())
-    shares = [answer.count / sum(each.count for each in answers) for answer in answers]
+    shares = [answer.views / sum(each.views for each in answers) for answer in answers]
 
     def mean(values):
         return sum(share * value for share, value in zip(shares, values, strict=True))
