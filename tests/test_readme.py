@@ -272,7 +272,7 @@ def test_figures_of_imported_designs_are_the_stored_ones():
 
 def test_figures_of_a_network_s_forms_are_the_stored_ones():
     rows = stored("forms/promises.json")["tables"]["promises"]["rows"]
-    for form, sessions in ("ONNX, `file:", rows[:4]), ("archive, `file:", rows[4:8]), ("in memory, `module:", rows[8:]):
+    for form, sessions in ("ONNX, `file:", rows[:4]), ("in memory, `module:", rows[8:]):
         promised, held = 100 * sessions[0][6], sum(session[-2] for session in sessions)
         judged, recognized = (sum(session[column] for session in sessions) for column in (8, 9))
         (verdict,) = {session[-1] for session in sessions}

@@ -25,7 +25,7 @@ def foolbox():
 @pytest.fixture(scope="module")
 def real(data):
     """A real network, what it sees of the labeled photographs, and their labels."""
-    classifier = load_classifier(f"file:{data}/models/mobilenet_v1_0.25_128.pt2", data)
+    classifier = load_classifier(f"file:{data}/models/mobilenet_v1_0.25_128.onnx", data)
     rows = list(csv.DictReader((data / "photos/labels.csv").read_text().splitlines()))
     pictures = squares([read_photo(data / "photos" / row["file"]).srgb for row in rows], classifier).clamp(0, 1)
     return classifier.network, pictures, torch.tensor([int(row["label"]) for row in rows])

@@ -253,7 +253,7 @@ def test_a_changed_scene_file_is_another_cell_and_ways_are_checked_early(tmp_pat
 def test_names_must_differ_and_ways_be_words():
     settings = TrainedSettings(scenes=("a.toml",), networks=("builtin",))
     with pytest.raises(Refused, match="different names"):
-        settings.changed(networks=("file:a/net.pt2", "file:b/net.pt2"))
+        settings.changed(networks=("file:a/net.onnx", "file:b/net.onnx"))
     with pytest.raises(Refused, match=r"ways\.a b"):
         validated(TrainedSettings, {"scenes": ["a"], "networks": ["b"], "ways": {"a b": {}}}, "config")
 

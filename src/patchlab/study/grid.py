@@ -49,7 +49,7 @@ class GridSettings(Strict):
 def short_name(name: str) -> str:
     """A scene's or network's name as tables and files say it: a file's stem, a registry's entry."""
     word = name.rpartition(":")[2]
-    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".pt2")) else word)[-40:]
+    return re.sub(r"[^\w.+-]", "-", Path(word).stem if "/" in word or word.endswith((".toml", ".onnx")) else word)[-40:]
 
 
 def scene_values(file: str, base: Path, tables: Tables | None = None, where: str = "") -> Values:

@@ -1,4 +1,4 @@
-"""What is stored of a trained network: weights as float16 or a program, and a card that says how it was made and how
+"""What is stored of a trained network: weights as float16 or an ONNX file, and a card that says how it was made and how
 good it is.
 """
 
@@ -38,11 +38,11 @@ def stored(network: nn.Module, path: Path) -> int:
 
 
 def exported(network: nn.Module, path: Path, input_px: int) -> int:
-    """Write the network as a program for any number of pictures; how many weights it has."""
+    """Write the network as an ONNX file for any number of pictures; how many weights it has."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    batches = {0: torch.export.Dim("n", min=1, max=4096)}
-    photos = torch.rand(2, 3, input_px, input_px)
-    torch.export.save(torch.export.export(network.eval(), (photos,), dynamic_shapes=(batches,)), path)
+    photos, any_number = torch.rand(2, 3, input_px, input_px), {0: torch.export.Dim("n")}
+    options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False}
+    torch.onnx.export(network.eval(), (photos,), path, dynamic_shapes=(any_number,), **options)
     return sum(weights.numel() for weights in network.parameters())
 
 

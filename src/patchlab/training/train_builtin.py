@@ -6,7 +6,8 @@ that training never saw.
 
 Another architecture learns from the same pictures where `--network` names what makes it, which is called with
 `num_classes` and what `--settings` says: `--name levit --network timm.create_model --settings '{"model_name":
-"levit_128s", "img_size": 96}'`. It is loaded as `file:DIR/levit.pt2`, without the library that it is from.
+"levit_128s", "img_size": 96}'`. It is loaded as `file:DIR/levit.onnx`, without the library that it is from; writing it
+takes `pip install "patchproof[lab]"`.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def untrained(recipe: Recipe) -> torch.nn.Module:
 def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: fit.Seconds) -> None:
     """The network and what is known about it; the accuracy is that of what is stored."""
     if recipe.network:
-        network, count = trained, exported(trained, out / f"{recipe.name}.pt2", recipe.input_px)
+        network, count = trained, exported(trained, out / f"{recipe.name}.onnx", recipe.input_px)
     else:
         network = folded(trained)
         count = stored(network, out / f"{recipe.name}.safetensors")

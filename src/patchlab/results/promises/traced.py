@@ -21,7 +21,7 @@ from patchproof.render.photograph import photograph
 from patchproof.reprints.path_traced import photograph_traced
 
 N, SEED = 60, 78
-NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.pt2"
+NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.onnx"
 
 
 def measured(name: str) -> list[dict]:

@@ -66,7 +66,7 @@ def pass_ms(problem, pictures, indices) -> float:
 
 def measured(name: str, scene: str, processes: int) -> dict:
     """A line of the table."""
-    models = [resnet50()] if name == "resnet50" else [f"file:${{PATCHPROOF_DATA}}/models/{name}.pt2"]
+    models = [resnet50()] if name == "resnet50" else [f"file:${{PATCHPROOF_DATA}}/models/{name}.onnx"]
     asked = pp.load_scene(f"{scene}.toml").settings.changed(optimize={"steps": ROUNDS * STEPS})
     scene = pp.make_scene(asked)
     problem = replace(set_problem(scene, models=models), jobs=processes)

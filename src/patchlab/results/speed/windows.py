@@ -84,7 +84,7 @@ def asked_beside_others(network, size: int, share: float) -> dict:
 
 def measured(name: str, share: float) -> dict:
     """A line of the table."""
-    classifier = load_classifier(f"file:{os.environ['PATCHPROOF_DATA']}/models/{name}.pt2", Path())
+    classifier = load_classifier(f"file:{os.environ['PATCHPROOF_DATA']}/models/{name}.onnx", Path())
     asked = classifier.network, classifier.input_px, share
     return {"network": name, "share": share, **asked_for_gradients(*asked), **asked_beside_others(*asked)}
 

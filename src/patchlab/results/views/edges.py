@@ -19,7 +19,7 @@ from patchproof.render.photograph import expose, shade
 from patchproof.render.views import see
 
 N, SEED, SAMPLES = 60, 78, 3
-NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.pt2"
+NETWORK = "file:${PATCHPROOF_DATA}/models/mobilenet_v1_0.75_192.onnx"
 
 
 def measured(name: str) -> dict:
