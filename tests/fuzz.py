@@ -419,11 +419,11 @@ def faces_txt(rng: Rng, folder: Path) -> Read:
 
 
 def card_json(rng: Rng, folder: Path) -> Read:
-    from patchproof.classifier.program import load_program
+    from patchproof.classifier.network_file import load_network
 
-    (folder / "n.pt2").write_bytes(b"PK")
+    (folder / "n.onnx").write_bytes(protobuf(onnx_model()))
     (folder / "n.json").write_bytes(broken_json(rng, CARD))
-    return lambda: load_program(folder / "n.pt2")
+    return lambda: load_network(folder / "n.onnx")
 
 
 # a protobuf message as pairs of a field's number and what it holds: a number, bytes, text or another message

@@ -52,9 +52,11 @@ def small() -> onnx.ModelProto:
     return model(SMALL, 13)
 
 
-def save(folder: Path, made: onnx.ModelProto | bytes, labels=LABELS, name: str = "small") -> Path:
+def save(
+    folder: Path, made: onnx.ModelProto | bytes, labels=LABELS, name: str = "small", kind: str = "classifier"
+) -> Path:
     """The file and its card."""
     path = folder / f"{name}.onnx"
     path.write_bytes(made if isinstance(made, bytes) else made.SerializeToString())
-    path.with_suffix(".json").write_text(json.dumps({"input_px": 8, "labels": labels}))
+    path.with_suffix(".json").write_text(json.dumps({"input_px": 8, "labels": labels, "kind": kind}))
     return path

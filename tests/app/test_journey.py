@@ -280,7 +280,8 @@ def test_other_processes_take_and_judge_the_same_photographs(journey, tmp_path):
         (("verify", "{j}/photos", "--sheet", "{j}/nothing.json", "--out", "x"), "no file"),
         (("verify", "{j}/nowhere", "--sheet", "{j}/sheet.json", "--out", "x"), "a folder of photographs"),
         (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "{j}/report"), "--overwrite"),
-        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "file:no.pt2"), "no.pt2"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "file:no.onnx"), "no.onnx"),
+        (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "file:no.pt2"), "onnx.export"),
         (("verify", "{j}/photos", "--sheet", "{j}/sheet.json", "--out", "x", "--models", "resnet"), '"resnet"'),
     ],
 )

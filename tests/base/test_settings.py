@@ -177,8 +177,8 @@ def test_expand_paths_and_names(tmp_path, monkeypatch):
     absolute = str(tmp_path / "x" / "car.glb")
     assert expand("car.glb", tmp_path / "x") == absolute and expand(absolute, Path("/elsewhere")) == absolute
     assert expand("${PP_TEST_DIR}/car.glb", tmp_path) == "/data/car.glb"
-    assert expand("file:${PP_TEST_DIR}/net.pt2", tmp_path) == "file:/data/net.pt2"
-    assert expand("file:net.pt2", tmp_path) == f"file:{tmp_path / 'net.pt2'}"
+    assert expand("file:${PP_TEST_DIR}/net.onnx", tmp_path) == "file:/data/net.onnx"
+    assert expand("file:net.onnx", tmp_path) == f"file:{tmp_path / 'net.onnx'}"
     assert expand("timm:vit@w.safetensors", tmp_path) == f"timm:vit@{tmp_path / 'w.safetensors'}"
     assert expand("torchvision:vgg11@/data/w.safetensors", tmp_path) == "torchvision:vgg11@/data/w.safetensors"
     kept = ("timm:hf-hub:timm/vit@main", "timm:vit@w.pth", "torchvision:resnet50", "timm:vit")

@@ -82,7 +82,7 @@ def test_doubts_are_warned_about_and_let_pass():
         check(lambda x: GOOD(x) * 1e3)
 
 
-@pytest.mark.parametrize("name", ["resnet50", "", "torch:x", "models/a.pt2", "http://x/y.pt2", "Builtin"])
+@pytest.mark.parametrize("name", ["resnet50", "", "torch:x", "models/a.onnx", "http://x/y.pt2", "Builtin"])
 def test_a_name_of_no_known_form_is_refused(name, tmp_path):
     with pytest.raises(Refused, match=r'file:NAME\.onnx or module:package\.factory, got "' + name):
         load_classifier(name, tmp_path)
@@ -91,9 +91,9 @@ def test_a_name_of_no_known_form_is_refused(name, tmp_path):
 def test_a_variable_that_is_not_set_and_a_file_that_is_not_there(tmp_path, monkeypatch):
     monkeypatch.delenv("NOWHERE", raising=False)
     with pytest.raises(Refused, match="environment variable NOWHERE"):
-        load_classifier("file:${NOWHERE}/a.pt2", tmp_path)
-    with pytest.raises(Refused, match=r"no file at .*a\.pt2"):
-        load_classifier("file:a.pt2", tmp_path)
+        load_classifier("file:${NOWHERE}/a.onnx", tmp_path)
+    with pytest.raises(Refused, match=r"no file at .*a\.onnx"):
+        load_classifier("file:a.onnx", tmp_path)
 
 
 # ------------------------------------------------------------------------------------------------ torchvision, timm

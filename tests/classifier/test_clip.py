@@ -6,8 +6,8 @@ import json
 
 import pytest
 import torch
-from archives import seeded
 from safetensors.torch import save_file
+from small_networks import seeded
 
 from patchproof.base.strict import Refused
 from patchproof.classifier import load_classifier

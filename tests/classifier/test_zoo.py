@@ -10,9 +10,9 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import torch
-from archives import seeded
 from conftest import SCENE
 from safetensors.torch import save_file
+from small_networks import seeded
 
 import patchproof as pp
 from patchproof.app.begin.new import _model

@@ -1,4 +1,4 @@
-"""Pictures in batches that a CPU is fast with: the same logits and gradients, and programs that take one order only."""
+"""Pictures in batches that a CPU is fast with: the same logits and gradients, and networks that take one order only."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from patchproof.networks.batches import InBatches, fastest, few_on_cpu
 
 
 class Flattens(torch.nn.Module):
-    """A convolution and, as exported programs may hold it, a view that takes one order of memory only."""
+    """A convolution and, as networks may hold it, a view that takes one order of memory only."""
 
     def __init__(self, view: bool):
         super().__init__()
@@ -26,8 +26,10 @@ def test_batches_are_cut_and_filled_up():
         return photos.mean((2, 3))
 
     photos = torch.rand(7, 3, 2, 2)
-    assert torch.equal(InBatches(network, 2, 3)(photos), photos.mean((2, 3)))
-    assert seen == [3, 3, 2]
+    assert torch.equal(InBatches(network, 3)(photos), photos.mean((2, 3)))
+    assert seen == [3, 3, 3]
+    assert torch.equal(InBatches(network)(photos), photos.mean((2, 3)))
+    assert seen[3:] == [7]
 
 
 @pytest.mark.parametrize(("view", "order"), [(False, torch.channels_last), (True, torch.contiguous_format)])
@@ -35,7 +37,7 @@ def test_the_fastest_order_is_the_one_that_the_network_takes(view, order):
     network = Flattens(view)
     pictures = torch.rand(5, 3, 128, 128)
     laid = fastest(network, pictures[:2])
-    assert laid.order is order and laid.high == few_on_cpu(128) == 12
+    assert laid.order is order and laid.most == few_on_cpu(128) == 12
     given, plain = (pictures.clone().requires_grad_() for _ in range(2))
     (gradient,) = torch.autograd.grad(laid(given).square().sum(), given)
     (expected,) = torch.autograd.grad(network(plain).square().sum(), plain)
@@ -43,8 +45,8 @@ def test_the_fastest_order_is_the_one_that_the_network_takes(view, order):
     torch.testing.assert_close(gradient, expected)
 
 
-def test_few_pictures_at_a_time_on_a_cpu_but_never_fewer_than_a_program_takes():
+def test_few_pictures_at_a_time_on_a_cpu_but_as_many_as_a_network_takes():
     pictures = torch.rand(2, 3, 224, 224)
-    assert fastest(Flattens(False), pictures).high == 4
-    assert fastest(InBatches(Flattens(False), 8, 8), pictures).high == 8
+    assert fastest(Flattens(False), pictures).most == 4
+    assert fastest(InBatches(Flattens(False), 8), pictures).most == 8
     assert few_on_cpu(64) == 49 and few_on_cpu(1024) == 1

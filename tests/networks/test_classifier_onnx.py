@@ -1,4 +1,4 @@
-"""ONNX files as networks: what they answer, beside torch, onnx's own reference and the same weights in other forms."""
+"""ONNX files as networks: what they answer, beside torch, onnx's own reference and the same weights in memory."""
 
 import json
 import warnings
@@ -7,17 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from archives import LABELS, ConvNeXt, ResNet, ViT, exported, seeded
-from archives import save as save_archive
+from small_networks import LABELS, ConvNeXt, ResNet, ViT, seeded
 
 import patchproof as pp
 from patchproof.base.strict import Refused
 from patchproof.classifier import load_classifier
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
-from patchproof.classifier.program import load_program
+from patchproof.classifier.network_file import EXPORT, load_network
+from patchproof.networks import windows
+from patchproof.networks.batches import fastest
 from patchproof.networks.onnx_file import read_onnx
 from patchproof.networks.onnx_operators import OPERATORS, Operator
+from patchproof.networks.windows import Windows
 from test_zoo import judged
 
 pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')
@@ -38,16 +40,14 @@ class Prompted(ViT):
         return 10 * seen @ said.T
 
 
-def written(folder: Path, network: torch.nn.Module, batch: int | None = None, dynamo: bool = False) -> Path:
-    """`network` for N×3×16×16, by one of torch's two exporters, of any N or of one."""
+def written(folder: Path, network: torch.nn.Module, batch: int | None = None, side: int = 16) -> Path:
+    """`network` for N×3×16×16 or another side, by torch's older exporter, of any N or of one."""
     path = folder / "net.onnx"
-    sizes = {"dynamic_shapes": None if batch else ({0: torch.export.Dim("n", min=1, max=64)},), "verbose": False}
     axes = {"input_names": ["x"], "dynamic_axes": None if batch else {"x": {0: "n"}}}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns of itself
-        pictures = (torch.rand(batch or 2, 3, 16, 16),)
-        torch.onnx.export(seeded(network), pictures, str(path), dynamo=dynamo, **(sizes if dynamo else axes))
-    path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
+        torch.onnx.export(seeded(network), (torch.rand(batch or 2, 3, side, side),), str(path), dynamo=False, **axes)
+    path.with_suffix(".json").write_text(json.dumps({"input_px": side, "labels": LABELS}))
     return path
 
 
@@ -68,33 +68,61 @@ def check_alike(network, truth, numbers=(1, 5)) -> None:
 @pytest.mark.parametrize("batch", [None, 1])
 @pytest.mark.parametrize("make", [ResNet, ViT, ConvNeXt, Prompted])
 def test_logits_and_gradients_are_torchs(make, batch, tmp_path):
-    check_alike(load_program(written(tmp_path, make(), batch)).network, seeded(make()))
+    check_alike(load_network(written(tmp_path, make(), batch)).network, seeded(make()))
 
 
-def test_those_of_the_newer_exporter_with_weights_beside_it(tmp_path):
+def test_the_command_of_the_refusal_writes_such_a_file_with_weights_beside_it(tmp_path, monkeypatch):
     pytest.importorskip("onnxscript", reason="torch's newer exporter needs onnxscript")
-    path = written(tmp_path, ViT(), dynamo=True)
+    monkeypatch.chdir(tmp_path)
+    code, _, _ = EXPORT.removeprefix("export it with ").partition(", S pixels")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of itself
+        exec(code.replace("NAME", "net"), {"torch": torch, "network": seeded(ViT()), "S": 16})
+    path = tmp_path / "net.onnx"
+    path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
     assert (tmp_path / "net.onnx.data").stat().st_size > 1000
-    classifier = load_program(path)
-    check_alike(classifier.network, seeded(ViT()), (3,))
+    classifier = load_network(path)
+    check_alike(classifier.network, seeded(ViT()))
     with (tmp_path / "net.onnx.data").open("r+b") as data:
         data.write(b"\1")
-    assert load_program(path).sha256 != classifier.sha256  # what is hashed is both files
+    assert load_network(path).sha256 != classifier.sha256  # what is hashed is both files
     (tmp_path / "net.onnx.data").unlink()
     with pytest.raises(Refused, match=r"no file at .*net\.onnx\.data"):
-        load_program(path)
+        load_network(path)
 
 
-def test_onnx_module_and_archive_of_the_same_weights_agree(tmp_path):
-    network = seeded(ResNet())
-    save_archive(tmp_path, exported(network))
-    names = [f"file:{written(tmp_path, network)}", "file:small.pt2", classifier_of(network, 16, LABELS)]
-    photos = torch.rand(5, 3, 40, 30)
-    (logits, gradient), *others = (answered(load_classifier(name, tmp_path).logits, photos) for name in names)
-    assert gradient.abs().max() > 1e-3
-    for other_logits, other_gradient in others:
-        torch.testing.assert_close(logits, other_logits, rtol=1e-4, atol=1e-4)
-        torch.testing.assert_close(gradient, other_gradient, rtol=1e-4, atol=1e-4)
+def test_file_and_module_of_the_same_weights_agree_for_photographs_of_any_size(tmp_path):
+    network, photos = seeded(ResNet()), torch.rand(5, 3, 40, 30)
+    names = [f"file:{written(tmp_path, network)}", classifier_of(network, 16, LABELS)]
+    ours, theirs = (answered(load_classifier(name, tmp_path).logits, photos) for name in names)
+    assert ours[1].abs().max() > 1e-3
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("order", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("make", [ResNet, ViT, ConvNeXt])
+def test_pictures_may_come_in_either_order(make, order, tmp_path):
+    network, truth = load_network(written(tmp_path, make())).network.network, seeded(make())
+    photos = torch.rand(5, 3, 16, 16).to(memory_format=order)
+    for ours, theirs in zip(answered(network, photos), answered(truth, photos), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_file_is_cut_where_its_module_is(tmp_path, monkeypatch):
+    """Gradients in windows are the whole network's there, and are computed there only."""
+    monkeypatch.setattr(windows, "FIXED", 0)  # the network is small
+    pictures = torch.rand(2, 3, 96, 96)
+    network, of_module = load_network(written(tmp_path, ResNet(), side=96)).network, fastest(seeded(ResNet()), pictures)
+    assert fastest(network, pictures).cut and of_module.cut and network.cut.stride == of_module.cut.stride
+    px = np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
+    photos, gradients = torch.rand(3, 3, 96, 96), []
+    for asked in (None, Windows(px)):
+        given = photos.clone().requires_grad_()
+        gradients.append(torch.autograd.grad(network(given, asked).square().sum(), given)[0])
+    whole, parts = gradients
+    for one, same, (left, top, right, bottom) in zip(parts, whole, px.tolist(), strict=True):
+        torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
+    assert not torch.equal(parts, whole)
 
 
 def test_a_file_goes_from_a_scene_to_a_verdict(tmp_path):
@@ -113,14 +141,11 @@ def test_a_file_goes_from_a_scene_to_a_verdict(tmp_path):
         assert ours["file:b.onnx"].target_confidence == pytest.approx(theirs["builtin"].target_confidence, abs=1e-4)
 
 
-def test_a_name_a_card_and_a_hash_are_as_for_archives(tmp_path):
-    path = onnx_files.save(tmp_path, onnx_files.small())
+def test_a_file_has_a_name_a_hash_and_its_card_s_labels(tmp_path):
+    onnx_files.save(tmp_path, onnx_files.small())
     classifier = load_classifier("file:small.onnx", tmp_path)
     assert (classifier.name, classifier.input_px, list(classifier.labels)) == ("file:small.onnx", 8, onnx_files.LABELS)
     assert len(classifier.sha256) == 64 and not any(p.requires_grad for p in classifier.network.buffers())
-    path.with_suffix(".json").unlink()
-    with pytest.raises(Refused, match=r"no file at .*small\.json: write"):
-        load_program(path)
     with pytest.raises(Refused, match=r'write "file:small\.onnx"'):
         load_classifier("small.onnx", tmp_path)
 
@@ -222,8 +247,8 @@ def test_an_operator_is_onnxs(opset, body):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # logarithms of negative numbers
         (expected,) = ReferenceEvaluator(made).run(None, {"x": pictures})
-    network, low, high = read_onnx(made.SerializeToString(), lambda: b"")
-    assert (low, high) == (1, 4096)
+    network, batch = read_onnx(made.SerializeToString(), lambda: b"")
+    assert batch is None
     got = network(torch.from_numpy(pictures)).numpy()
     assert (got.dtype, got.shape) == (expected.dtype, expected.shape)
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
@@ -231,7 +256,7 @@ def test_an_operator_is_onnxs(opset, body):
     assert elsewhere.shape == got.shape
 
 
-def test_what_archives_save_is_saved_here_too():
+def test_operators_of_torch_s_own_take_part_in_what_is_saved():
     body = """a = Conv<group=3, pads=[0,0,1,1]>(x, D) b = Clip(a, Zero, Two) c = Conv(b, W) d = Conv(b, W)
         e = Add(c, d) y = Relu(e)"""
     network, *_ = read_onnx(onnx_files.model(body).SerializeToString(), lambda: b"")

@@ -4,10 +4,10 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import archives
 import numpy as np
 import pytest
 import torch
+from small_networks import ConvNeXt, ResNet, ViT, seeded
 
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
@@ -17,7 +17,6 @@ from patchproof.networks.batches import fastest
 from patchproof.networks.graph import Program
 from patchproof.networks.steps import Step, Value, mark_spent
 from patchproof.networks.windows import Windows
-from patchproof.optimizer import loop
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, shown_with_controls
@@ -63,7 +62,8 @@ def kernel(before: int, after: int, side: int = 3) -> torch.Tensor:
 
 def convolution(of, before: int, after: int, stride: int = 1, side: int = 3, padding: int | None = None):
     padding = side // 2 if padding is None else padding
-    return ATEN.conv2d.default, [of, kernel(before, after, side), torch.randn(after), [stride] * 2, [padding] * 2]
+    more = [[stride] * 2, [padding] * 2, [1, 1], False, [0, 0], 1]
+    return ATEN.convolution.default, [of, kernel(before, after, side), torch.randn(after), *more]
 
 
 def head(of, features: int):
@@ -79,7 +79,7 @@ def plain() -> Program:
         convolution("x", 3, 16, 2),
         (ATEN.relu.default, [(0,)]),
         convolution((1,), 16, 16),
-        (ATEN.relu6.default, [(2,)]),
+        (ATEN.hardtanh.default, [(2,), 0.0, 6.0]),
         convolution((3,), 16, 24, 2),
         (ATEN.hardswish.default, [(4,)]),
         *head(5, 24),
@@ -89,7 +89,7 @@ def plain() -> Program:
 def residual() -> Program:
     return program(
         (ATEN.sub.Tensor, ["x", torch.full((3, 1, 1), 0.5)]),
-        (ATEN.pad.default, [(0,), [0, 1, 0, 1]]),
+        (ATEN.constant_pad_nd.default, [(0,), [0, 1, 0, 1]]),
         convolution((1,), 3, 12, 2, padding=0),
         (ATEN.relu.default, [(2,)]),
         convolution((3,), 12, 12),
@@ -359,14 +359,14 @@ def test_a_network_too_small_to_save_anything_is_not_cut(monkeypatch):
 
 def test_batches_take_their_own_windows(monkeypatch):
     laid, photos = fastest(plain(), pictures()), pictures(7)
-    monkeypatch.setattr(laid, "high", 3)
+    monkeypatch.setattr(laid, "most", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     torch.manual_seed(0)
     whole, parts = gradient(laid, photos), gradient(lambda x: laid(x, Windows(asked)), photos)
     for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
         torch.testing.assert_close(one[:, top:bottom, left:right], same[:, top:bottom, left:right])
     assert not torch.equal(parts, whole)
-    monkeypatch.setattr(laid, "low", 2)  # the seventh picture goes twice, as ever
+    monkeypatch.setattr(laid, "size", 3)  # the seventh picture goes three times
     filled = gradient(lambda x: laid(x, Windows(asked)), photos)
     torch.testing.assert_close(filled[6], whole[6])
 
@@ -429,7 +429,7 @@ def test_pictures_that_differ_in_windows_share_the_rest(made, seed):
 
 def test_batches_keep_their_own_first_pictures(monkeypatch):
     laid, first = fastest(plain(), pictures()), pictures(7)
-    monkeypatch.setattr(laid, "high", 3)
+    monkeypatch.setattr(laid, "most", 3)
     asked = np.array([[10 * i, 5 * i, 10 * i + 20, 5 * i + 30] for i in range(7)])
     other = first.clone()
     for picture, (left, top, right, bottom) in zip(other, asked.tolist(), strict=True):
@@ -464,7 +464,7 @@ def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatc
     monkeypatch.setattr(batches, "answers", lambda *given: asked.append(1) or found(*given))
     designs = [best_design(problem)]
     assert asked or jobs > 1  # other processes count for themselves
-    monkeypatch.setattr(loop, "windows_of", lambda views: None)
+    monkeypatch.setattr("patchproof.optimizer.expectation.windows_of", lambda views: None)
     designs.append(best_design(problem))
     assert len(np.unique(designs[0])) > 10 and np.abs(designs[0].astype(int) - designs[1]).max() <= 1
 
@@ -489,9 +489,9 @@ def test_a_promise_shares_what_its_views_have_in_common(tmp_path, monkeypatch):
         assert (shared[kind].confidence != shared["bare"].confidence).any() or kind == "bare"
 
 
-@pytest.mark.parametrize("made", [archives.ResNet, archives.ConvNeXt, lambda: load_builtin().network, Written])
+@pytest.mark.parametrize("made", [ResNet, ConvNeXt, lambda: load_builtin().network, Written])
 def test_modules_in_memory_are_cut_where_torch_can_follow_them(made):
-    network = archives.seeded(made()).eval().requires_grad_(False)
+    network = seeded(made()).eval().requires_grad_(False)
     side = 96
     photos, asked = torch.rand(3, 3, side, side), np.array([[40, 30, 50, 44], [0, 0, 9, 9], [80, 85, 96, 96]])
     laid = fastest(network, photos)
@@ -502,7 +502,7 @@ def test_modules_in_memory_are_cut_where_torch_can_follow_them(made):
     assert not torch.equal(parts, whole)
 
 
-@pytest.mark.parametrize("made", [archives.ViT, Turns, Counts, Masked, Slices])
+@pytest.mark.parametrize("made", [ViT, Turns, Counts, Masked, Slices])
 def test_modules_that_torch_cannot_follow_are_computed_whole(made):
     network = made().eval().requires_grad_(False)
     photos, asked = torch.rand(3, 3, 16, 16), np.array([[4, 4, 6, 6]] * 3)

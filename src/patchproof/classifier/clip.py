@@ -21,7 +21,7 @@ from patchproof.base.strict import Refused
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
-from patchproof.classifier.program import read_card
+from patchproof.classifier.network_file import read_card
 from patchproof.classifier.zoo import Normalized, downloaded, library, own_weights, put_into
 
 

@@ -2,8 +2,7 @@
 
     builtin                the small network that comes with the package (builtin.py)
     builtin-detector       the small detector that comes with it (builtin_detector.py)
-    file:NAME.pt2          a torch.export program with NAME.json beside it (program.py)
-    file:NAME.onnx         an ONNX file with NAME.json beside it
+    file:NAME.onnx         an ONNX file with NAME.json beside it (network_file.py)
     torchvision:NAME       a torchvision or timm model; its weights are downloaded because it was named (zoo.py),
     timm:NAME              or with @FILE.safetensors behind the name read from that file
     clip:NAME@FILE         a network of pictures and text, whose labels are the prompts of a file (clip.py)
@@ -43,9 +42,9 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
 
         classifier = load_builtin_detector()
     elif kind == "file":
-        from patchproof.classifier.program import load_program
+        from patchproof.classifier.network_file import load_network
 
-        classifier = load_program(Path(rest), device)
+        classifier = load_network(Path(rest), device)
     elif kind in ("torchvision", "timm"):
         from patchproof.classifier.zoo import load_timm, load_torchvision
 
@@ -61,8 +60,11 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")
     else:
-        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.pt2, file:NAME.onnx"
-        do = f'write "file:{name}"' if name.endswith((".pt2", ".onnx")) else "write one of these"
+        from patchproof.classifier.network_file import EXPORT
+
+        known = "builtin, builtin-detector, torchvision:NAME, timm:NAME, clip:NAME@FILE, file:NAME.onnx"
+        words = {".onnx": f'write "file:{name}"', ".pt2": EXPORT}
+        do = words.get(Path(name).suffix, "write one of these")
         raise Refused(f"a model named {known} or module:package.factory", f'"{name}"', do)
     return _trusted(replace(classifier, name=name), device)
 

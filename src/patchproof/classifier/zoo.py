@@ -33,7 +33,7 @@ from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier
-from patchproof.classifier.program import Card, network_bytes, read_card
+from patchproof.classifier.network_file import Card, network_bytes, read_card
 
 
 class Normalized(nn.Module):

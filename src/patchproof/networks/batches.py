@@ -18,30 +18,32 @@ from torch import Tensor
 
 from patchproof.networks.windows import Cut, Windows, answers, cut_of
 
-MAX_BATCH = 4096  # where a program sets no limit of its own
 CPU_BATCH_PIXELS = 4 * 224**2  # 2 to 8 pictures of 224 px cost the same each, 12 a third more
 
 
 class InBatches(torch.nn.Module):
-    """`network` for any N, though itself it takes from `low` to `high` pictures; short batches repeat their last."""
+    """`network` for any N, though itself it may take one number of pictures, `size`, only: short batches repeat their
+    last. At most `most` go at a time, None for all.
+    """
 
-    def __init__(self, network: Callable[[Tensor], Tensor], low: int = 1, high: int = MAX_BATCH):
+    def __init__(self, network: Callable[[Tensor], Tensor], size: int | None = None):
         super().__init__()
-        self.network, self.low, self.high, self.order = network, low, high, torch.contiguous_format
+        self.network, self.size, self.most, self.order = network, size, size, torch.contiguous_format
         self.tried: Tensor | None = None  # on a CPU, two of the pictures that the order was tried with
 
     def train(self, mode: bool = True) -> InBatches:
-        """Nothing to switch: networks come as they are to be used, and an exported program refuses `eval()`."""
+        """Nothing to switch: networks come as they are to be used."""
         return self
 
     def forward(self, photos: Tensor, windows: Windows | None = None) -> Tensor:
         """N×3×S×S → N×K logits. The pictures' gradient need hold in `windows` only."""
         logits = []
-        for number, batch in enumerate(photos.split(self.high)):
-            missing = self.low - len(batch)
+        most = self.most or len(photos)
+        for number, batch in enumerate(photos.split(most)):
+            missing = (self.size or 0) - len(batch)
             padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
             ordered = padded.contiguous(memory_format=self.order)
-            first, own = number * self.high, None
+            first, own = number * most, None
             if windows is not None and missing <= 0:
                 own = windows.part(first, first + len(batch))
             logits.append(self._answers(ordered, own)[: len(batch)])
@@ -62,11 +64,11 @@ class InBatches(torch.nn.Module):
 def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:
     """`network` in the batches and the order that suit the device; `pictures` N×3×S×S are tried for it.
 
-    Exported programs may hold a reshape that takes one order only; such a program is left as it was.
+    A network may hold a view that takes one order only; such a network is left as it was.
     """
     batches = network if isinstance(network, InBatches) else InBatches(network)
     if pictures.device.type == "cpu":
-        batches.high = max(batches.low, min(batches.high, few_on_cpu(pictures.shape[-1])))
+        batches.most = batches.size or few_on_cpu(pictures.shape[-1])
     batches.tried = pictures[:2] if pictures.device.type == "cpu" else None
     batches.order = torch.channels_last
     try:

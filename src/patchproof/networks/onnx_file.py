@@ -1,7 +1,7 @@
 """`file:NAME.onnx`: an ONNX file that nobody vouches for, read without onnx.
 
 In: its bytes, and a way to those of NAME.onnx.data, where exporters put large weights. Out: a Program of numbered
-steps (graph.py), and the batches that it takes; Unwanted where there is anything else in it. Nothing of the file is
+steps (graph.py), and how many pictures it takes; Unwanted where there is anything else in it. Nothing of the file is
 executed, and no text of it becomes a path: where a weight's "location" points is not looked at.
 Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
 weights, opsets before 13, of which onnx.version_converter makes newer ones.
@@ -19,9 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.networks.archive import MAX_DIMENSIONS, MAX_NUMBERS, Unwanted, quoted, whole
-from patchproof.networks.batches import MAX_BATCH
-from patchproof.networks.description import MAX_LIST
+from patchproof.networks.bounds import MAX_BATCH, MAX_DIMENSIONS, MAX_LIST, MAX_NUMBERS, Unwanted, quoted, whole
 from patchproof.networks.graph import Program
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
 from patchproof.networks.onnx_plain import Way, way_through
@@ -85,8 +83,8 @@ _MODEL: Schema = {
 }
 
 
-def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int, int]:
-    """The network, and the smallest and largest batch that it takes; `beside` reads NAME.onnx.data, once at most."""
+def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int | None]:
+    """The network, and how many pictures it takes, None for any number; `beside` reads NAME.onnx.data, once at most."""
     model = read_message(stored, _MODEL)
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
@@ -157,7 +155,7 @@ class _Reader:
         self.values: dict[str, Value | Tensor | None] = {"": None}  # an input that is left out
         self.tensor = weights.tensor
 
-    def read(self) -> tuple[Program, int, int]:
+    def read(self) -> tuple[Program, int | None]:
         """See read_onnx."""
         for initializer in self.graph.get("initializer", []):
             self._constant(initializer.get("name", ""), self.tensor(initializer))
@@ -167,7 +165,7 @@ class _Reader:
                 self._constant(node["output"][0], self._attribute(node["attribute"][0]))
         if len(given) != 1:
             raise Unwanted(f"{len(given)} inputs, not one of N×3×S×S")
-        low, high, sizes = _shape(given[0]["type"]["tensor"])
+        batch, sizes = _shape(given[0]["type"]["tensor"])
         self.count = len(self.weights)
         self.of_four = {number for number, weight in enumerate(self.weights) if weight.dim() == 4}
         self._new(given[0]["name"])
@@ -176,7 +174,7 @@ class _Reader:
         if len(outputs) != 1 or not isinstance(outputs[0], Value):
             raise Unwanted(f"{len(outputs)} outputs, not one of N×K")
         mark_spent(steps, {*range(len(self.weights) + 1), outputs[0].number})
-        return Program(self.weights, steps, outputs[0].number, sizes), low, high
+        return Program(self.weights, steps, outputs[0].number, sizes), batch
 
     def _constant(self, name: str, value: Any) -> None:
         """A weight has a number and moves with the network; lists of sizes and factors stay on the CPU."""
@@ -253,13 +251,13 @@ class _Reader:
         return content
 
 
-def _shape(tensor: dict[str, Any]) -> tuple[int, int, list[int | None]]:
-    """The smallest and largest batch, and the input's sizes, None where any is allowed."""
+def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None]]:
+    """The batch, and the input's sizes; None where any is allowed."""
     if tensor["kind"] != 1:
         raise Unwanted("an input that is not float32")
     sizes = [size.get("value") for size in tensor["shape"].get("dim", [])]
     if len(sizes) != 4:
         raise Unwanted(f"an input of {len(sizes)} dimensions, not N×3×S×S")
     fixed = [None if size is None else whole(size, 1, 1 << 16) for size in sizes]
-    low, high = (1, MAX_BATCH) if fixed[0] is None else (whole(fixed[0], 1, MAX_BATCH),) * 2
-    return low, high, [None, *fixed[1:]]
+    batch = None if fixed[0] is None else whole(fixed[0], 1, MAX_BATCH)
+    return batch, [None, *fixed[1:]]

@@ -1,9 +1,9 @@
 """What an ONNX file may compute: the standard's operators of image classifiers, written with torch.
 
-In: a name as the file writes it. Out: a function of tensors. As in operators.py none of them reads or writes anything
-but its tensors or draws random numbers, and a name that is not in the table leads nowhere. In a signature inputs before
-`/` are data, those after it sizes or axes, and these and what follows `*` may be attributes of that name. Data are sent
-to the pictures' device, which has no memory when graph.py tries the steps. Only for the operators in `_ON_SIZES`, whose
+In: a name as the file writes it. Out: a function of tensors. None of them reads or writes anything but its tensors or
+draws random numbers, and a name that is not in the table leads nowhere. In a signature inputs before `/` are data,
+those after it sizes or axes, and these and what follows `*` may be attributes of that name. Data are sent to the
+pictures' device, which has no memory when graph.py tries the steps. Only for the operators in `_ON_SIZES`, whose
 results their inputs bound, a few numbers on the CPU stay there: so sizes can be reckoned with.
 To allow one more, add a line to `_TABLE`, of what torch computes alike (test_classifier_onnx.py holds it against onnx).
 Left out on purpose: control flow, sequences, text, random numbers, quantized and recurrent networks, boxes.
@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import patchproof.networks.onnx_shapes as shapes
-from patchproof.networks.archive import Unwanted
+from patchproof.networks.bounds import Unwanted
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
 # the numbers of TensorProto.DataType

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from patchproof.networks.archive import MAX_DIMENSIONS
+from patchproof.networks.bounds import MAX_DIMENSIONS
 
 MAX_SIZES = 64  # numbers on the CPU in one value: three of them, each against each, are 262 thousand
 

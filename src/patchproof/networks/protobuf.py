@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.networks.archive import Unwanted
+from patchproof.networks.bounds import Unwanted
 
 MAX_FIELDS = 1 << 19  # in a file: Swin's, which computes all its sizes, has 57 thousand
 MAX_ITEMS = 1 << 15  # of one kind in a message

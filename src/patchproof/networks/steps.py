@@ -1,4 +1,4 @@
-"""A program as numbered steps: what description.py and onnx_file.py make of a file, and graph.py computes."""
+"""A program as numbered steps: what onnx_file.py makes of a file, or traced.py of a module, and graph.py computes."""
 
 from __future__ import annotations
 

@@ -1,30 +1,10 @@
-"""Exported programs for tests: small networks, honest archives of them, and archives with something else in them."""
-
-import io
-import json
-import os
-import pickle
-import shutil
-import zipfile
-from pathlib import Path
+"""Small networks of the usual kinds for N×3×16×16, in torch."""
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 LABELS = ["red", "green", "blue", "none"]
-
-
-class Small(nn.Module):
-    """A normalization, a convolution, a mean."""
-
-    def __init__(self):
-        super().__init__()
-        self.conv = nn.Conv2d(3, 4, 3, padding=1)
-        self.register_buffer("mean", torch.full((1, 3, 1, 1), 0.5), persistent=False)  # a constant of the program
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.relu(self.conv(x - self.mean)).flatten(2).mean(2)
 
 
 class ResNet(nn.Module):
@@ -116,75 +96,3 @@ def seeded(network: nn.Module) -> nn.Module:
         noise = torch.randn(tensor.shape, generator=generator)
         tensor.data = 1 + 0.1 * noise if tensor.dim() < 2 else noise / tensor[0].numel() ** 0.5
     return network.eval()
-
-
-def exported(network: nn.Module, batch: int | None = None) -> torch.export.ExportedProgram:
-    """A program for N×3×16×16, of any N up to 64 or of one."""
-    sizes = None if batch else ({0: torch.export.Dim("n", min=1, max=64)},)
-    return torch.export.export(seeded(network), (torch.rand(batch or 2, 3, 16, 16),), dynamic_shapes=sizes)
-
-
-def save(folder: Path, program: torch.export.ExportedProgram) -> Path:
-    """The archive and its card."""
-    path = folder / "small.pt2"
-    torch.export.save(program, str(path))
-    path.with_suffix(".json").write_text(json.dumps({"input_px": 16, "labels": LABELS}))
-    return path
-
-
-class Hostile:
-    """One archive that wants to make a folder, the proof that something of it was executed."""
-
-    def __init__(self, folder: Path, honest: Path):
-        folder.mkdir(exist_ok=True)
-        self.path, self.mark = folder / "hostile.pt2", folder / "executed"
-        shutil.copy(honest.with_suffix(".json"), self.path.with_suffix(".json"))
-        with zipfile.ZipFile(honest) as archive:
-            self.members = {info.filename: archive.read(info) for info in archive.infolist()}
-        self.root = next(iter(self.members)).partition("/")[0]
-
-    def pickle(self) -> bytes:
-        mark = str(self.mark)
-
-        class MakesAFolder:
-            def __reduce__(self):
-                return os.mkdir, (mark,)
-
-        return pickle.dumps(MakesAFolder())
-
-    def torch_pickle(self) -> bytes:
-        """The same in the zip that torch.save makes."""
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w") as archive:
-            archive.writestr("archive/data.pkl", self.pickle())
-            archive.writestr("archive/version", "3\n")
-            archive.writestr("archive/byteorder", "little")
-        return buffer.getvalue()
-
-    def python(self) -> str:
-        return f"__import__('os').mkdir({str(self.mark)!r})"
-
-    def edit(self, name: str, change) -> "Hostile":
-        """Change a JSON member by a function of its parsed content."""
-        content = json.loads(self.members[f"{self.root}/{name}"])
-        change(content)
-        return self.set(name, content)
-
-    def set(self, name: str, content) -> "Hostile":
-        """A JSON member with that content."""
-        return self.add(name, json.dumps(content).encode())
-
-    def add(self, name: str, content: bytes) -> "Hostile":
-        self.members[f"{self.root}/{name}"] = content
-        return self
-
-    def write(self) -> Path:
-        with zipfile.ZipFile(self.path, "w") as archive:
-            for name, content in self.members.items():
-                archive.writestr(name, content)
-        return self.path
-
-    def executed(self) -> bool:
-        was = self.mark.exists()
-        shutil.rmtree(self.mark, ignore_errors=True)
-        return was

@@ -1,16 +1,13 @@
-"""`file:NAME.pt2`, `file:NAME.onnx`: a network as a `torch.export` program or in ONNX, with NAME.json beside it.
+"""`file:NAME.onnx`: a network as an ONNX file, with NAME.json beside it.
 
-The JSON says `input_px`, the side of the square that the program takes, and `labels`: a list, or the name of a JSON
-file beside it that holds one. The program takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits;
+The JSON says `input_px`, the side of the square that the network takes, and `labels`: a list, or the name of a JSON
+file beside it that holds one. The network takes N×3×S×S sRGB in [0, 1], its normalization inside, and gives N×K logits;
 where the JSON says `"kind": "detector"`, candidates N×A×(4+K), boxes in pixels before the logits (detector.py).
-A program exported for one batch size, or for a range of them, is called in such batches.
-Nothing of the file is executed: archive.py reads tensors and JSON, description.py the graph from it, and graph.py
-computes its operators, which are on the list in operators.py; for ONNX these are protobuf.py, onnx_file.py and
-onnx_operators.py. torch's own loader, which writes names of the file into Python, is not called, nor is onnx.
+One that was exported for one number of pictures is called with as many.
+Nothing of the file is executed: protobuf.py reads its fields, onnx_file.py the graph from them, and graph.py computes
+its operators, which are on the list in onnx_operators.py. The library onnx is not called.
 
-To make one: `torch.export.save(torch.export.export(network.eval(), (torch.rand(2, 3, S, S),),
-dynamic_shapes=({0: torch.export.Dim("n", min=1, max=4096)},)), "NAME.pt2")`, or `torch.onnx.export` with the same
-`dynamic_shapes`; what it writes into NAME.onnx.data belongs to NAME.onnx.
+`EXPORT` is how to make one. What an exporter writes into NAME.onnx.data belongs to NAME.onnx.
 """
 
 from __future__ import annotations
@@ -25,19 +22,21 @@ from patchproof.base.input import is_file, read_json
 from patchproof.base.strict import Refused
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
-from patchproof.networks.archive import Unwanted, read_archive
 from patchproof.networks.batches import InBatches
-from patchproof.networks.description import read_program
+from patchproof.networks.bounds import Unwanted
 from patchproof.networks.onnx_file import read_onnx
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
+EXPORT = (
+    'export it with torch.onnx.export(network.eval(), (torch.rand(2, 3, S, S),), "NAME.onnx", '
+    'dynamic_shapes=({0: torch.export.Dim("n")},), dynamo=True), S pixels a side, and lay NAME.json beside it'
+)
 
 
-def load_program(path: Path, device: torch.device | str = "cpu") -> Classifier:
-    """The program and its card as a Classifier."""
-    if path.suffix not in _WORDS:
-        do = "save it with torch.export.save as NAME.pt2, or with torch.onnx.export, with NAME.json beside it"
-        raise Refused("a torch.export program, file:NAME.pt2, or file:NAME.onnx", f"{path}", do)
+def load_network(path: Path, device: torch.device | str = "cpu") -> Classifier:
+    """The ONNX file and its card as a Classifier; files of other kinds are refused by their name."""
+    if path.suffix != ".onnx":
+        raise Refused("a network as an ONNX file, file:NAME.onnx", f"{path}", EXPORT)
     stored = network_bytes(path)  # once, so that what is hashed is what is loaded
     card = read_card(path.with_suffix(".json"))
     digest = hashlib.sha256(stored)
@@ -84,28 +83,20 @@ def read_card(path: Path) -> Card:
 
 
 def _network(stored: bytes, path: Path, digest: Any) -> InBatches:
-    """The program as a function of any number of photographs."""
+    """The network as a function of any number of photographs."""
 
     def beside() -> bytes:
         data = network_bytes(path.with_name(f"{path.name}.data"))
         digest.update(data)
         return data
 
-    expected, plain, again = _WORDS[path.suffix]
     try:
-        if path.suffix == ".onnx":
-            return InBatches(*read_onnx(stored, beside))
-        return InBatches(*read_program(*read_archive(stored, path)))
+        return InBatches(*read_onnx(stored, beside))
     except Unwanted as error:
-        raise Refused(f"{expected} of plain tensors and operators", f"{path} with {error}", plain) from error
+        do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
+        raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
     except Refused:
         raise
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise Refused(expected, f"{path}, whose description cannot be read ({type(error).__name__})", again) from error
-
-
-_EVAL = "export it in evaluation mode, without custom operators, control flow or tensor subclasses"
-_WORDS = {  # what it should be, and what to do where it holds something else, or cannot be read
-    ".pt2": ("a torch.export program", _EVAL, "export it again with torch.export.save, torch 2.9 or later"),
-    ".onnx": ("an ONNX file", f"{_EVAL}, opset 13 or later", "export it again with torch.onnx.export"),
-}
+        got = f"{path}, whose description cannot be read ({type(error).__name__})"
+        raise Refused("an ONNX file", got, "export it again with torch.onnx.export") from error
