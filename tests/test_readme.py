@@ -669,3 +669,16 @@ def test_the_table_of_rooms_has_the_order_of_imports():
 def test_the_two_commands_are_there():
     text = README.read_text(encoding="utf-8")
     assert "pip install . && patchproof demo" in text and 'pip install -e ".[test]" && pytest' in text
+
+
+def test_figures_of_a_gpu_are_the_stored_ones():
+    page = words(NOTEBOOK)
+    for scene, name in (("suv", "SUV, MobileNetV2 1.0"), ("truck", "truck, builtin")):
+        row = {line["quantity"]: line for line in rows_of("cuda/cuda.csv") if line["scene"] == scene}
+        gpu = {quantity: float(line["gpu"]) for quantity, line in row.items()}
+        step = f"{float(row['median step, ms']['cpu']):.0f}, {gpu['median step, ms']:.0f}"
+        views = ", ".join(f"{gpu[f'new views a second, {count} together']:.0f}" for count in (4, 256))
+        off = f"{100 * gpu['relative difference of the gradient']:.2g} %"
+        pixel, confidence = gpu["largest difference of a pixel"], gpu["largest difference of a confidence"]
+        alike = f"{gpu['answers alike of 96']:.0f} of 96"
+        assert f"| {name} | {pixel:.2g} | {off} | {alike} | {confidence:.2g} | {step} | {views} |" in page

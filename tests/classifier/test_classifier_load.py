@@ -12,6 +12,7 @@ from patchproof.base.strict import Refused
 from patchproof.classifier import Classifier, load_classifier, zoo
 from patchproof.classifier.builtin import SmallNetwork, folded
 from patchproof.classifier.check import check_network
+from patchproof.classifier.load import use_full_precision
 from patchproof.classifier.network import weights_sha256
 
 LABELS = ("a", "b", "c", "d")
@@ -262,3 +263,11 @@ def test_folding_the_batch_norms_changes_nothing_but_the_speed():
     with torch.no_grad():
         torch.testing.assert_close(plain(photos), trained(photos), rtol=1e-4, atol=1e-4)
     assert sum(parameter.numel() for parameter in plain.parameters()) <= 700_000
+
+
+def test_a_gpu_convolves_in_full_precision(monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    use_full_precision("cpu")
+    assert torch.backends.cudnn.allow_tf32
+    use_full_precision("cuda:1")
+    assert not torch.backends.cudnn.allow_tf32

@@ -71,8 +71,17 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
 
 def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
     """The classifier on the device, frozen, doubted, and as fast as it can be called."""
+    use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
         classifier.network.requires_grad_(False).to(device)
     check_network(classifier, device)
     pictures = smooth_pictures(classifier.input_px).to(device)
     return replace(classifier, network=fastest(classifier.network, pictures))
+
+
+def use_full_precision(device: torch.device | str) -> None:
+    """Have cuDNN convolve in float32 on a GPU, so that networks answer there as on a CPU: its own default, TF32, keeps
+    10 bits of 23, with which a MobileNetV2's gradient at a design was off by 9 %.
+    """
+    if torch.device(device).type == "cuda":
+        torch.backends.cudnn.allow_tf32 = False
