@@ -3,7 +3,7 @@ others.
 
 In: a finished run. Out: SHEET.pdf and SHEET.json. The piece is the same on every template that has room for it, but for
 the ids of its markers. The last page of a template with `plan_page` says where the piece goes and how to photograph it.
-Before there is a run, `blank_page` writes the pages of blanks, charts and boards.
+Pages that need no run: see `sheets.blank`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from patchproof.base.strict import Refused
 from patchproof.optimizer.run import Run
 from patchproof.reprints.hung import hang
 from patchproof.reprints.shots import shot_sections
@@ -20,8 +19,6 @@ from patchproof.reprints.tape import tapes
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import patch_frame
 from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
-from patchproof.sheets.blank import blank_sheet, chart_sheet
-from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
@@ -120,15 +117,3 @@ def _wrapped(scene: PatchScene) -> str:
         return text
     lengths = ", ".join(f"{tape.edge} {tape.length_mm:.0f} mm {tape.end}" for tape in laid_out)
     return f"{text} Lay a tape on the surface, straight on from the middle of each of the piece's edges: {lengths}."
-
-
-def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:
-    """Write a page that needs no run: of a template with a [blank] or a [board] table, or of a chart alone."""
-    if control is not None:
-        raise Refused(f"the run whose {control} control belongs on the page", "none", "name the run")
-    if template is None:
-        raise Refused("a run, or the template of a blank page", "neither", "name a run, or --template blank_a4")
-    if is_board(template):
-        return board_sheet(template, pdf_path)
-    page = load_template(template)
-    return chart_sheet(page, pdf_path) if page.piece is None else blank_sheet(template, pdf_path)
