@@ -6,6 +6,9 @@ license beside it: a page that is opened as a file may not load modules or model
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.base.claims import Estimate
@@ -37,3 +40,12 @@ def _percent(share: float | None) -> str:
 
 def _figure(value: float | None, digits: int = 2) -> str:
     return "not measured" if value is None else f"{value:.{digits}f}"
+
+
+def versions_of(libraries: Iterable[str]) -> dict[str, str]:
+    """The versions of those that are installed."""
+    versions = {}
+    for name in libraries:
+        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
+            versions[name] = version(name)
+    return versions
