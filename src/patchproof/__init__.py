@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from patchproof.reprints.reprint import reprint as reprint
     from patchproof.reprints.run_sheet import sheet_of as sheet
     from patchproof.scene.conditions import Conditions as Conditions
-    from patchproof.scene.scene import Scene as Scene
+    from patchproof.scene.interface import Scene as Scene
     from patchproof.scene.scene import load_scene as load_scene
     from patchproof.scene.scene import make_scene as make_scene
     from patchproof.sheets.manifest import Manifest as Manifest
@@ -58,7 +58,7 @@ _HOME = {
     "Refused": "base.strict:Refused",
     "Report": "evidence.results:Report",
     "Run": "optimizer.run:Run",
-    "Scene": "scene.scene:Scene",
+    "Scene": "scene.interface:Scene",
     "SceneSettings": "base.settings:SceneSettings",
     "Stage": "render.stage:Stage",
     "choose_place": "optimizer.places:choose_place",

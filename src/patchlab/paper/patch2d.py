@@ -46,7 +46,7 @@ from patchproof.render.photograph import Shown
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
-from patchproof.scene.scene import Scene
+from patchproof.scene.interface import Scene
 
 KINDS = ("bare", "gray", "noise", "patch")
 OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target

@@ -36,8 +36,8 @@ from patchproof.render.stage import set_stage
 from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import HungSheet, hang_piece, jpeg_of
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import load_scene, needs_patch
+from patchproof.scene.patch_scene import PatchScene, needs_patch
+from patchproof.scene.scene import load_scene
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import control_design
 

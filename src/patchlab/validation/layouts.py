@@ -47,8 +47,8 @@ from patchproof.optimizer.responses import responses
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
 from patchproof.reprints.hung_sheet import hang_piece
-from patchproof.scene.patch_scene import OpenScene
-from patchproof.scene.scene import PatchScene, needs_patch
+from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.patch_scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
 from patchproof.sheets.rects import RectMm, grown

@@ -26,15 +26,14 @@ from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import InBatches
 from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.subject import Subject
-from patchproof.optimizer.texture import Texture
+from patchproof.optimizer.subject import Subject, subject_of
 from patchproof.render.pixels import PHOTOGRAPHED, Look, Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import Scene, needs_piece, needs_texture
 
 # Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
 # no less than so many pixels, since each of them takes one sample. Averaging textures over eight tenths of a pixel
@@ -145,11 +144,7 @@ def set_problem(
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
     stage = set_stage(scene, device)
-    if scene.HAS_PIECE:
-        hung, network_px = needs_piece(scene), max(classifier.input_px for classifier in classifiers)
-        subject = Patch(hung, printer, hung.design_px(network_px), stage.device)
-    else:
-        subject = Texture(needs_texture(scene), stage.device)
+    subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1:
         with threads(1):  # here, for all processes to be forked, and as one of them would: two threads round otherwise

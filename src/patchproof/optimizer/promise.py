@@ -28,8 +28,8 @@ from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, asking, joined
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import PieceScene, needs_piece
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import PieceScene, needs_piece
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 # Many short sessions: how much they differ is known from their number, not from their length.

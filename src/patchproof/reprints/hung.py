@@ -27,9 +27,9 @@ from patchproof.render.views import relit, see
 from patchproof.reprints.tape import Tape, tapes
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import needs_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Frame, patch_frame
-from patchproof.scene.scene import needs_mesh
 from patchproof.sheets.plan_page import Hung, Span
 from patchproof.sheets.template import Template
 from patchproof.sheets.tiles import plan_tiles

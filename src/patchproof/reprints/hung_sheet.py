@@ -34,8 +34,8 @@ from patchproof.report.coco import PATCH
 from patchproof.reprints.path_traced import photograph_traced
 from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import Conditions, fields_of
+from patchproof.scene.interface import PieceScene, Scene, needs_piece
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import PieceScene, Scene, needs_piece
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import attached_manifest, piece_pixels

@@ -16,9 +16,9 @@ from patchproof.optimizer.run import Run
 from patchproof.reprints.hung import hang
 from patchproof.reprints.shots import shot_sections
 from patchproof.reprints.tape import tapes
-from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.interface import PieceScene, needs_piece
+from patchproof.scene.patch_scene import PatchScene, needs_patch
 from patchproof.scene.placement import patch_frame
-from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
