@@ -26,12 +26,13 @@ import numpy as np
 import torch
 
 from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, classes_of
+from patchlab.study.claims import clustered
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.claims import difference, rate
 from patchproof.base.strict import Refused, expand, nearest
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels

@@ -26,12 +26,13 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.paper.image_classes import write_labels, write_renders
+from patchlab.study.claims import clustered
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import Record, hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.claims import difference, rate
 from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
 from patchproof.base.strict import Range, Refused, Share
 from patchproof.optimizer.loop import best_design, views_seen

@@ -21,8 +21,9 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from patchlab.study.claims import clustered_median
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import Estimate, clustered_median, rate
+from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
 from patchproof.base.strict import Refused, Share, Strict

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from patchlab.study.claims import clustered_median, mean
 from patchlab.study.grid import (
     Count,
     GridSettings,
@@ -31,7 +32,7 @@ from patchlab.study.grid import (
 )
 from patchlab.study.record import Record, gain_of, hardest, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import Estimate, clustered_median, mean, rate
+from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.output import image_pixels
 from patchproof.base.strict import Positive, Strict

@@ -12,7 +12,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.base.claims import Estimate
-from patchproof.report.tables import shown
 
 
 def page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
@@ -23,7 +22,7 @@ def page(template: str, folder: Path = Path(__file__).parent, **values: object) 
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=strict
     )
-    environment.filters |= {"percent": _percent, "figure": _figure, "shown": shown}
+    environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
 

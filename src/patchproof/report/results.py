@@ -15,7 +15,7 @@ from typing import Any
 from patchproof.base.output import write_whole
 from patchproof.report.images import data_uri
 from patchproof.report.page import page, versions_of
-from patchproof.report.tables import Drawing, Table, csv_text, png
+from patchproof.report.tables import Drawing, Table, csv_text, png, shown
 
 _LIBRARIES = ("patchproof", "torch", "numpy")
 
@@ -52,6 +52,7 @@ def write_results(folder: Path, results: Results) -> None:
         pictures=[(drawing, data_uri(content)) for drawing, content in pictures],
         settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
         versions=versions,
+        shown=shown,
     )
     write_whole(folder / f"{results.name}.html", text)
     data = {

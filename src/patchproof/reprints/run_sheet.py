@@ -8,23 +8,19 @@ Pages that need no run: see `sheets.blank`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from patchproof.optimizer.run import Run
 from patchproof.reprints.hung import hang
 from patchproof.reprints.shots import shot_sections
-from patchproof.reprints.tape import tapes
 from patchproof.scene.interface import PieceScene, needs_piece
 from patchproof.scene.patch_scene import PatchScene, needs_patch
-from patchproof.scene.placement import patch_frame
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.several import write_several
 from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet
 
@@ -35,27 +31,15 @@ def sheet_of(
     """Write the run's sheet; `control` is mean, gray, noise, shuffled or blank, `template` a name or file in place of
     the scene's.
     """
-    content, scene = _content(run, template, control)
+    content, scene = content_of(run, template, control)
     page = load_template(scene.settings.sheet.template)
-    plan = _plan(scene, page, content) if page.plan_page else None
+    plan = plan_of(scene, page, content) if page.plan_page else None
     if control == "blank":
         content = replace(content, design_srgb8=None)
     return write_sheet(pdf_path, page, content, plan, copies)
 
 
-def sheet_of_several(
-    runs: Sequence[Run], pdf_path: str | Path, *, template: str | None = None, control: str | None = None
-) -> list[Manifest]:
-    """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
-    another is named.
-    """
-    name = template or runs[0].scene.settings.sheet.template
-    page, made = load_template(name), [_content(run, name, control) for run in runs]
-    plans = [_plan(scene, page, content) for content, scene in made] if page.plan_page else []
-    return write_several(pdf_path, page, [content for content, _ in made], plans)
-
-
-def _content(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
+def content_of(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
     """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
     own = needs_piece(run.scene)
     scene = own if template is None else own.with_template(template)
@@ -70,7 +54,7 @@ def _content(run: Run, template: str | None, control: str | None) -> tuple[Print
     return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings, bent), scene
 
 
-def _plan(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
+def plan_of(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
     """Where the piece goes, whose design it is if not ours and, for a promise, how to photograph it; None where none of
     it can be said.
     """
@@ -111,7 +95,7 @@ def _edges(hung: Hung) -> str:
 
 def _wrapped(scene: PatchScene) -> str:
     """How bent paper goes on the object, and what a tape measure says beside it."""
-    laid_out = tapes(scene.mesh, scene.placement, patch_frame(scene.mesh, scene.settings.patch).normal)
+    laid_out = scene.tapes()
     text = "Wrap the piece round the object from its middle outwards, its top edge up, without folds or air under it."
     if not laid_out:
         return text

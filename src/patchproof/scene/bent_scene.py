@@ -11,6 +11,7 @@ from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import load_bare
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
+from patchproof.scene.tape import Tape, tapes
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,11 @@ class BentScene(PatchScene):
     """An object with a piece that bends with it; where the surface is flat, that is a card, too."""
 
     LAY: ClassVar[Lay] = staticmethod(place_bent)
+
+    def tapes(self) -> tuple[Tape, ...]:
+        """As in `PatchScene.tapes`."""
+        facing = patch_frame(self.mesh, self.settings.patch).normal
+        return () if self.placement.is_flat else tapes(self.mesh, self.placement, facing)
 
 
 def build(source: SceneSource) -> BentScene:

@@ -7,7 +7,7 @@ layout of the printed piece (the design and its markers, whose size follows from
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -20,9 +20,12 @@ from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSour
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import load_template
-from patchproof.sheets.tiles import refuse_larger_than_page
+
+if TYPE_CHECKING:
+    from patchproof.scene.tape import Tape
 
 At = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
@@ -102,6 +105,10 @@ class PatchScene(PieceScene, MeshScene):
         middle = np.array(self.placement.size_mm) / 2
         poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
         return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
+
+    def tapes(self) -> tuple[Tape, ...]:
+        """What a tape measure says beside the piece, as one faces its side; of a card, whose edges do, nothing."""
+        return ()
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
         """N: the light on white paper at the piece's middle, without lamps."""

@@ -136,9 +136,9 @@ def sheet(
     from patchproof.base.output import check_file
     from patchproof.base.settings import behind
     from patchproof.sheets.blank import blank_page
-    from patchproof.sheets.shop import shop_lines
+    from patchproof.sheets.shop import check_sheet, shop_lines
     from patchproof.sheets.template import template_lines
-    from patchproof.sheets.write import check_sheet, manifest_paths
+    from patchproof.sheets.write import manifest_paths
 
     if templates:
         return say(*template_lines())
@@ -173,7 +173,8 @@ def _write_sheets(
 ) -> list[Manifest]:
     """Write the page of finished runs; a manifest for each."""
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.run_sheet import sheet_of, sheet_of_several
+    from patchproof.reprints.run_sheet import sheet_of
+    from patchproof.reprints.several_runs import sheet_of_several
 
     runs = [load_run(folder) for folder in folders]
     if len(runs) == 1:
@@ -209,7 +210,7 @@ def reprint(
     from patchproof.reprints.hung_sheet import Hanging
     from patchproof.reprints.page_photos import reprint_pages
     from patchproof.reprints.reprint import reprint as reprint_sheet
-    from patchproof.reprints.reprint import scan
+    from patchproof.reprints.scan import scan
 
     scale = pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:
