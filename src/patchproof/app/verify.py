@@ -22,7 +22,6 @@ from patchproof.base.output import check_folder, write_whole
 from patchproof.base.strict import Refused
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer
-from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
@@ -128,7 +127,7 @@ def forecaster(run: str | Path | Run, manifest: Manifest) -> Callable[[Shot], fl
 
 def _drawn(boxes: str | Path, manifest: Manifest, options: Options) -> dict[str, Box]:
     """The boxes of a file, refused before networks that do not look at them."""
-    if manifest.promise is None or not any(isinstance(model, Detector) for model in options.models):
+    if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
         raise Refused("a detector, which alone looks at boxes", "none that judges these photographs", "leave boxes out")
     return given_boxes(boxes, manifest.promise.target.label)
 
@@ -159,7 +158,7 @@ def options_of(
     base, promise = Path(sheet).resolve().parent, manifest.promise
     least_score = None if promise is None else promise.models[0].least_score
     return Options(
-        models=[at_score(load_classifier(network, base), least_score) for network in _networks(manifest, models)],
+        models=[load_classifier(network, base).at_score(least_score) for network in _networks(manifest, models)],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=None if camera is None else load_camera(camera),
     )

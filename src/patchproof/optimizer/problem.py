@@ -19,7 +19,6 @@ from patchproof.base.settings import OptimizeSettings
 from patchproof.base.strict import Refused
 from patchproof.base.workers import threads
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -78,7 +77,7 @@ class Problem:
 
     def boxes(self, conditions: Conditions) -> np.ndarray | None:
         """Where the object lies in these views (`Scene.boxes`), if one of the networks asks for it."""
-        return self.scene.boxes(conditions) if any(isinstance(c, Detector) for c in self.classifiers) else None
+        return self.scene.boxes(conditions) if any(c.LOOKS_AT_BOXES for c in self.classifiers) else None
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
@@ -139,7 +138,7 @@ def set_problem(
     _check_device(device)
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
-    classifiers = tuple(at_score(load_classifier(name, scene.base, device), least_score) for name in names)
+    classifiers = tuple(load_classifier(name, scene.base, device).at_score(least_score) for name in names)
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
