@@ -22,7 +22,7 @@ _HOME = {
     if isinstance(node, ast.ImportFrom)
     for alias in node.names
 }
-__all__ = sorted(_HOME.keys() - {"__version__"})
+__all__ = sorted(_HOME.keys() - {"__version__"})  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
