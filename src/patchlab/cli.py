@@ -94,7 +94,7 @@ def study(
     """An experiment of the paper or a test of the tool: many cells, tables with intervals, figures and one page."""
     from patchlab.keys import documents, example_config
     from patchlab.study.study import Work, run_study
-    from patchproof.app.cli.keys import keys_page
+    from patchproof.app.keys import keys_page
 
     if keys or example:
         print(keys_page(documents(), name) if keys else example_config(name), end="")
@@ -113,7 +113,7 @@ def study(
 def keys(name: Annotated[str | None, typer.Argument(help="A study; without one, all.")] = None) -> None:
     """All keys of studies' configs: range, unit, default and meaning, as Markdown."""
     from patchlab.keys import HEAD, documents
-    from patchproof.app.cli.keys import keys_page
+    from patchproof.app.keys import keys_page
 
     print(keys_page(documents(), name, HEAD), end="")
 

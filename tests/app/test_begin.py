@@ -29,9 +29,9 @@ from patchproof.app.begin.sides import (
 from patchproof.base.settings import load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.render.stage import set_stage
-from patchproof.reprints.run_sheet import blank_page
 from patchproof.scene.fitting import largest
 from patchproof.scene.scene import load_scene, make_scene
+from patchproof.sheets.blank import blank_page
 from test_report import seen_in_browser
 
 LABELS = ["coffee mug", "cup", "garbage truck, dustcart", "tow truck, tow car, wrecker", "mailbox, letter box"]

@@ -12,7 +12,7 @@ from console import lab_command
 import patchlab
 import patchproof
 from patchlab.keys import HEAD, documents
-from patchproof.app.cli.keys import DOCUMENTS, keys_page, meanings, tables
+from patchproof.app.keys import DOCUMENTS, keys_page, meanings, tables
 from patchproof.base.strict import Refused, Strict
 from patchproof.sheets.template import QrCode
 

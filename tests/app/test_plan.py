@@ -26,6 +26,7 @@ from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.scene.bent_scene import other_surface
 from patchproof.scene.conditions import draw
 from patchproof.scene.flat import Picture
 from patchproof.scene.paper_light import PaperLight
@@ -197,13 +198,13 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
     settings = {"object__mesh": "primitive:mug", "patch__side": "-x", "patch__width_mm": 50, "patch__height_mm": 40}
     settings |= {"camera__photo_px": [800, 600], "view__distance_mm": [350, 400]}
     bent = scene_with(tmp_path, **settings, patch__bend=True)
-    card, sentence = bent.other_surface()
+    card, sentence = other_surface(bent)
     assert card.is_flat and not bent.placement.is_flat and sentence.startswith("bend = false would be a card")
     errors, _ = errors_of(bent, card)
     (name,) = (name for name in errors if name.endswith("not a card"))
     assert errors[name].codes_mean > 0.1 and errors[name].verdict in {"keep", "can go"}
     flat = scene_with(tmp_path, **settings)
-    other, sentence = flat.other_surface()
+    other, sentence = other_surface(flat)
     assert not other.is_flat and f"bend = true would be a {other.family}" in sentence
     problem = set_problem(flat)
     assert not scene_terms(problem, problem.subject.start(), other)[-1].modeled
@@ -211,7 +212,7 @@ def test_bent_pieces_are_weighed_against_cards(tmp_path):
 
 def test_a_refused_bend_is_said_in_its_own_sentence(tmp_path):
     wide = {"patch__width_mm": 150, "patch__height_mm": 150}  # beyond the carton's rounded edges
-    other, sentence = scene_with(tmp_path, **wide).other_surface()
+    other, sentence = other_surface(scene_with(tmp_path, **wide))
     assert other is None and sentence.startswith("bend = true is refused. Expected ")
 
 

@@ -21,7 +21,7 @@ from patchproof.base.goal import Goal
 from patchproof.base.strict import Refused
 from patchproof.channel.boxes import MOST_POINTS, box_of, outermost
 from patchproof.classifier.builtin_detector import HERE, INPUT_PX
-from patchproof.classifier.detector import NOTHING, Detector, at_score, iou
+from patchproof.classifier.detector import NOTHING, Detector, iou
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.precision import average_precision, findings, unsuppressed
 from patchproof.optimizer.goals import target_loss
@@ -62,10 +62,10 @@ def test_half_an_overlap_is_the_last_that_counts(share, counts):
 
 @pytest.mark.parametrize(("score", "counts"), [(0.7, True), (0.75, False)])
 def test_the_score_from_which_on_boxes_count_is_the_scene_s(score, counts):
-    made = at_score(detector(([2, 2, 6, 6], [1.0, 0.0])), score)  # a score of 0.731
+    made = detector(([2, 2, 6, 6], [1.0, 0.0])).at_score(score)  # a score of 0.731
     assert made.recognized(made.logits(torch.rand(1, 3, 8, 8), np.array([FOUR])), (0,)).item() is counts
     plain = pp.Classifier("plain", None, 8, ("a",), lambda x: x)
-    assert at_score(plain, score) is plain
+    assert plain.at_score(score) is plain
 
 
 def test_losses_fall_where_the_goal_is_reached_and_keep_their_gradient():
@@ -279,7 +279,7 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stag
     said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
     assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
     truth = scene.boxes(scene.draw("reprint", 3))
-    network = at_score(load_classifier(name, HERE), 0.4)
+    network = load_classifier(name, HERE).at_score(0.4)
     for photo, box in zip(report.photos, truth, strict=True):
         answer = photo.predictions[name]
         pixels = torch.tensor(np.asarray(Image.open(tmp_path / "photos" / photo.file).convert("RGB")))

@@ -8,7 +8,8 @@ import pytest
 from patchlab.study.study import run_study
 from patchlab.validation.layouts import Layout, laid_out
 from patchproof.optimizer import loop
-from patchproof.scene.scene import make_scene, needs_patch
+from patchproof.scene.patch_scene import needs_patch
+from patchproof.scene.scene import make_scene
 from patchproof.sheets.piece import marker_image
 
 SCENE = {

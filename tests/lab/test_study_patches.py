@@ -13,10 +13,11 @@ from PIL import Image
 
 from patchlab.paper import patch2d, patch3d
 from patchlab.paper.image_classes import ImageClass, class_scene, classes_of, scene_settings, write_renders
+from patchlab.study.claims import clustered, clustered_mean
 from patchlab.study.grid import scene_values
 from patchlab.study.record import bits
 from patchlab.study.study import Cell, Result, run_study
-from patchproof.base.claims import LEAST_CLUSTERS, clustered, clustered_mean
+from patchproof.base.claims import LEAST_CLUSTERS
 from patchproof.base.geometry import local_scale
 from patchproof.base.strict import Refused, read_toml, validated
 from patchproof.optimizer import loop

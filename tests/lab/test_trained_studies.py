@@ -11,11 +11,12 @@ import torch
 
 from patchlab.paper import deceive, transfer
 from patchlab.paper.sides import from_sides, mean_color, three_views
+from patchlab.study.claims import mean
 from patchlab.study.grid import short_name
 from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, run_study
 from patchlab.study.trained import TrainedSettings, trained_cells, verdict
-from patchproof.base.claims import Estimate, mean
+from patchproof.base.claims import Estimate
 from patchproof.base.strict import Refused, validated
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate_run

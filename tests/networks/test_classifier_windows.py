@@ -12,7 +12,7 @@ from small_networks import ConvNeXt, ResNet, ViT, seeded
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network import Classifier, _in_square, center_square
-from patchproof.networks import batches, windows
+from patchproof.networks import cuts, windows
 from patchproof.networks.batches import fastest
 from patchproof.networks.graph import Program
 from patchproof.networks.steps import Step, Value, mark_spent
@@ -136,11 +136,11 @@ def test_the_gradient_in_windows_is_the_whole_programs(made, seed):
     starts[0] = [(0, 0), (SIZE - 40, 0), (0, SIZE - 40), (SIZE - 40, SIZE - 40)][seed]
     sides[0] = 40  # up to the rim
     asked = np.hstack([starts, starts + sides])
-    cuts = windows._cuts(network, photos)
-    assert len(cuts) >= 2
+    found = cuts._cuts(network, photos)
+    assert len(found) >= 2
     whole = gradient(network, photos)
-    for cut in cuts:
-        parts = gradient(lambda x, cut=cut: windows.answers(cut, x, Windows(asked)), photos)
+    for cut in found:
+        parts = gradient(lambda x, cut=cut: cut.answers(x, Windows(asked)), photos)
         for one, same, (left, top, right, bottom) in zip(parts, whole, asked.tolist(), strict=True):
             here = slice(None), slice(top, bottom), slice(left, right)
             torch.testing.assert_close(one[here], same[here], rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
@@ -151,9 +151,9 @@ def test_the_gradient_in_windows_is_the_whole_programs(made, seed):
 
 
 def test_how_far_a_pixel_reaches_is_what_kernels_and_strides_say():
-    cuts = {cut.steps: cut for cut in windows._cuts(plain(), pictures())}
+    found = {cut.steps: cut for cut in cuts._cuts(plain(), pictures())}
     # by hand: 3 at stride 2; 2 more steps of 2 px; 2 more of 2 px at stride 4
-    assert [(c.steps, c.stride, c.low, c.high) for c in cuts.values()] == [
+    assert [(c.steps, c.stride, c.low, c.high) for c in found.values()] == [
         (1, 2, -1, 1),
         (2, 2, -1, 1),
         (3, 2, -3, 3),
@@ -161,24 +161,24 @@ def test_how_far_a_pixel_reaches_is_what_kernels_and_strides_say():
         (5, 4, -5, 5),
         (6, 4, -5, 5),
     ]
-    assert cuts[4].made == 4 * 16 * (SIZE // 2) ** 2
+    assert found[4].made == 4 * 16 * (SIZE // 2) ** 2
 
 
 def test_cuts_lie_where_one_value_is_left():
-    assert [cut.steps for cut in windows._cuts(residual(), pictures())] == [3, 4, 7, 8, 9]
-    assert [cut.steps for cut in windows._cuts(joined(), pictures())] == [1, 2, 3, 4, 5, 8, 9]
+    assert [cut.steps for cut in cuts._cuts(residual(), pictures())] == [3, 4, 7, 8, 9]
+    assert [cut.steps for cut in cuts._cuts(joined(), pictures())] == [1, 2, 3, 4, 5, 8, 9]
 
 
 @pytest.mark.parametrize("less", [2, 3])
 def test_a_cut_that_reaches_less_far_than_it_should_is_not_taken(monkeypatch, less):
     network, photos = plain(), pictures(2)
-    cut = windows.cut_of(network, photos)
-    assert cut is not None and windows._holds(network, cut, photos)
+    cut = cuts.cut_of(network, photos)
+    assert cut is not None and cuts._holds(network, cut, photos)
     narrow = replace(cut, low=cut.low + 2 * less, high=cut.high - 2 * less)
-    monkeypatch.setattr(windows, "STEP_PX", 4)  # rounding up hides a pixel or two
-    assert windows._holds(network, cut, photos) and not windows._holds(network, narrow, photos)
-    monkeypatch.setattr(windows, "_cuts", lambda *_: [narrow])
-    assert windows.cut_of(network, photos) is None
+    monkeypatch.setattr(cuts, "STEP_PX", 4)  # rounding up hides a pixel or two
+    assert cuts._holds(network, cut, photos) and not cuts._holds(network, narrow, photos)
+    monkeypatch.setattr(cuts, "_cuts", lambda *_: [narrow])
+    assert cuts.cut_of(network, photos) is None
 
 
 def squeezes() -> Program:
@@ -254,8 +254,8 @@ def test_answers_that_depend_on_all_of_a_picture_without_a_gradient_are_not_shar
         for each in (photos, other):
             torch.testing.assert_close(laid(each, Windows(asked, kept)), network(each))
     assert laid.cut is None
-    monkeypatch.setattr(windows, "_alike", lambda *_: True)
-    assert windows.cut_of(network, photos[:2]), "nothing else would have seen it"
+    monkeypatch.setattr(cuts, "_alike", lambda *_: True)
+    assert cuts.cut_of(network, photos[:2]), "nothing else would have seen it"
 
 
 @pytest.mark.parametrize("made", [squeezes, of_one_size, with_places, pictures_again, swallows_nan])
@@ -309,17 +309,24 @@ class Slices(Written):
         return super().forward(photos[:, :, : photos.shape[2] // 2])
 
 
-@pytest.mark.parametrize(("side", "cuts"), [(96, True), (120, False), (100, False)])
-def test_sides_that_strides_do_not_divide_are_left_whole(side, cuts):
+@pytest.mark.parametrize(("side", "is_cut"), [(96, True), (120, False), (100, False)])
+def test_sides_that_strides_do_not_divide_are_left_whole(side, is_cut):
     photos = torch.rand(2, 3, side, side)
-    assert (windows.cut_of(plain(), photos) is not None) == cuts
+    assert (cuts.cut_of(plain(), photos) is not None) == is_cut
+
+
+def asked_of(network, monkeypatch):
+    """What a network will be asked in windows, once its cut is found."""
+    assert network.cut
+    found, calls = cuts.Cut.answers, []
+    monkeypatch.setattr(cuts.Cut, "answers", lambda *given: calls.append(given) or found(*given))
+    return calls
 
 
 @pytest.mark.parametrize(("side", "used"), [(20, True), (56, True), (57, False), (SIZE, False)])
 def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side, used):
     laid, photos, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
-    found, calls = batches.answers, []
-    monkeypatch.setattr(batches, "answers", lambda *given: calls.append(1) or found(*given))
+    calls = asked_of(laid, monkeypatch)
     torch.testing.assert_close(
         gradient(lambda x: laid(x, Windows(asked)), photos)[..., :side, :side],
         gradient(laid, photos)[..., :side, :side],
@@ -330,9 +337,8 @@ def test_windows_that_would_save_nothing_are_computed_as_ever(monkeypatch, side,
 @pytest.mark.parametrize(("side", "used"), [(20, True), (57, True), (88, True), (89, False), (SIZE, False)])
 def test_answers_are_shared_up_to_larger_windows(monkeypatch, side, used):
     laid, first, asked = fastest(plain(), pictures()), pictures(), np.array([[0, 0, side, side]] * 3)
-    other, found, calls = torch.rand_like(first), batches.answers, []
+    other, calls = torch.rand_like(first), asked_of(laid, monkeypatch)
     other[..., side:], other[..., side:, :] = first[..., side:], first[..., side:, :]
-    monkeypatch.setattr(batches, "answers", lambda *given: calls.append(1) or found(*given))
     with torch.no_grad():
         kept = {}
         for photos in (first, other):
@@ -345,16 +351,16 @@ def test_a_gradient_of_zero_proves_nothing():
     layers = convolution("x", 3, 8, 2), convolution((0,), 8, 8, 2)
     for scale in (1, 0):
         network = program(*layers, mean, (linear, [of, scale * weight, bias]))
-        assert (windows.cut_of(network, pictures(2)) is not None) == bool(scale)
+        assert (cuts.cut_of(network, pictures(2)) is not None) == bool(scale)
 
 
 def test_a_network_too_small_to_save_anything_is_not_cut(monkeypatch):
     photos = pictures(2)
-    assert windows.cut_of(plain(), photos)
+    assert cuts.cut_of(plain(), photos)
     monkeypatch.undo()
-    assert windows.cut_of(plain(), photos) is None
+    assert cuts.cut_of(plain(), photos) is None
     larger = torch.rand(2, 3, 4 * SIZE, 4 * SIZE)
-    assert windows.cut_of(plain(), larger)
+    assert cuts.cut_of(plain(), larger)
 
 
 def test_batches_take_their_own_windows(monkeypatch):
@@ -419,10 +425,10 @@ def test_pictures_that_differ_in_windows_share_the_rest(made, seed):
         for picture, (left, top, right, bottom) in zip(other, asked.tolist(), strict=True):
             picture[:, top:bottom, left:right] = torch.rand(3, bottom - top, right - left)
     with torch.no_grad():
-        for cut in windows._cuts(network, first[:2]):
+        for cut in cuts._cuts(network, first[:2]):
             kept = {}
             for photos in (first, *others):
-                told = windows.answers(cut, photos, Windows(asked, kept))
+                told = cut.answers(photos, Windows(asked, kept))
                 torch.testing.assert_close(told, network(photos), rtol=1e-4, atol=1e-5)
             assert torch.equal(kept[cut], network.first(cut.steps, first)[cut.value]), "steps write over their own"
 
@@ -444,7 +450,7 @@ def test_batches_keep_their_own_first_pictures(monkeypatch):
 
 def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
     asked = []
-    monkeypatch.setattr(batches, "cut_of", lambda *_: asked.append(1))
+    monkeypatch.setattr(cuts, "cut_of", lambda *_: asked.append(1))
     laid = fastest(plain(), pictures())
     laid(pictures())
     assert not asked
@@ -460,8 +466,7 @@ def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatc
     camera = {"camera__noise": [0.0, 0.0], "camera__blur_px": [0.0, 2.0], "view__distance_mm": [700, 900]}
     scene = scene_with(tmp_path, optimize__steps=3, target__models=["python:network"], **camera)
     problem = replace(set_problem(scene, models=[network]), jobs=jobs)
-    asked, found = [], batches.answers
-    monkeypatch.setattr(batches, "answers", lambda *given: asked.append(1) or found(*given))
+    asked = asked_of(problem.classifiers[0].network, monkeypatch)
     designs = [best_design(problem)]
     assert asked or jobs > 1  # other processes count for themselves
     monkeypatch.setattr("patchproof.optimizer.expectation.windows_of", lambda views: None)
@@ -478,8 +483,7 @@ def test_a_promise_shares_what_its_views_have_in_common(tmp_path, monkeypatch):
     scene = scene_with(tmp_path, target__models=["python:network"], view__azimuth_deg=[-170, 170])
     problem = set_problem(scene, models=[network])
     shown = shown_with_controls(problem, np.full((*problem.patch.design_px[::-1], 3), 200, np.uint8), CONTROLS)
-    conditions, found, calls = scene.draw("promise", 8), batches.answers, []
-    monkeypatch.setattr(batches, "answers", lambda *given: calls.append(given) or found(*given))
+    conditions, calls = scene.draw("promise", 8), asked_of(problem.classifiers[0].network, monkeypatch)
     shared = responses(problem, shown, conditions)
     assert len(calls) == 2 * len(shown) and all(windows.kept for _, _, windows in calls)
     monkeypatch.setattr("patchproof.optimizer.responses.windows_of", lambda views: None)

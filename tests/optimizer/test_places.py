@@ -21,9 +21,10 @@ from patchproof.classifier.load import load_classifier
 from patchproof.optimizer import place_files, places, run
 from patchproof.optimizer.place_files import read_place, save_place
 from patchproof.optimizer.places import choose_place, default_passes, place_lines
+from patchproof.scene.interface import Scene, needs_piece
+from patchproof.scene.patch_scene import needs_patch
 from patchproof.scene.placement import WARN_OVERHANG_SHARE
 from patchproof.scene.places import APART, Ground
-from patchproof.scene.scene import needs_piece, needs_texture
 
 PLATE = (300, 300, 20)  # mm: its front fills the pictures
 STRAIGHT = {"azimuth_deg": [-5, 5], "elevation_deg": [-5, 5], "distance_mm": [300, 330], "look_at_jitter": 0}
@@ -229,7 +230,7 @@ def test_what_cannot_be_searched_is_refused_in_one_sentence(changes, sentence):
 
 def test_a_scene_without_a_place_says_so_and_one_with_it_needs_no_search():
     scene = open_scene()
-    for needs in (needs_piece, needs_texture):
+    for needs in (needs_piece, needs_patch, Scene.own_texture):
         with pytest.raises(Refused, match=r'Expected a scene whose piece has its place, got patch.place = "auto"'):
             needs(scene)
     with pytest.raises(Refused, match=r'Expected a scene with patch.place = "auto", got a mesh of 12 faces'):
@@ -257,7 +258,7 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
     first = pp.optimize(path, out)
     place = read_place(out)
     assert first.scene.settings.patch.at_mm == place.at and (out / "place.png").stat().st_size > 500
-    monkeypatch.setattr(run, "choose_place", no_search)
+    monkeypatch.setattr(places, "choose_place", no_search)
     loaded = pp.load_run(out)
     np.testing.assert_array_equal(loaded.scene.placement.world_from_piece, first.scene.placement.world_from_piece)
     assert loaded.scene.sheet_id == first.scene.sheet_id

@@ -32,8 +32,9 @@ from patchproof.render.stage import set_stage
 from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
 from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import draw, with_values
-from patchproof.scene.patch_scene import PatchScene, load_mesh_scene
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import place_card
+from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.rects import grown
 
@@ -107,7 +108,7 @@ def photos(tmp_path_factory):
         text = text.replace(old, new)
     (folder / "small_blank.toml").write_text(text, encoding="utf-8")
     assert command("sheet", "--template", folder / "small_blank.toml", "--out", folder / "BLANK.pdf") == 0
-    world = hang(load_mesh_scene(WORLD, folder, 3), load_manifest(folder / "BLANK.json"))
+    world = hang(build_scene(WORLD, folder, 3), load_manifest(folder / "BLANK.json"))
     conditions = draw(WORLD, "promise", PHOTOS, 3)
     shoot(world, folder / "BLANK.pdf", conditions, folder / "photos")
     return optimized(folder, world, conditions, 'photos = "photos"\nsheet = "BLANK.json"', "", "assist")
@@ -116,7 +117,7 @@ def photos(tmp_path_factory):
 @pytest.fixture(scope="module")
 def images(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
-    world = load_mesh_scene(WORLD, folder, 3)
+    world = build_scene(WORLD, folder, 3)
     conditions = world.draw("evaluate", 8)
     shoot(world, None, conditions, folder / "images")
     rows = [f"photo_{i}.jpg,carton" for i in range(8)]

@@ -17,7 +17,8 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.scene import flat
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
-from patchproof.scene.photo_scene import _digest, load_photo_scene, see
+from patchproof.scene.photo_scene import _digest, see
+from patchproof.scene.scene import build_scene
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.manifest import Manifest, dump_manifest
 from patchproof.sheets.piece import lay_out_piece, sheet_id
@@ -106,7 +107,7 @@ def settings_of(world: World, **tables) -> SceneSettings:
 
 @pytest.fixture(scope="module")
 def scene(world):
-    return load_photo_scene(settings_of(world), world.folder, 0)
+    return build_scene(settings_of(world), world.folder, 0)
 
 
 def still(scene, n: int):
@@ -155,7 +156,7 @@ def test_the_piece_is_the_blank_s_with_ids_of_its_own(world, scene):
 
 
 def test_another_template_is_the_scene_made_for_it(world, scene):
-    made = load_photo_scene(settings_of(world, sheet={"template": "letter"}), world.folder, 0)
+    made = build_scene(settings_of(world, sheet={"template": "letter"}), world.folder, 0)
     changed = scene.with_template("letter")
     assert scene.with_template("a4") is scene and changed.photos is scene.photos
     assert (changed.settings, changed.sheet_id, changed.piece) == (made.settings, made.sheet_id, made.piece)
@@ -269,7 +270,7 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
     (tmp_path / "mixed" / "broken.jpg").write_bytes(b"no picture")
     Image.new("RGB", SIZE, "gray").save(tmp_path / "mixed" / "empty.png")
     object_ = {"photos": "mixed", "sheet": "BLANK.json"}
-    scene = load_photo_scene(settings_of(world, object=object_), tmp_path, 0)
+    scene = build_scene(settings_of(world, object=object_), tmp_path, 0)
     assert scene.warnings[:2] == (
         "broken.jpg is left out: unreadable",
         "empty.png is left out: too_few_markers",
@@ -279,13 +280,13 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
         r"at least 6 photographs.*got 5 usable of 7 in .*\(broken.jpg: unreadable; empty.png: too_few_markers\): take"
     )
     with pytest.raises(Refused, match=told):
-        load_photo_scene(settings_of(world, object=object_), tmp_path, 0)
+        build_scene(settings_of(world, object=object_), tmp_path, 0)
     (tmp_path / "sessions").mkdir()
     (tmp_path / "mixed").rename(tmp_path / "sessions" / "first")
     with pytest.raises(
         Refused, match=r"0 usable of 0 in .*; 7 more in folders there, which are not looked into: lay all"
     ):
-        load_photo_scene(settings_of(world, object={"photos": "sessions", "sheet": "BLANK.json"}), tmp_path, 0)
+        build_scene(settings_of(world, object={"photos": "sessions", "sheet": "BLANK.json"}), tmp_path, 0)
 
 
 @pytest.mark.parametrize(
@@ -302,7 +303,7 @@ def test_photographs_that_cannot_be_used_are_named(world, tmp_path):
 )
 def test_what_does_not_fit_is_refused(world, tables, sentence):
     with pytest.raises(Refused, match=sentence):
-        load_photo_scene(settings_of(world, **tables), world.folder, 0)
+        build_scene(settings_of(world, **tables), world.folder, 0)
 
 
 def test_a_page_too_small_for_the_blank_s_piece_is_refused(world, tmp_path):
@@ -310,7 +311,7 @@ def test_a_page_too_small_for_the_blank_s_piece_is_refused(world, tmp_path):
     assert "167.0, 180.0]" in text
     (tmp_path / "small.toml").write_text(text.replace("167.0, 180.0]", "120.0, 120.0]"), encoding="utf-8")
     with pytest.raises(Refused, match=r"at most 119\.6 × 119\.6 mm on this page, got 162 × 162 mm"):
-        load_photo_scene(settings_of(world, sheet={"template": str(tmp_path / "small.toml")}), world.folder, 0)
+        build_scene(settings_of(world, sheet={"template": str(tmp_path / "small.toml")}), world.folder, 0)
 
 
 def test_a_sheet_with_a_design_is_refused(world, tmp_path):
@@ -318,7 +319,7 @@ def test_a_sheet_with_a_design_is_refused(world, tmp_path):
     (tmp_path / "SHEET.json").write_text(dump_manifest(design), encoding="utf-8")
     tables = {"object": {"photos": str(world.folder / "photos"), "sheet": "SHEET.json"}}
     with pytest.raises(Refused, match="manifest of a blank sheet"):
-        load_photo_scene(settings_of(world, **tables), tmp_path, 0)
+        build_scene(settings_of(world, **tables), tmp_path, 0)
 
 
 def test_each_unusable_photograph_has_its_code(world, tmp_path):

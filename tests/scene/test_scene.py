@@ -60,7 +60,7 @@ def test_markers_follow_from_the_views(tmp_path):
 def test_another_template_is_the_scene_made_for_it_and_nothing_is_loaded_again(tmp_path, monkeypatch):
     scene = scene_of(tmp_path, SCENE)
     made = scene_of(tmp_path, SCENE + '\n[sheet]\ntemplate = "letter"\n')
-    monkeypatch.setattr("patchproof.scene.patch_scene.load_mesh", None)
+    monkeypatch.setattr("patchproof.scene.mesh_scene.load_mesh", None)
     changed = scene.with_template("letter")
     assert scene.with_template("a4") is scene and changed.mesh is scene.mesh
     assert changed.settings == made.settings and changed.sheet_id == made.sheet_id != scene.sheet_id

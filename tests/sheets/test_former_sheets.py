@@ -22,7 +22,7 @@ from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo.read import Photo
 from patchproof.scene.paper_light import quadratic_terms
-from patchproof.scene.photo_scene import load_photo_scene
+from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import Manifest, dump_manifest, load_manifest
 from patchproof.sheets.piece import Piece, PieceMarker, marker_image, marker_rect, moved_marker
 from patchproof.sheets.rects import holds
@@ -92,7 +92,7 @@ def test_photographs_of_a_framed_blank_still_make_a_scene(tmp_path):
         where, light = homography(size_mm, *pose), light_of(i, exposure)
         Image.fromarray(photograph(raster, where, size_mm, light, blur, i)).save(tmp_path / "photos" / f"{i}.png")
         truth.append((where, light, blur))
-    scene = load_photo_scene(settings_of(None), tmp_path, 0)
+    scene = build_scene(settings_of(None), tmp_path, 0)
     assert scene.piece.size_mm == pytest.approx(size_mm) and len(scene.piece.markers) == 8
     conditions = still(scene, len(VIEWS))
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)

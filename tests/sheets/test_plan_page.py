@@ -14,8 +14,8 @@ from patchproof.base.strict import Refused
 from patchproof.reprints.hung import hang
 from patchproof.reprints.run_sheet import _wrapped
 from patchproof.reprints.shots import shot_sections
-from patchproof.reprints.tape import tapes
 from patchproof.scene.placement import patch_frame
+from patchproof.scene.tape import tapes
 from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm, lay_out_plan, wrapped
 from patchproof.sheets.template import load_template
 from test_scene import scene_of

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from patchproof.base.strict import Refused, shipped
-from patchproof.reprints.run_sheet import blank_page
-from patchproof.sheets.blank import blank_sheet
+from patchproof.sheets.blank import blank_page, blank_sheet
 from patchproof.sheets.board import board_sheet, is_board, load_board
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.raster import attached_manifest, page_pixels

@@ -25,13 +25,15 @@ from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.page import largest_piece_mm
+from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheets.several import write_several
+from patchproof.sheets.shop import check_sheet
 from patchproof.sheets.template import load_template, template_names
-from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
-from patchproof.sheets.write import check_sheet, write_sheet
+from patchproof.sheets.tiles import plan_tiles
+from patchproof.sheets.write import write_sheet
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
 from test_worth import promise_of
 

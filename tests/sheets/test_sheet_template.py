@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from patchproof.base.strict import Refused, shipped
-from patchproof.sheets.chart import CORNERS, GRAYS, chart_colors, chart_swatches
+from patchproof.sheets.chart import CORNERS, GRAYS, chart_colors, chart_swatches, sobol
 from patchproof.sheets.template import load_template, template_names
 
 A4 = shipped("print_templates", "a4.toml")
@@ -65,6 +65,12 @@ def test_chart_filling_leaves_no_large_hole_in_the_cube():
     everywhere = np.array(list(product(np.linspace(0, 1, 17), repeat=3)))
     nearest = np.linalg.norm(everywhere[:, None] - colors, axis=-1).min(1)
     assert nearest.max() < 0.45 and nearest.mean() < 0.2
+
+
+def test_filling_is_the_sequence_that_others_know():
+    from scipy.stats import qmc
+
+    assert np.array_equal(sobol(1000), qmc.Sobol(3, scramble=False).random_base2(10)[:1000])
 
 
 def test_chart_places_decouple_light_and_color():

@@ -20,9 +20,9 @@ from patchproof.sheets.pdf import srgb_profile
 from patchproof.sheets.piece import control_design, lay_out_piece, marker_image
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
-from patchproof.sheets.shop import shop_lines
+from patchproof.sheets.shop import check_sheet, shop_lines
 from patchproof.sheets.template import load_template
-from patchproof.sheets.write import check_sheet, write_sheet
+from patchproof.sheets.write import write_sheet
 
 ID = "A1B2C3D4E5"
 DPI = 150

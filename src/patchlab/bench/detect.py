@@ -15,7 +15,7 @@ import numpy as np
 from patchlab.bench.chart import Chart, Check, OnStage, Point
 from patchlab.bench.measure import clocked
 from patchlab.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
-from patchproof.base.claims import median
+from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet

@@ -26,7 +26,8 @@ from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.responses import responses
 from patchproof.optimizer.run import DRAFT, THOROUGH, Run, optimize_scene
 from patchproof.report.tables import Table
-from patchproof.scene.scene import Scene, build_scene
+from patchproof.scene.interface import Scene
+from patchproof.scene.scene import build_scene
 
 # By label, all from above: the primitive, its length, how far the piece is off its middle, and its size, in mm.
 OBJECTS = {

@@ -23,7 +23,7 @@ from patchlab.bench.paper import (
     drawn_sheet,
     photographed,
 )
-from patchproof.base.claims import median
+from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, fit_homography
 from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import DICTIONARY

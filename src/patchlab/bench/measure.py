@@ -16,7 +16,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from patchproof.base.claims import Estimate, median
+from patchlab.study.claims import median
+from patchproof.base.claims import Estimate
 
 Name = TypeVar("Name", bound=Hashable)
 Answer = TypeVar("Answer")

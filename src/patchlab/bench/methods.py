@@ -32,7 +32,7 @@ from patchproof.optimizer.loop import best_design, views_seen
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import in_parts
 from patchproof.render.photograph import expose
-from patchproof.scene.scene import needs_patch
+from patchproof.scene.patch_scene import needs_patch
 
 SIGN_STEP = 0.01  # as the paper has it
 # Best of 0.02, 0.05 and 0.1 for `flat` and, of 255 code values, 5 (ART's default), 13 and 25 for `art`: mean rates of

@@ -25,13 +25,13 @@ from patchlab.bench.chart import Chart, OnStage, Point
 from patchlab.bench.measure import clocked
 from patchlab.bench.methods import METHODS, load_art
 from patchlab.paper.patch3d import patch_cells
+from patchlab.study.claims import clustered, median, paired_means
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import Count, GridSettings, Seeds, grouped, of_values, problem_of, who, with_tables
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import gain_of, hardest, rate_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene
-from patchproof.base.claims import clustered, median, paired_means
 from patchproof.base.strict import Refused
 from patchproof.base.workers import threads
 from patchproof.optimizer.pixels import from_pixels

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchlab.bench.chart import Chart, Check, OnStage, Point
-from patchproof.base.claims import mean, median, rate, student_mean
+from patchlab.study.claims import mean, median
+from patchproof.base.claims import rate, student_mean
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart

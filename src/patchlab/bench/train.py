@@ -15,7 +15,7 @@ from torch import Tensor
 
 from patchlab.bench.chart import Chart, OnStage, Point
 from patchlab.bench.world import demo_problem
-from patchproof.base.claims import paired_means
+from patchlab.study.claims import paired_means
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer.loop import SELECT_AFTER, SELECT_VIEWS, State, selects, steps, views_seen
 from patchproof.optimizer.pixels import as_pixels, from_pixels

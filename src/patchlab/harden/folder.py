@@ -24,9 +24,10 @@ from pydantic import Field
 from patchlab.harden.attacks import ATTACKS, right
 from patchlab.harden.harden import Epsilon, Method, epsilon_words, harden, moved, squares
 from patchlab.harden.labeled import in_blocks, labeled_files, read_large_enough
+from patchlab.study.claims import clustered
 from patchlab.study.grid import Count, Names, short_name
 from patchlab.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
-from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.claims import difference, rate
 from patchproof.base.output import image_bytes, write_whole
 from patchproof.base.strict import Positive, Refused, Share, Strict, expand
 from patchproof.classifier.labels import find_labels

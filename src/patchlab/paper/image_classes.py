@@ -38,7 +38,8 @@ from patchproof.render.photograph import shade
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import see
 from patchproof.report.images import png
-from patchproof.scene.image_scene import ImageScene, labels_of, largest_share, load_image_scene
+from patchproof.scene.image_scene import ImageScene, build, labels_of, largest_share
+from patchproof.scene.interface import SceneSource
 from patchproof.sheets.piece import Piece
 
 _RENDER_PX = 384
@@ -100,7 +101,7 @@ def class_scene(
     images, table = settings.images or "", settings.labels or ""
     if images_of.scene is not None:
         images, table = _render_class(images_of.label, images_of.scene, base, seed, settings.renders_each, folder)
-    scene = load_image_scene(scene_settings(settings, images_of, classifier, images, table), base, seed)
+    scene = build(SceneSource(scene_settings(settings, images_of, classifier, images, table), base, seed))
     side = float(settings.made_px)
     return replace(scene, piece=Piece((side, side), (), 1.0), sheet_id=f"patch2d:{seed}")
 

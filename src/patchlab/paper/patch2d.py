@@ -26,12 +26,13 @@ import numpy as np
 import torch
 
 from patchlab.paper.image_classes import ImageClass, PastedSettings, class_scene, classes_of
+from patchlab.study.claims import clustered
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import Count, Names, Seeds, cell_of, grouped, of_values, scene_values, short_name
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.claims import difference, rate
 from patchproof.base.strict import Refused, expand, nearest
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels
@@ -46,7 +47,7 @@ from patchproof.render.photograph import Shown
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Drawing, Table
 from patchproof.scene.image_scene import SPLIT_FROM, ImageScene
-from patchproof.scene.scene import Scene
+from patchproof.scene.interface import Scene
 
 KINDS = ("bare", "gray", "noise", "patch")
 OWN, TARGET = 0, 1  # by whose labels hits count: the image's own class, or the patch's target

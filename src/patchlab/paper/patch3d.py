@@ -26,12 +26,13 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.paper.image_classes import write_labels, write_renders
+from patchlab.study.claims import clustered
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import Record, hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import clustered, difference, rate
+from patchproof.base.claims import difference, rate
 from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
 from patchproof.base.strict import Range, Refused, Share
 from patchproof.optimizer.loop import best_design, views_seen
@@ -44,9 +45,9 @@ from patchproof.render.photograph import Shown
 from patchproof.render.stage import set_stage
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table
-from patchproof.scene.image_scene import largest_share, load_image_scene
-from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import needs_patch
+from patchproof.scene.image_scene import build, largest_share
+from patchproof.scene.interface import SceneSource
+from patchproof.scene.patch_scene import PatchScene, needs_patch
 
 KINDS = ("bare", "gray", "noise", "2d", "3d")
 HARD = 0.2  # clean rate up to which an object counts as misread
@@ -109,7 +110,7 @@ def flat_twin(problem: Problem, settings: Patch3dSettings, folder: Path) -> Prob
     scene = needs_patch(problem.scene, "a printed patch on a mesh")
     names = write_renders(problem.stage, settings.renders, problem.training_px, folder)
     write_labels([(name, scene.settings.target.label) for name in names], folder)
-    flat = load_image_scene(flat_settings(scene, settings), folder, scene.seed)
+    flat = build(SceneSource(flat_settings(scene, settings), folder, scene.seed))
     pasted = Patch(flat, problem.printer, problem.patch.design_px, problem.device)
     return replace(problem, scene=flat, stage=set_stage(flat, problem.device), subject=pasted)
 

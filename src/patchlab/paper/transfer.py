@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from patchlab.paper.sides import sides, three_views
+from patchlab.study.claims import mean
 from patchlab.study.figures import number_grid, picture_sheet
 from patchlab.study.grid import Count, Names, grouped, of_values, problem_of, short_name
 from patchlab.study.pictures import contact_sheet, photographs
@@ -38,7 +39,7 @@ from patchlab.study.trained import (
     trained_on,
     verdict,
 )
-from patchproof.base.claims import mean, rate
+from patchproof.base.claims import rate
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses

@@ -20,7 +20,8 @@ from patchlab.study.study import Cell, Result
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Strict, expand, read_toml, validated
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.scene.scene import Scene, build_scene
+from patchproof.scene.interface import Scene
+from patchproof.scene.scene import build_scene
 
 Values = dict[str, Any]  # of a cell: JSON values
 Tables = Mapping[str, Mapping[str, Any]]  # tables of a scene file with the keys that change

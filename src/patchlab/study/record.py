@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from patchlab.study.claims import mean
 from patchlab.study.study import Result
-from patchproof.base.claims import Estimate, difference, mean, rate
+from patchproof.base.claims import Estimate, difference, rate
 from patchproof.base.goal import Goal
 from patchproof.optimizer.responses import Answers
 

@@ -21,12 +21,13 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchlab.study.claims import mean
 from patchlab.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
 from patchlab.study.record import Record, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.cost import relative_costs
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
-from patchproof.base.claims import Estimate, mean
+from patchproof.base.claims import Estimate
 from patchproof.base.strict import Refused
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.loop import best_design

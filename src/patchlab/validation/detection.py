@@ -21,8 +21,9 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from patchlab.study.claims import clustered_median
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import Estimate, clustered_median, rate
+from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
 from patchproof.base.strict import Refused, Share, Strict
@@ -36,8 +37,8 @@ from patchproof.render.stage import set_stage
 from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import HungSheet, hang_piece, jpeg_of
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import load_scene, needs_patch
+from patchproof.scene.patch_scene import PatchScene, needs_patch
+from patchproof.scene.scene import load_scene
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import control_design
 

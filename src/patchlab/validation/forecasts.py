@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from patchlab.study.claims import mean
 from patchlab.study.grid import grouped, networks_at, of_values
 from patchlab.study.record import hits_of
 from patchlab.study.study import Cell, Result, Study
@@ -26,7 +27,7 @@ from patchlab.validation.photographed import (
     recorded_spread,
     take_photos,
 )
-from patchproof.base.claims import mean, rate, wilson
+from patchproof.base.claims import rate, wilson
 from patchproof.evidence.forecast import forecast_of
 from patchproof.report.tables import Drawing, Table
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from patchlab.study.claims import clustered_median, mean
 from patchlab.study.grid import (
     Count,
     GridSettings,
@@ -31,7 +32,7 @@ from patchlab.study.grid import (
 )
 from patchlab.study.record import Record, gain_of, hardest, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.base.claims import Estimate, clustered_median, mean, rate
+from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.output import image_pixels
 from patchproof.base.strict import Positive, Strict
@@ -47,8 +48,8 @@ from patchproof.optimizer.responses import responses
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
 from patchproof.reprints.hung_sheet import hang_piece
-from patchproof.scene.patch_scene import OpenScene
-from patchproof.scene.scene import PatchScene, needs_patch
+from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.patch_scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.piece import SCISSORS_MM, Piece, lay_out_piece
 from patchproof.sheets.rects import RectMm, grown

@@ -43,7 +43,7 @@ from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.reprints.inkjets import draw_inkjet
 from patchproof.scene.conditions import Conditions, with_values
-from patchproof.scene.scene import PieceScene
+from patchproof.scene.interface import PieceScene
 
 STEP = {"print": "print", "blur": "blur_and_noise", "cast": "light_and_camera", "dim": "light_and_camera"}
 LEAST_COST = 0.10  # of confidence

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchlab.study.claims import mean
 from patchlab.study.grid import Names, grouped, networks_at, of_values, short_name
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result, Study
@@ -34,7 +35,7 @@ from patchlab.validation.photographed import (
     recorded_spread,
     take_photos,
 )
-from patchproof.base.claims import mean, rate
+from patchproof.base.claims import rate
 from patchproof.base.sessions import TAIL, Spread, in_sessions, spread_of
 from patchproof.base.strict import Refused, nearest
 from patchproof.optimizer.problem import set_problem

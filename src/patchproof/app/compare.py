@@ -27,7 +27,7 @@ from patchproof.optimizer.responses import Answers
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.results import Results, write_results
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.scene.scene import Scene, needs_piece
+from patchproof.scene.interface import Scene, needs_piece
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -3,7 +3,8 @@
 In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: REPORT/ with report.json, report.csv,
 report.html, pictures, coco.json with the piece's and a detected object's place, and photos.jsonl, one line per finished
 photograph, from which `resume` goes on. This joins what must not know each other: the judge, its networks and the page.
-The promise's primary network always judges, whatever others are named.
+The promise's primary network always judges, whatever others are named. Only a given run brings its scene, the renderer
+and the optimizer in (see `forecaster`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,23 +22,24 @@ from patchproof.base.output import check_folder, write_whole
 from patchproof.base.strict import Refused
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer
-from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
 from patchproof.evidence.boxes import from_square, given_boxes
 from patchproof.evidence.classify import Box
 from patchproof.evidence.journal import file_sha256
+from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
-from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import PATCH, Labeled, coco_json
 from patchproof.report.images import save_pictures, stem_of
-from patchproof.report.results import versions_of
+from patchproof.report.page import versions_of
 from patchproof.report.write import write_report
-from patchproof.reprints.retake import retaker
 from patchproof.sheets.manifest import Manifest, load_manifest
+
+if TYPE_CHECKING:
+    from patchproof.optimizer.run import Run
 
 _JOURNAL = "photos.jsonl"
 OWN = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _JOURNAL)
@@ -82,7 +85,7 @@ def verify_photos(
     )
     if boxes is not None:
         options = replace(options, boxes=_drawn(boxes, manifest, options))
-    forecast = None if run is None else retaker(run if isinstance(run, Run) else load_run(run), manifest)
+    forecast = None if run is None else forecaster(run, manifest)
     report = gather_evidence(
         photos,
         manifest,
@@ -113,9 +116,18 @@ def verify_photos(
     return report
 
 
+def forecaster(run: str | Path | Run, manifest: Manifest) -> Callable[[Shot], float | None]:
+    """What gives each photograph of a sheet the chance of being recognized, by the run (or its folder) that the sheet
+    is of: see `reprints.retake`.
+    """
+    from patchproof.reprints.retake import retaker  # brings scene, renderer and optimizer in
+
+    return retaker(run, manifest)
+
+
 def _drawn(boxes: str | Path, manifest: Manifest, options: Options) -> dict[str, Box]:
     """The boxes of a file, refused before networks that do not look at them."""
-    if manifest.promise is None or not any(isinstance(model, Detector) for model in options.models):
+    if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
         raise Refused("a detector, which alone looks at boxes", "none that judges these photographs", "leave boxes out")
     return given_boxes(boxes, manifest.promise.target.label)
 
@@ -146,7 +158,7 @@ def options_of(
     base, promise = Path(sheet).resolve().parent, manifest.promise
     least_score = None if promise is None else promise.models[0].least_score
     return Options(
-        models=[at_score(load_classifier(network, base), least_score) for network in _networks(manifest, models)],
+        models=[load_classifier(network, base).at_score(least_score) for network in _networks(manifest, models)],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
         camera=None if camera is None else load_camera(camera),
     )

@@ -7,7 +7,7 @@ applies.
 Left out on purpose: corrections for looking more than once. `optimizer.promise` looks so that none is needed.
 
 Sources: Wilson, JASA 22 (1927); Newcombe, Statistics in Medicine 17 (1998) 873-890 (independent) and 2635-2650
-(paired); Morey, Tutorials in Quantitative Methods for Psychology 4 (2008) 61-64 (several settings on the same seeds).
+(paired).
 """
 
 from __future__ import annotations
@@ -50,35 +50,11 @@ def difference(a: list[bool], b: list[bool]) -> Estimate | None:
     return Estimate(value, low, high, len(a))
 
 
-def mean(values: Sequence[float]) -> Estimate | None:
-    """The mean with Student's interval; None of fewer than two values."""
-    return student_mean(values) if len(values) > 1 else None
-
-
 def student_mean(values: Sequence[float] | np.ndarray) -> Estimate:
     """The mean of two values or more with Student's interval."""
     n, value = len(values), statistics.fmean(values)
     half = _student(n - 1) * (statistics.stdev(map(float, values)) / math.sqrt(n))
     return Estimate(value, value - half, value + half, n)
-
-
-def median(values: Sequence[float] | np.ndarray) -> Estimate:
-    """The median with its distribution-free interval from order statistics; of few values, their range."""
-    from scipy.stats import binom
-
-    ordered, n = sorted(map(float, values)), len(values)
-    skipped = max(int(binom.ppf(_TAIL, n, 0.5)) - 1, 0)
-    return Estimate(statistics.median(ordered), ordered[skipped], ordered[n - 1 - skipped], n)
-
-
-def paired_means(values: np.ndarray) -> list[Estimate]:
-    """Means of the columns of S×K (K settings tried on the same S seeds) with intervals for comparing them: what all
-    settings of a seed have in common is taken out, and what is left gets Student's interval (Morey 2008).
-    """
-    seeds, settings = values.shape
-    left = values - values.mean(1, keepdims=True)
-    half = _student(seeds - 1) * left.std(0, ddof=1) * math.sqrt(settings / (settings - 1) / seeds)
-    return [Estimate(float(m), float(m - h), float(m + h), seeds) for m, h in zip(values.mean(0), half, strict=True)]
 
 
 def wilson(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -130,45 +106,11 @@ def rates_difference(
     return difference, (low, difference + math.hypot(high_a - rate_a, rate_b - low_b))
 
 
-def clustered_mean(values: Sequence[float]) -> tuple[float, tuple[float, float]]:
-    """Mean of one figure per cluster with a percentile bootstrap over clusters: what is alike within a cluster (seeds
-    and conditions of one object before one network) is not evidence of its own. The same values give the same
-    interval. Needs LEAST_CLUSTERS: of fewer it would claim far too much (of one, certainty), and of ten it covers
-    about nine times in ten.
-    """
-    import numpy as np
-
-    if len(values) < LEAST_CLUSTERS:
-        raise ValueError(f"expected at least {LEAST_CLUSTERS} clusters, got {len(values)}")
-    means = resampled_means(np.asarray(values, float), 10_000)
-    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(np.mean(values)), (float(low), float(high))
-
-
-def clustered_median(values: np.ndarray) -> Estimate:
-    """The median of n × ... values with a percentile bootstrap over the n rows; the same values, the same interval."""
-    import numpy as np
-
-    rows = np.random.default_rng(0).integers(0, len(values), (1000, len(values)))
-    low, high = np.quantile([np.median(values[picked]) for picked in rows], (_TAIL, 1 - _TAIL))
-    return Estimate(float(np.median(values)), float(low), float(high), len(values))
-
-
 def resampled_means(values: np.ndarray, draws: int) -> np.ndarray:
     """Means (`draws` × ...) of bootstrap resamples of the n × ... values, the same ones each time."""
     import numpy as np
 
     return values[np.random.default_rng(0).integers(0, len(values), (draws, len(values)))].mean(1)
-
-
-def clustered(values: Sequence[float]) -> Estimate | float | None:
-    """The mean of one figure per cluster as a table says it, n the number of clusters: without an interval where they
-    are too few for one, None of nothing.
-    """
-    if len(values) < LEAST_CLUSTERS:
-        return statistics.fmean(values) if values else None
-    value, (low, high) = clustered_mean(values)
-    return Estimate(value, low, high, len(values))
 
 
 def mcnemar_p(a: list[bool], b: list[bool]) -> float:

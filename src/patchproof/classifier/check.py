@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.strict import Refused
-from patchproof.classifier.detector import NOTHING, Detector
-from patchproof.classifier.network import Classifier
+from patchproof.classifier.network import NOTHING, Classifier
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a
 # BatchNorm in training mode moves them by more than a hundredth.
@@ -41,7 +40,7 @@ def check_network(classifier: Classifier, device: torch.device | str = "cpu") ->
         got = f"{name}, which fails on 3×3×{classifier.input_px}×{classifier.input_px} ({reason})"
         raise Refused("a network that takes N×3×S×S pictures", got, "check input_px and the export") from error
     _check_outputs(logits, len(classifier.labels), name)
-    if classifier.KIND == Detector.KIND and float(logits.max()) <= NOTHING:
+    if classifier.LOOKS_AT_BOXES and float(logits.max()) <= NOTHING:
         warnings.warn(f"{name} finds nothing in smooth pictures: its gradients were not tried", stacklevel=2)
         return
     spread = float(logits.max() - logits.min())

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from patchproof.base.strict import Refused
-from patchproof.classifier.detector import NOTHING, Detector
-from patchproof.classifier.network import Classifier, weights_sha256
+from patchproof.classifier.detector import Detector
+from patchproof.classifier.network import NOTHING, Classifier, weights_sha256
 
 MOST_FOUND = 1000  # boxes in a picture, of networks that find any number
 

@@ -17,11 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.classifier.network import Classifier, Odds
+from patchproof.classifier.network import NOTHING, Classifier, Odds
 from patchproof.networks.windows import Windows
 
 LEAST_IOU = 0.5  # as in PASCAL VOC's and COCO's AP50
-NOTHING = -20.0  # the logit where no candidate lies on the object: a score of 2e-9
 
 
 @dataclass(frozen=True)
@@ -33,6 +32,16 @@ class Detector(Classifier):
     least_score: float = 0.5
 
     KIND = "detector"
+    LOOKS_AT_BOXES = True
+
+    @property
+    def score_needed(self) -> float:
+        """The score from which on its boxes count."""
+        return self.least_score
+
+    def at_score(self, least_score: float | None) -> Detector:
+        """As in `Classifier.at_score`."""
+        return self if least_score is None else replace(self, least_score=least_score)
 
     def probabilities(self, logits: Tensor) -> Tensor:
         """N×K scores, each label's own."""
@@ -59,13 +68,6 @@ class Detector(Classifier):
             overlap = iou(candidates[..., :4].detach(), torch.as_tensor(boxes).to(squares) * self.input_px)
             logits = logits.masked_fill((overlap < LEAST_IOU)[..., None], NOTHING)
         return logits.amax(1)
-
-
-def at_score(network: Classifier, least_score: float | None) -> Classifier:
-    """The network with that score from which on its boxes count, if it is a detector and there is one."""
-    if least_score is None or not isinstance(network, Detector):
-        return network
-    return replace(network, least_score=least_score)
 
 
 def iou(boxes: Tensor, truth: Tensor) -> Tensor:

@@ -21,6 +21,8 @@ from patchproof.base.strict import Refused
 from patchproof.networks.batches import InBatches
 from patchproof.networks.windows import Windows
 
+NOTHING = -20.0  # the logit where no candidate of a detector lies on the object: a score of 2e-9
+
 
 class Odds(NamedTuple):
     """The logarithms of N confidences and of what they lack to 1; float64, so that 1 - 1e-9 is not 1."""
@@ -40,6 +42,16 @@ class Classifier:
     network: Callable[[Tensor], Tensor]
 
     KIND: ClassVar[str] = "classifier"
+    LOOKS_AT_BOXES: ClassVar[bool] = False  # whether it matters where the object lies
+
+    @property
+    def score_needed(self) -> float | None:
+        """The score from which on a detector's boxes count; None of a classifier, whose best label counts."""
+        return None
+
+    def at_score(self, least_score: float | None) -> Classifier:
+        """The network with that score in place of its own, if there is one and it needs any."""
+        return self
 
     def logits(
         self,

@@ -11,18 +11,18 @@ from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from patchproof.base.goal import Goal
 from patchproof.base.strict import Finite, Strict
-from patchproof.evidence.worth import Worth
 from patchproof.photo.cannot import CannotJudge
 
 Status = Literal["judged", "measured", "rejected"]
 Word = Literal["kept", "broken", "cannot_tell"]
+WorthWord = Literal["helps", "no_better", "worse", "not_shown"]
 Effect = Literal["shown", "not_shown", "not_tested"]
 Required = Literal["kept", "helps"]  # of a verification that scripts go on from
 Row = tuple[Finite, Finite, Finite]
-# where the focal length comes from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to
-# check (so that there is no distance), or contradicts; EXIF of another size or shape of picture, which is not used;
-# nowhere
+# where the focal length is from: a camera file; EXIF, which the sheet's own perspective confirms, is too weak to check
+# (so that there is no distance), or contradicts; EXIF of a picture of another size or shape, which is not used; nowhere
 Focal = Literal["calibrated", "confirmed", "unchecked", "contradicted", "cropped", "unknown"]
 
 
@@ -214,6 +214,18 @@ class SessionCount(Strict):
     name: str
     recognized: int
     judged: int
+
+
+class Worth(Strict):
+    """What the patch is worth beside the control that decided it, whose rate is the promise's unless `photographed`."""
+
+    word: WorthWord
+    goal: Goal
+    control: str
+    control_rate: Finite
+    difference: Finite
+    difference_interval: tuple[Finite, Finite]
+    photographed: bool
 
 
 class Summary(Strict):

@@ -15,32 +15,12 @@ useless, and is, keeps its promise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
 
 from patchproof.base.claims import rates_difference
-from patchproof.base.goal import Goal
-from patchproof.base.strict import Finite, Strict
+from patchproof.evidence.results import Control, Worth, WorthWord
 from patchproof.sheets.manifest import Promise
 
-if TYPE_CHECKING:
-    from patchproof.evidence.results import Control
-
-Word = Literal["helps", "no_better", "worse", "not_shown"]
 LITTLE = 0.10  # a gain below which a patch is no better
-
-
-class Worth(Strict):
-    """The word, the control that decided it with its rate, and the patch's rate minus that; `photographed` is false
-    where the control's rate is that of the promise.
-    """
-
-    word: Word
-    goal: Goal
-    control: str
-    control_rate: Finite
-    difference: Finite
-    difference_interval: tuple[Finite, Finite]
-    photographed: bool
 
 
 def worth_of(rate: float, interval: tuple[float, float], controls: Sequence[Control], promise: Promise) -> Worth | None:
@@ -74,7 +54,7 @@ def worth_of(rate: float, interval: tuple[float, float], controls: Sequence[Cont
     )
 
 
-def _word(low: float, high: float, promised_better: bool) -> Word:
+def _word(low: float, high: float, promised_better: bool) -> WorthWord:
     if low > 0:
         return "helps"
     if high < 0:

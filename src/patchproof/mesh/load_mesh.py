@@ -14,8 +14,6 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
-import trimesh
-from trimesh.exchange.gltf import export_glb
 
 from patchproof.base.strict import Refused
 from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
@@ -50,11 +48,6 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", g
         parts, warnings = read_parts(Path(path), _Y_UP_FROM_Z_UP if up == "z" else np.eye(3))
     parts, reduced = _within_limit(parts)
     return from_parts(parts, length_mm, (*warnings, *reduced))
-
-
-def glb_of(mesh: trimesh.Trimesh | trimesh.Scene) -> bytes:
-    """A mesh in memory as the bytes of a GLB file."""
-    return export_glb(trimesh.Scene(mesh) if isinstance(mesh, trimesh.Trimesh) else mesh)
 
 
 def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:

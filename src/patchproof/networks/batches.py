@@ -5,18 +5,22 @@ In: a network for N×3×S×S. Out: the same logits for any N, on a CPU in about 
 32 MiB is memory that the system hands out and clears anew each time, which MobileNetV2 paid with a third of its time;
 and convolutions want the colors of a pixel side by side ("channels last"), another third. Of the plain call's time
 remain 0.45 with MobileNetV2 at 224 px, 0.60 with SqueezeNet 1.1, 0.72 with MobileNetV1 0.75 at 192 px; small inputs
-are faster whole and stay so. A gradient that is asked for in windows only takes less (windows.py).
+are faster whole and stay so. A gradient that is asked for in windows only takes less (cuts.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from patchproof.networks.windows import Cut, Windows, answers, cut_of
+from patchproof.networks.windows import Windows, worth_cutting
+
+if TYPE_CHECKING:
+    from patchproof.networks.cuts import Cut
 
 CPU_BATCH_PIXELS = 4 * 224**2  # 2 to 8 pictures of 224 px cost the same each, 12 a third more
 
@@ -53,12 +57,16 @@ class InBatches(torch.nn.Module):
         cut = None if windows is None or self.tried is None else self.cut
         if windows is None or cut is None or cut.saves(windows, photos.shape[-1]) <= 0:
             return self.network(photos)
-        return answers(cut, photos, windows)
+        return cut.answers(photos, windows)
 
     @cached_property
     def cut(self) -> Cut | None:
         """Where its first layers can be told from the others, found when it is first asked for."""
-        return None if self.tried is None else cut_of(self.network, self.tried)
+        if self.tried is None or not worth_cutting(self, self.tried):
+            return None
+        from patchproof.networks.cuts import cut_of  # which follows a network step by step: small ones do without
+
+        return cut_of(self.network, self.tried)
 
 
 def fastest(network: Callable[[Tensor], Tensor], pictures: Tensor) -> InBatches:

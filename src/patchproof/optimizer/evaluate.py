@@ -19,7 +19,6 @@ from patchproof.base.input import is_file
 from patchproof.base.output import write_whole
 from patchproof.base.strict import Refused
 from patchproof.base.workers import Workers, open_workers
-from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier, center_square
 from patchproof.classifier.precision import Finding, average_precision, findings
 from patchproof.optimizer.problem import Problem, set_problem
@@ -123,7 +122,7 @@ def _found(problem: Problem, shown: Mapping[str, Shown], conditions: Conditions)
         views = problem.see(shown["design"], conditions, problem.figure_px)
         pictures = {kind: expose(views, thing) for kind, thing in shown.items()}
         for network, indices in zip(problem.classifiers, problem.indices, strict=True):
-            if not isinstance(network, Detector):
+            if not network.LOOKS_AT_BOXES:
                 continue
             boxes_px, shows = torch.as_tensor(boxes * network.input_px), [True] * len(boxes)
             found[network.name] = {

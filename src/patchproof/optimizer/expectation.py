@@ -162,7 +162,7 @@ def _mean_answer(problem: Problem, design: Tensor, ask: Callable[[Tensor], Seque
         return sum(share * value for share, value in zip(shares, values, strict=True))
 
     at_printed = torch.as_tensor(mean(answer.gradient for answer in answers), device=problem.device)
-    # a product to derive, since torch imports SymPy when it is handed a gradient to begin with (networks/windows.py)
+    # a product to derive, since torch imports SymPy when it is handed a gradient to begin with (networks/cuts.py)
     (gradient,) = torch.autograd.grad((printed * at_printed).sum(), design)
     pictures = [torch.as_tensor(answer.pictures) for answer in answers if answer.pictures is not None]
     return Answer(

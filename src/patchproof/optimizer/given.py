@@ -35,7 +35,8 @@ from patchproof.optimizer.run import OWN, Run, check_promise, finish_run, load_r
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable, read_photo
-from patchproof.scene.scene import PieceScene, Scene, load_scene, needs_piece
+from patchproof.scene.interface import PieceScene, Scene, needs_piece
+from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import design_sha256
 from patchproof.sheets.piece import Piece, marker_image
 

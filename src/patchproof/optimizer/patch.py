@@ -22,16 +22,15 @@ from patchproof.channel.printer import Printer
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.goals import total_variation
 from patchproof.optimizer.pixels import as_pixels
-from patchproof.optimizer.subject import Grid, write_png
+from patchproof.optimizer.subject import DESIGN_FILE, Grid, read_png, write_png
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.pixels import PiecePicture
-from patchproof.scene.interface import PieceScene
+from patchproof.scene.interface import PieceScene, Scene, needs_piece
 from patchproof.sheets.piece import control_design, on_paper
 
 # A design's pixels are printed as blocks of at least this density. Coarser pictures are smoothed by some PDF readers
 # and not by others, and markers, drawn on the same grid, would be lost.
 PRINTED_PX_PER_MM = 2.0
-DESIGN_FILE = "design.png"
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,3 +122,14 @@ class Patch:
     @cached_property
     def _printed(self) -> PrintedPiece:
         return PrintedPiece(self.scene.piece, self.scene.sheet_id, self.printer, self.device)
+
+
+def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Patch:
+    """As in `subject`: the design of the scene's piece, no finer than networks can see it."""
+    hung = needs_piece(scene)
+    return Patch(hung, printer, hung.design_px(network_px), device)
+
+
+def read_design(scene: Scene, folder: Path) -> np.ndarray:
+    """As in `subject`: `design.png`."""
+    return read_png(folder / DESIGN_FILE)

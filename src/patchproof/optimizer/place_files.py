@@ -29,10 +29,11 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import cameras, near_mm, see
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import OpenScene, PatchScene
+from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import patch_frame, side_frame, spun
 
-PLACE_FILES = _RECORD, _PICTURE = ("place.json", "place.png")
+_RECORD, _PICTURE = "place.json", "place.png"
 _DIRECTIONS, _SIDE_PX = 4, 420
 _ROOM = 1.05  # of the object's diagonal
 _DOT = 0.3  # of the piece's size

@@ -34,9 +34,10 @@ from patchproof.optimizer.responses import responses
 from patchproof.optimizer.training_views import training_views
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import At, OpenScene
+from patchproof.scene.interface import Scene
+from patchproof.scene.open_scene import OpenScene, needs_open
+from patchproof.scene.patch_scene import At
 from patchproof.scene.places import APART, Ground, Spot
-from patchproof.scene.scene import Scene, needs_open
 
 PASSES = 608  # at most: pictures that go through a network, and once more those that gradients come back through
 PLACES, SCREEN_VIEWS = 24, 4  # 192 of them, and 4 of the bare object

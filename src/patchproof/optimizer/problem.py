@@ -19,22 +19,20 @@ from patchproof.base.settings import OptimizeSettings
 from patchproof.base.strict import Refused
 from patchproof.base.workers import threads
 from patchproof.channel.printer import Printer, load_printer
-from patchproof.classifier.detector import Detector, at_score
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import InBatches
 from patchproof.optimizer.goals import Loss, target_loss
 from patchproof.optimizer.patch import Patch
-from patchproof.optimizer.subject import Subject
-from patchproof.optimizer.texture import Texture
+from patchproof.optimizer.subject import Subject, subject_of
 from patchproof.render.pixels import PHOTOGRAPHED, Look, Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import Scene, needs_piece, needs_texture
 
 # Figures come from views of so many times the largest input's side, which a network reduces as it does photographs, and
 # no less than so many pixels, since each of them takes one sample. Averaging textures over eight tenths of a pixel
@@ -79,7 +77,7 @@ class Problem:
 
     def boxes(self, conditions: Conditions) -> np.ndarray | None:
         """Where the object lies in these views (`Scene.boxes`), if one of the networks asks for it."""
-        return self.scene.boxes(conditions) if any(isinstance(c, Detector) for c in self.classifiers) else None
+        return self.scene.boxes(conditions) if any(c.LOOKS_AT_BOXES for c in self.classifiers) else None
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Square views of these conditions, for what is shown now and any other design in its place."""
@@ -140,16 +138,12 @@ def set_problem(
     _check_device(device)
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
-    classifiers = tuple(at_score(load_classifier(name, scene.base, device), least_score) for name in names)
+    classifiers = tuple(load_classifier(name, scene.base, device).at_score(least_score) for name in names)
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)
     printer = load_printer(settings.printer.profile, scene.base)
     stage = set_stage(scene, device)
-    if scene.HAS_PIECE:
-        hung, network_px = needs_piece(scene), max(classifier.input_px for classifier in classifiers)
-        subject = Patch(hung, printer, hung.design_px(network_px), stage.device)
-    else:
-        subject = Texture(needs_texture(scene), stage.device)
+    subject = subject_of(scene, printer, max(classifier.input_px for classifier in classifiers), stage.device)
     jobs = jobs if stage.device.type == "cpu" else 1
     if jobs > 1:
         with threads(1):  # here, for all processes to be forked, and as one of them would: two threads round otherwise

@@ -22,14 +22,13 @@ import torch
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.sessions import difference_in_sessions, in_sessions, spread_of
-from patchproof.classifier.detector import Detector
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, asking, joined
 from patchproof.render.pixels import Shown
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.interface import PieceScene, needs_piece
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import PieceScene, needs_piece
 from patchproof.sheets.manifest import ConditionClaim, ControlClaim, ModelClaim, Promise, Target
 
 # Many short sessions: how much they differ is known from their number, not from their length.
@@ -151,7 +150,7 @@ def _counted(on_views: Callable[[int, int], None], before: int, total: int, done
 def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
     """The object's outermost points in the frame of its piece, where a network asks for its box in photographs."""
     scene = problem.scene
-    if not isinstance(scene, PatchScene) or not any(isinstance(c, Detector) for c in problem.classifiers):
+    if not isinstance(scene, PatchScene) or not any(c.LOOKS_AT_BOXES for c in problem.classifiers):
         return ()
     points = geometry.carried(np.linalg.inv(scene.placement.world_from_piece), scene.outermost_mm)
     return tuple((round(x, 3), round(y, 3), round(z, 3)) for x, y, z in points.tolist())
@@ -186,7 +185,7 @@ def model_claims(
             rate=float(recognized.mean()),
             interval=spread_of(*in_sessions(recognized, per_session, places)).rate,
             confidence=float(confidence.mean()),
-            least_score=classifier.least_score if isinstance(classifier, Detector) else None,
+            least_score=classifier.score_needed,
         )
         for classifier, recognized, confidence in rows
     )

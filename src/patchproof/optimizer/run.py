@@ -32,22 +32,19 @@ from patchproof.classifier.network import Classifier
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
 from patchproof.optimizer.goals import Loss
 from patchproof.optimizer.loop import SELECT_AFTER, State, Step, saves, start, steps
-from patchproof.optimizer.patch import DESIGN_FILE
 from patchproof.optimizer.pixels import side_by_side
-from patchproof.optimizer.place_files import PLACE_FILES, read_place, save_place
-from patchproof.optimizer.places import choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, make_promise
-from patchproof.optimizer.subject import read_png, write_png
-from patchproof.optimizer.texture import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Texture
-from patchproof.scene.patch_scene import OpenScene
-from patchproof.scene.scene import Scene, build_scene, load_scene, needs_patch, needs_texture
+from patchproof.optimizer.subject import DESIGN_FILE, MASK_FILE, OBJECT_FILE, TEXTURE_FILES, read_design, write_png
+from patchproof.scene.interface import Scene
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.scene import build_scene, load_scene
 from patchproof.sheets.manifest import Promise
 
 _LOG, RUN_FILE, _VIEWS = ("steps.jsonl", "run.json", "views.png")
 _GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
-OWN = (CHECKPOINT, _LOG, RUN_FILE, _VIEWS, _GIVEN, *PLACE_FILES, *_RESULTS, "evaluate.json", ".*.part")
+OWN = (CHECKPOINT, _LOG, RUN_FILE, _VIEWS, _GIVEN, "place.*", *_RESULTS, "evaluate.json", ".*.part")
 
 NotNegativeInt = Annotated[int, Field(ge=0)]
 # Steps and promised views of a first look, whose interval is some four times as wide, and of a print that counts: three
@@ -99,21 +96,37 @@ def optimize_scene(
     if not resume:
         check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / RUN_FILE))
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
-    place = None
-    if isinstance(scene, OpenScene):
-        place = read_place(out, scene) if resume else None
-        place = place or choose_place(scene, models=models, loss=loss, device=device, jobs=jobs, on_pass=on_place)
-        scene = scene.at(place.at, place.spin_deg)
+    keep_place = None
+    if not scene.HAS_PLACE:
+        searching = {"models": models, "loss": loss, "device": device, "jobs": jobs, "on_pass": on_place}
+        scene, keep_place = _placed(scene, out, resume, searching)
     on_scene(scene)
     problem = set_problem(scene, device, models, loss, jobs)
     if not resume:
         _clear(out)
     make_folder(out)
-    if place is not None:
-        save_place(place, needs_patch(scene), out)
+    if keep_place is not None:
+        keep_place()
     state = resumed(out, problem) if resume else start(problem)
     design = _loop(problem, state, out, on_step)
     return finish_run(problem, design, out, controls, promise_views, on_promise)
+
+
+def _placed(
+    scene: Scene, out: Path, resume: bool, searching: Mapping[str, Any]
+) -> tuple[PatchScene, Callable[[], None]]:
+    """A scene whose piece has no place, at the one that a search chooses or chose; and what keeps that in the folder.
+
+    Nothing of the search is imported for a scene that gives a place itself.
+    """
+    from patchproof.optimizer.place_files import read_place, save_place
+    from patchproof.optimizer.places import choose_place
+    from patchproof.scene.open_scene import needs_open
+
+    scene = needs_open(scene)
+    place = (read_place(out, scene) if resume else None) or choose_place(scene, **searching)
+    placed = scene.at(place.at, place.spin_deg)
+    return placed, lambda: save_place(place, placed, out)
 
 
 def check_promise(views: int | None) -> None:
@@ -161,7 +174,7 @@ def load_run(folder: str | Path) -> Run:
         scene = build_scene(settings, base, record.seed, record.sheet_id, glb)
         if record.imported is not None:
             scene = replace(scene, known={**scene.known, "design": record.imported.sha256})
-        design = _design(scene, folder)
+        design = read_design(scene, folder)
     except Refused:
         raise
     except (OSError, ValueError, RuntimeError) as error:
@@ -199,13 +212,6 @@ def _refuse_framed(settings: SceneSettings, placement: _Placement | None, folder
             f"one from before in {folder}, with a frame round its {width_mm:g} mm",
             f"verify its sheets, but optimize again, with the whole piece's width_mm = {piece_mm[0]:.4g}",
         )
-
-
-def _design(scene: Scene, folder: Path) -> np.ndarray:
-    """The design's pixels of a finished run."""
-    if scene.HAS_PIECE:
-        return read_png(folder / DESIGN_FILE)
-    return Texture(needs_texture(scene), torch.device("cpu")).read(folder)
 
 
 def _clear(out: Path) -> None:

@@ -1,17 +1,21 @@
 """What may be optimized: a design, of a printed piece or of the object's own texture.
 
 In: a scene. Out: a `Subject`, which says where a design starts, what may become of it, what it costs, how it looks and
-what files a run keeps of it. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3.
+what files a run keeps of it. A design is a float tensor 3×h×w in [0, 1], its `pixels` are uint8 h×w×3. Patches and
+textures have a module each, of which a scene loads its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import ClassVar, Protocol, Self
 
 import numpy as np
+import torch
 from PIL import Image
 from torch import Tensor
 
@@ -19,6 +23,9 @@ from patchproof.base.input import opened_picture
 from patchproof.base.output import write_whole
 from patchproof.channel.printer import Printer
 from patchproof.render.pixels import Shown
+from patchproof.scene.interface import Scene
+
+DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "design.png", "object.glb", "texture_*.png", "mask.png"
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,20 @@ class Subject(Protocol):
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
         """A file name's suffix, and the one file that shows the design to others."""
         ...
+
+
+def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Subject:
+    """What a scene leaves open, before networks whose largest input has that side."""
+    return _module_of(scene).subject_of(scene, printer, network_px, device)
+
+
+def read_design(scene: Scene, folder: Path) -> np.ndarray:
+    """The pixels that `Subject.save` wrote, to the bit; refused where they are not of this scene."""
+    return _module_of(scene).read_design(scene, folder)
+
+
+def _module_of(scene: Scene) -> ModuleType:
+    return import_module(f"patchproof.optimizer.{'patch' if scene.HAS_PIECE else 'texture'}")
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:

@@ -26,13 +26,12 @@ from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.subject import Grid, read_png, write_png
+from patchproof.optimizer.subject import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Grid, read_png, write_png
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
-from patchproof.scene.mesh_scene import TextureScene
+from patchproof.scene.interface import Scene
+from patchproof.scene.texture import Canvas
 from patchproof.sheets.piece import CELLS, control_design
-
-OBJECT_FILE, TEXTURE_FILES, MASK_FILE = "object.glb", "texture_*.png", "mask.png"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +41,13 @@ class Texture:
     # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
     # 60 % as it came, 60, 70, 76 % with steps of 0.1, 0.03, 0.015 (96 views), 81 % with twice as many of 0.015.
     LOOK: ClassVar[str] = "textures"
-    scene: TextureScene
+    scene: Scene
+    canvas: Canvas
     device: torch.device
 
     def start(self) -> Tensor:
         """The texels that the canvas starts from."""
-        return from_pixels(self.surface.texels(self.scene.canvas.start_srgb), self.device)
+        return from_pixels(self.surface.texels(self.canvas.start_srgb), self.device)
 
     def clipped(self, design: Tensor) -> Tensor:
         """The nearest design within the ball round the start."""
@@ -101,14 +101,14 @@ class Texture:
             return self._shuffled(pixels)
         if kind != "noise":
             return control_design(kind, pixels, self.scene.sheet_id)
-        textures = [np.zeros((*mask.shape, 3), np.uint8) for mask in self.scene.canvas.mask]
+        textures = [np.zeros((*mask.shape, 3), np.uint8) for mask in self.canvas.mask]
         return self.surface.texels([control_design(kind, texture, self.scene.sheet_id) for texture in textures])
 
     def _shuffled(self, pixels: np.ndarray) -> np.ndarray:
         """Each texture's texels moved cell by cell; cells that a mask cuts push the next ones along."""
         rng = np.random.default_rng(int(self.scene.sheet_id, 36))
         result, first = pixels.copy(), 0
-        for mask in self.scene.canvas.mask:
+        for mask in self.canvas.mask:
             rows, columns = np.nonzero(mask)
             cell = max(min(mask.shape) / CELLS, 1)
             number = (rows / cell).astype(int) * mask.shape[1] + (columns / cell).astype(int)
@@ -138,35 +138,25 @@ class Texture:
         """Write the object with its new textures, each of them, and below each other the masks, white where a texture
         was free to change.
         """
-        textures, masks = self.surface.textures(pixels), self.scene.canvas.mask
-        write_whole(folder / OBJECT_FILE, lambda path: write_glb(self.scene.canvas.mesh, textures, path))
+        textures, masks = self.surface.textures(pixels), self.canvas.mask
+        write_whole(folder / OBJECT_FILE, lambda path: write_glb(self.canvas.mesh, textures, path))
         for i, texture in enumerate(textures):
             write_png(folder / TEXTURE_FILES.replace("*", f"{i}"), texture)
         width = max(mask.shape[1] for mask in masks)
         wide = [np.pad(mask, ((0, 0), (0, width - mask.shape[1]))) for mask in masks]
         write_png(folder / MASK_FILE, np.concatenate(wide).astype(np.uint8) * 255)
 
-    def read(self, folder: Path) -> np.ndarray:
-        """The pixels that `save` wrote, to the bit; refused where they are not of this scene."""
-        masks = self.scene.canvas.mask
-        textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(masks))]
-        for texture, mask in zip(textures, masks, strict=True):
-            if texture.shape[:2] != mask.shape:
-                got = f"{texture.shape[1]} × {texture.shape[0]} pixels"
-                raise Refused("the textures of this scene", got, "optimize again")
-        return self.surface.texels(textures)
-
     def file(self, pixels: np.ndarray) -> tuple[str, bytes]:
         """The object with its new textures as GLB."""
         with TemporaryDirectory() as folder:
             path = Path(folder) / OBJECT_FILE
-            write_glb(self.scene.canvas.mesh, self.surface.textures(pixels), path)
+            write_glb(self.canvas.mesh, self.surface.textures(pixels), path)
             return "glb", path.read_bytes()
 
     @property
     def grid(self) -> Grid:
         """How fine the textures are, per millimeter of the surface on average."""
-        mesh, masks = self.scene.mesh, self.scene.canvas.mask
+        mesh, masks = self.canvas.mesh, self.canvas.mask
         sizes = np.array([mask.shape[1::-1] for mask in masks])
         uv = mesh.corner_uv.astype(float) * sizes[mesh.face_material][:, None]
         flat = np.abs(np.linalg.det(uv[:, 1:] - uv[:, :1])).sum()
@@ -178,11 +168,27 @@ class Texture:
     @cached_property
     def surface(self) -> LearnedTextures:
         """The textures with their changeable texels."""
-        return LearnedTextures(self.scene.canvas, self.device)
+        return LearnedTextures(self.canvas, self.device)
 
     @cached_property
     def _start(self) -> Tensor:
         return self.start()
+
+
+def subject_of(scene: Scene, printer: Printer, network_px: int, device: torch.device) -> Texture:
+    """As in `subject`: the scene's own texture, whatever printer and networks there are."""
+    return Texture(scene, scene.own_texture(), device)
+
+
+def read_design(scene: Scene, folder: Path) -> np.ndarray:
+    """As in `subject`: the changeable texels of the textures."""
+    canvas = scene.own_texture()
+    textures = [read_png(folder / TEXTURE_FILES.replace("*", f"{i}")) for i in range(len(canvas.mask))]
+    for texture, mask in zip(textures, canvas.mask, strict=True):
+        if texture.shape[:2] != mask.shape:
+            got = f"{texture.shape[1]} × {texture.shape[0]} pixels"
+            raise Refused("the textures of this scene", got, "optimize again")
+    return LearnedTextures(canvas, torch.device("cpu")).texels(textures)
 
 
 def _neighbors(texture: Tensor, mask: Tensor):

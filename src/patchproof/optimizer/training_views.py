@@ -15,7 +15,7 @@ import numpy as np
 from patchproof.optimizer.problem import Problem
 from patchproof.render.views import Views, apart, seen_again
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import Scene
+from patchproof.scene.interface import Scene
 
 VIEWS_PER_TASK = 2  # of a step, that one process renders: one at a time, rendering took 1.4 times as long
 STEPS_AHEAD = 4  # whose views a process renders together: alone, rendering took 1.4 times as long

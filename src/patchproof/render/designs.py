@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,8 +18,10 @@ from torch import Tensor
 
 from patchproof.channel.printer import Printer
 from patchproof.render.pixels import ObjectTextures, PiecePicture
-from patchproof.scene.texture import Canvas
 from patchproof.sheets.piece import Piece, marker_image, with_ids
+
+if TYPE_CHECKING:
+    from patchproof.scene.texture import Canvas
 
 
 @dataclass(frozen=True, eq=False)

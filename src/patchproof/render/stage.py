@@ -15,7 +15,8 @@ from patchproof.channel.lens import Camera
 from patchproof.channel.printer import load_printer
 from patchproof.render.designs import LearnedTextures, PrintedPiece
 from patchproof.render.surfaces import ObjectSurface, PieceSurface, object_surface, piece_surface
-from patchproof.scene.scene import Scene, needs_mesh, needs_piece, needs_texture
+from patchproof.scene.interface import Scene, needs_piece
+from patchproof.scene.mesh_scene import needs_mesh
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Stage:
     def look(self) -> PrintedPiece | LearnedTextures:
         """What designs look like here: as the scene's printer prints them, or as textures."""
         if not self.scene.HAS_PIECE:
-            return LearnedTextures(needs_texture(self.scene).canvas, self.device)
+            return LearnedTextures(self.scene.own_texture(), self.device)
         scene = needs_piece(self.scene)
         printer = load_printer(scene.settings.printer.profile, scene.base)
         return PrintedPiece(scene.piece, scene.sheet_id, printer, self.device)

@@ -43,8 +43,8 @@ from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage
 from patchproof.render.texture import look_up
 from patchproof.scene.conditions import Conditions, with_poses_of
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import needs_mesh, needs_pictures
+from patchproof.scene.interface import needs_piece
+from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 
 NEAR_SHARE = 1e-3  # of the object's length
 
@@ -278,16 +278,15 @@ def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Li
 
 def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:
     """Views of a scene made of pictures: the piece's homography takes the place of camera and mesh."""
-    scene, parts = needs_pictures(stage.scene), None
+    parts, pictures = None, stage.scene.pictures(conditions, size_px)
     if piece is not None:
-        homographies, surface = scene.piece_homographies(conditions, size_px), stage.piece_surface
+        scene, surface = needs_piece(stage.scene), stage.piece_surface
+        homographies = scene.piece_homographies(conditions, size_px)
         flat = cameras(np.broadcast_to(np.eye(4), (len(homographies), 4, 4)), homographies, size_px, stage)
         fragments = rasterize(surface.vertices, surface.faces, flat, 1e-9)
         coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=stage.device)
         parts = piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
-    return Views(
-        stage, conditions, size_px, size_px, None, None, scene.pictures(conditions, size_px), None, parts, None
-    )
+    return Views(stage, conditions, size_px, size_px, None, None, pictures, None, parts, None)
 
 
 def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:
@@ -299,8 +298,7 @@ def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Fram
 
 def backgrounds(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:
     """What lies behind N views, uint8 N×H×W×3 before exposure; its edge goes on in a lens's margin."""
-    photo_px = scene.settings.camera.photo_px
-    pictures = np.stack([scene.backgrounds.picture(choice, photo_px, size_px) for choice in conditions.pose.background])
+    pictures = scene.pictures(conditions, size_px)
     margin = ((0, 0), (frame.top, frame.bottom), (frame.left, frame.right), (0, 0))
     return np.pad(pictures, margin, mode="edge") if frame.size_px != size_px else pictures
 

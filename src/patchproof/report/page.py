@@ -6,10 +6,12 @@ license beside it: a page that is opened as a file may not load modules or model
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from patchproof.base.claims import Estimate
-from patchproof.report.tables import shown
 
 
 def page(template: str, folder: Path = Path(__file__).parent, **values: object) -> str:
@@ -20,7 +22,7 @@ def page(template: str, folder: Path = Path(__file__).parent, **values: object) 
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=strict
     )
-    environment.filters |= {"percent": _percent, "figure": _figure, "shown": shown}
+    environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
 
@@ -37,3 +39,12 @@ def _percent(share: float | None) -> str:
 
 def _figure(value: float | None, digits: int = 2) -> str:
     return "not measured" if value is None else f"{value:.{digits}f}"
+
+
+def versions_of(libraries: Iterable[str]) -> dict[str, str]:
+    """The versions of those that are installed."""
+    versions = {}
+    for name in libraries:
+        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
+            versions[name] = version(name)
+    return versions

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchproof.report.tables import drawn
+from patchproof.report.drawing import drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

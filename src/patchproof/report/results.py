@@ -7,17 +7,15 @@ from outside of itself. The same input gives the same bytes.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from patchproof.base.output import write_whole
 from patchproof.report.images import data_uri
-from patchproof.report.page import page
-from patchproof.report.tables import Drawing, Table, csv_text, png
+from patchproof.report.page import page, versions_of
+from patchproof.report.tables import Drawing, Table, csv_text, png, shown
 
 _LIBRARIES = ("patchproof", "torch", "numpy")
 
@@ -54,6 +52,7 @@ def write_results(folder: Path, results: Results) -> None:
         pictures=[(drawing, data_uri(content)) for drawing, content in pictures],
         settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
         versions=versions,
+        shown=shown,
     )
     write_whole(folder / f"{results.name}.html", text)
     data = {
@@ -70,12 +69,3 @@ def write_results(folder: Path, results: Results) -> None:
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """The data as a JSON file, written whole."""
     write_whole(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
-
-
-def versions_of(libraries: Iterable[str]) -> dict[str, str]:
-    """The versions of those that are installed."""
-    versions = {}
-    for name in libraries:
-        with suppress(PackageNotFoundError):  # run from a checkout, or another of OpenCV's four wheels
-            versions[name] = version(name)
-    return versions

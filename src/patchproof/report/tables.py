@@ -11,9 +11,10 @@ import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from patchproof.base.claims import Estimate
+from patchproof.report.drawing import drawn
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,19 +92,6 @@ def text_lines(table: Table) -> list[str]:
 def png(drawing: Drawing) -> bytes:
     """The drawing as a PNG file's bytes, without date or version."""
     return drawn(drawing.draw, drawing.size_in, "png", dpi=130, metadata={"Software": None})
-
-
-def drawn(draw: Callable[[Figure], None], size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
-    """A figure as the bytes of a "png" or "svg"; `options` are those of matplotlib's `savefig`."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    # text stays text in the page's own font; ids follow from a fixed salt, so that reports have the same bytes
-    with matplotlib.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "patchproof"}):
-        figure, buffer = Figure(figsize=size_in, layout="constrained"), io.BytesIO()
-        draw(figure)
-        figure.savefig(buffer, format=kind, **options)
-    return buffer.getvalue()
 
 
 def _four(value: Value) -> tuple[Value, ...]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,15 +25,17 @@ from patchproof.render.photograph import shade
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import relit, see
-from patchproof.reprints.tape import Tape, tapes
 from patchproof.scene.backgrounds import load_backgrounds
 from patchproof.scene.conditions import Conditions
+from patchproof.scene.mesh_scene import needs_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Frame, patch_frame
-from patchproof.scene.scene import needs_mesh
+from patchproof.sheets.pages import tiles_of
 from patchproof.sheets.plan_page import Hung, Span
 from patchproof.sheets.template import Template
-from patchproof.sheets.tiles import plan_tiles
+
+if TYPE_CHECKING:
+    from patchproof.scene.tape import Tape
 
 AWAY = 60.0  # of the object's length
 PICTURE_PX = 600  # along the longer side
@@ -56,14 +59,13 @@ def hang(scene: PatchScene, template: Template) -> Hung:
     outline = flat(placement.world(border))
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
-    if template.tiles is not None:
-        for tile in plan_tiles(template.tiles, scene.piece):
-            corners = flat(placement.world(rect_corners(tile.part_mm)))
-            seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
-            names.append((tuple(corners.mean(0)), tile.name))
+    for tile in tiles_of(template, scene.piece):
+        corners = flat(placement.world(rect_corners(tile.part_mm)))
+        seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
+        names.append((tuple(corners.mean(0)), tile.name))
     measured = None
     if not placement.is_flat:
-        laid_out = tapes(scene.mesh, placement, frame.normal)
+        laid_out = scene.tapes()
         measured = _spans(laid_out, flat)
         for tape in laid_out:
             start, end = flat(tape.points_mm[[0, -1]])

@@ -31,11 +31,10 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.coco import PATCH
-from patchproof.reprints.path_traced import photograph_traced
 from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import Conditions, fields_of
+from patchproof.scene.interface import PieceScene, Scene, needs_piece
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import PieceScene, Scene, needs_piece
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import attached_manifest, piece_pixels
@@ -98,9 +97,11 @@ class HungSheet:
 
     def photograph(self, conditions: Conditions) -> bytes:
         """A JPEG file of one view, of the drawn quality, with the camera's focal length in its EXIF data."""
-        if not self.how.path_traced:
-            return take_photo(self.stage, self.piece, conditions)
-        return _stored(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
+        if self.how.path_traced:
+            from patchproof.reprints.path_traced import photograph_traced  # whose renderer is an extra of its own
+
+            return _stored(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
+        return take_photo(self.stage, self.piece, conditions)
 
     def truth(self, conditions: Conditions) -> dict[str, Any]:
         """Where the page's millimeters fall in the photograph of one view, and what it was taken under."""

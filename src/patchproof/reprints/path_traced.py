@@ -37,8 +37,9 @@ from patchproof.render.stage import Stage
 from patchproof.render.views import backgrounds, lens_frame
 from patchproof.reprints.traced_light import lights
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.mesh_scene import MeshScene
-from patchproof.scene.scene import needs_mesh, needs_patch, needs_piece
+from patchproof.scene.interface import needs_piece
+from patchproof.scene.mesh_scene import MeshScene, needs_mesh
+from patchproof.scene.patch_scene import needs_patch
 
 LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
 APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's

@@ -1,10 +1,9 @@
-"""Simulated photographs of a printed sheet on its object, or scans of the uncut page.
+"""Simulated photographs of a printed sheet on its object (scans of the uncut page: see `scan`).
 
 In: a sheet's PDF and the run it was made from. Out: a folder of JPEG photographs of that piece on the object, and
 `truth.json` with each one's homography, marker corners and conditions (see `hung_sheet`), and `coco.json` with boxes of
-object and piece. With `scan` the uncut page is
-scanned flat instead. Conditions come from the reprint stream, which nothing else has seen: one print, photographed in
-one session or in several, each with a place, light and camera of its own and in a folder of its own.
+object and piece. Conditions come from the reprint stream, which nothing else has seen: one print, photographed in one
+session or in several, each with a place, light and camera of its own and in a folder of its own.
 """
 
 from __future__ import annotations
@@ -17,25 +16,15 @@ from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-import torch
-
-from patchproof.base import geometry
-from patchproof.base.color import photo_codes_of
-from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.output import image_bytes, make_folder, new_folder
+from patchproof.base.output import make_folder, new_folder
 from patchproof.base.strict import Refused
 from patchproof.base.workers import Workers, open_workers, result_of, sharing
-from patchproof.channel.printer import Printer
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import Labeled, coco_json
 from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, hang, sheet_scene
 from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import Conditions
-from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.raster import page_pixels
 
-SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
 OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
 
 
@@ -81,7 +70,7 @@ def reprint(
             photos = [Labeled(name, size_px, sheet.outlines(v)) for name, v in zip(names, views, strict=True)]
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
-            return _write_truth(folder, dict(zip(names, map(sheet.truth, views), strict=True)))
+            return write_truth(folder, dict(zip(names, map(sheet.truth, views), strict=True)))
 
 
 @contextmanager
@@ -115,61 +104,7 @@ def _hung_there(pdf: Path, run_folder: Path, how: Hanging) -> HungSheet:
     return hang(pdf, load_run(run_folder), how)
 
 
-def scan(
-    pdf_path: str | Path,
-    run: Run,
-    n: int,
-    out: str | Path,
-    dpi: float,
-    how: Hanging = AS_MADE,
-    *,
-    overwrite: bool = False,
-) -> dict:
-    """Write n flat scans at `dpi` of each uncut page with markers; returns the truth."""
-    (manifest, _), truth = sheet_scene(pdf_path, run), {}
-    printer, px_from_mm = how.printer_for(run.scene), np.diag([*(dpi / MM_PER_INCH * np.array(how.print_scale)), 1.0])
-    with new_folder(out, OWN, overwrite) as folder:
-        for page in sorted({marker.page for marker in manifest.markers}):
-            picture = _scanned(page_pixels(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, printer, how.print_scale)
-            corners = {
-                str(m.id): geometry.apply_homography(px_from_mm, m.corners_mm).tolist()
-                for m in manifest.markers
-                if m.page == page
-            }
-            content = image_bytes(photo_codes_of(picture), "JPEG", {"quality": SCAN_QUALITY})
-            for _ in range(n):
-                name = f"scan_{len(truth) + 1:04d}.jpg"
-                (folder / name).write_bytes(content)
-                truth[name] = {
-                    "homography_px_from_mm": (px_from_mm @ _page_from_design(manifest, page)).tolist(),
-                    "marker_corners_px": corners,
-                    "conditions": {"scan_dpi": dpi, "print_scale": list(how.print_scale)},
-                }
-        return _write_truth(folder, truth)
-
-
-def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scale: tuple[float, float]) -> np.ndarray:
-    """A page's pixels, twice as fine as the scan, as the scanner shows their print: H×W×3 in [0, 1]."""
-    import cv2
-
-    with torch.no_grad():
-        light = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
-    # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
-    (x, y), (width, height) = print_scale, (round(side * dpi / MM_PER_INCH) for side in page_mm)
-    matrix = np.array([[x / 2, 0, x / 4 - 0.5], [0, y / 2, y / 4 - 0.5]])
-    blurred = cv2.GaussianBlur(light, (0, 0), SCAN_BLUR_PX)
-    return cv2.warpAffine(blurred, matrix, (width, height), borderValue=(1.0, 1.0, 1.0))
-
-
-def _page_from_design(manifest: Manifest, page: int) -> np.ndarray:
-    """3×3 from the millimeters of the design's page to a tile's; pages without a tile keep their own."""
-    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
-    if page not in square:
-        return np.eye(3)
-    own = square[manifest.design.page if manifest.design else manifest.tiles[0].page]
-    return square[page] @ np.linalg.inv(own)
-
-
-def _write_truth(folder: Path, truth: dict) -> dict:
+def write_truth(folder: Path, truth: dict) -> dict:
+    """Write truth.json into a folder of photographs or scans; returns the truth."""
     (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     return truth

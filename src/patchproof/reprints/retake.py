@@ -14,6 +14,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,7 +28,7 @@ from patchproof.evidence.reproject import Shot
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import ask
-from patchproof.optimizer.run import Run
+from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import expose
 from patchproof.render.pixels import Shown
 from patchproof.render.views import Views, see
@@ -67,10 +68,11 @@ class Retaken(PatchScene):
         return np.diag([size_px[0], size_px[0], 1.0]) @ self.unit_matrix
 
 
-def retaker(run: Run, manifest: Manifest) -> Callable[[Shot], float | None]:
-    """What forecasts photographs of this sheet; refused where it is another run's. None of a photograph that cannot be
-    taken again.
+def retaker(run: str | Path | Run, manifest: Manifest) -> Callable[[Shot], float | None]:
+    """What forecasts photographs of this sheet, by its run or that one's folder; refused where it is another run's.
+    None of a photograph that cannot be taken again.
     """
+    run = run if isinstance(run, Run) else load_run(run)
     if manifest.sheet_id != run.scene.sheet_id:
         raise Refused(f"the run of sheet {manifest.sheet_id}", f"that of {run.scene.sheet_id}", "name the run it is of")
     problem = set_problem(run.scene)

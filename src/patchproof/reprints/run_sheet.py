@@ -3,31 +3,24 @@ others.
 
 In: a finished run. Out: SHEET.pdf and SHEET.json. The piece is the same on every template that has room for it, but for
 the ids of its markers. The last page of a template with `plan_page` says where the piece goes and how to photograph it.
-Before there is a run, `blank_page` writes the pages of blanks, charts and boards.
+Pages that need no run: see `sheets.blank`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from patchproof.base.strict import Refused
 from patchproof.optimizer.run import Run
 from patchproof.reprints.hung import hang
 from patchproof.reprints.shots import shot_sections
-from patchproof.reprints.tape import tapes
-from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import patch_frame
-from patchproof.scene.scene import PieceScene, needs_patch, needs_piece
-from patchproof.sheets.blank import blank_sheet, chart_sheet
-from patchproof.sheets.board import board_sheet, is_board
+from patchproof.scene.interface import PieceScene, needs_piece
+from patchproof.scene.patch_scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
-from patchproof.sheets.several import write_several
 from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet
 
@@ -38,27 +31,15 @@ def sheet_of(
     """Write the run's sheet; `control` is mean, gray, noise, shuffled or blank, `template` a name or file in place of
     the scene's.
     """
-    content, scene = _content(run, template, control)
+    content, scene = content_of(run, template, control)
     page = load_template(scene.settings.sheet.template)
-    plan = _plan(scene, page, content) if page.plan_page else None
+    plan = plan_of(scene, page, content) if page.plan_page else None
     if control == "blank":
         content = replace(content, design_srgb8=None)
     return write_sheet(pdf_path, page, content, plan, copies)
 
 
-def sheet_of_several(
-    runs: Sequence[Run], pdf_path: str | Path, *, template: str | None = None, control: str | None = None
-) -> list[Manifest]:
-    """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
-    another is named.
-    """
-    name = template or runs[0].scene.settings.sheet.template
-    page, made = load_template(name), [_content(run, name, control) for run in runs]
-    plans = [_plan(scene, page, content) for content, scene in made] if page.plan_page else []
-    return write_several(pdf_path, page, [content for content, _ in made], plans)
-
-
-def _content(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
+def content_of(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
     """The run's design (or a control) in its piece on that template, with the promise made for that piece."""
     own = needs_piece(run.scene)
     scene = own if template is None else own.with_template(template)
@@ -73,7 +54,7 @@ def _content(run: Run, template: str | None, control: str | None) -> tuple[Print
     return PrintedPiece(piece, scene.sheet_id, "design", run.design, run.promise, settings, bent), scene
 
 
-def _plan(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
+def plan_of(scene: PieceScene, template: Template, content: PrintedPiece) -> PlanPage | None:
     """Where the piece goes, whose design it is if not ours and, for a promise, how to photograph it; None where none of
     it can be said.
     """
@@ -114,21 +95,9 @@ def _edges(hung: Hung) -> str:
 
 def _wrapped(scene: PatchScene) -> str:
     """How bent paper goes on the object, and what a tape measure says beside it."""
-    laid_out = tapes(scene.mesh, scene.placement, patch_frame(scene.mesh, scene.settings.patch).normal)
+    laid_out = scene.tapes()
     text = "Wrap the piece round the object from its middle outwards, its top edge up, without folds or air under it."
     if not laid_out:
         return text
     lengths = ", ".join(f"{tape.edge} {tape.length_mm:.0f} mm {tape.end}" for tape in laid_out)
     return f"{text} Lay a tape on the surface, straight on from the middle of each of the piece's edges: {lengths}."
-
-
-def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:
-    """Write a page that needs no run: of a template with a [blank] or a [board] table, or of a chart alone."""
-    if control is not None:
-        raise Refused(f"the run whose {control} control belongs on the page", "none", "name the run")
-    if template is None:
-        raise Refused("a run, or the template of a blank page", "neither", "name a run, or --template blank_a4")
-    if is_board(template):
-        return board_sheet(template, pdf_path)
-    page = load_template(template)
-    return chart_sheet(page, pdf_path) if page.piece is None else blank_sheet(template, pdf_path)

@@ -17,32 +17,32 @@ import numpy as np
 from patchproof.base.settings import PatchSettings
 from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.bend import place_bent
-from patchproof.scene.placement import WARN_GAP_SHARE, WARN_OVERHANG_SHARE, Frame, patch_frame, place_card, side_frame
+from patchproof.scene.placement import WARN_GAP_SHARE, WARN_OVERHANG_SHARE, Frame, Lay, patch_frame, side_frame
 
 _STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
 _TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes some 5 and 200 ms
 _HALVINGS = 5  # to 3 % of the piece that was asked for
 
 
-def advice(mesh: Mesh, patch: PatchSettings, least_mm: float) -> str:
-    """What would lie well instead of a piece that was refused, as the keys of a scene file say it; empty where nothing
-    was found. Places are tried on the same side from the nearest on, then in the middles of the others.
+def advice(mesh: Mesh, patch: PatchSettings, lay: Lay, least_mm: float) -> str:
+    """What would lie well instead of a piece that was refused, laid as that was, as the keys of a scene file say it;
+    empty where nothing was found. Places are tried on the same side from the nearest on, then in the middles of the
+    others.
     """
-    frame, size_mm, how = patch_frame(mesh, patch), patch.size_mm, (patch.spin_deg, patch.bend)
+    frame, size_mm, how = patch_frame(mesh, patch), patch.size_mm, (patch.spin_deg, lay)
     width, height = np.minimum(size_mm, frame.extent_mm).tolist()
     smaller = largest((width, height), lambda trial: lies_well(mesh, frame, trial, *how), least_mm)
-    place = _nearest(mesh, patch)
+    place = _nearest(mesh, patch, lay)
     found = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
     found += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
     return "".join(f"; {text}" for text in found)
 
 
-def _nearest(mesh: Mesh, patch: PatchSettings) -> str | None:
+def _nearest(mesh: Mesh, patch: PatchSettings, lay: Lay) -> str | None:
     """The nearest place where the piece lies well, as a scene file's key says it."""
 
     def fits(frame: Frame) -> bool:
-        return lies_well(mesh, frame, patch.size_mm, patch.spin_deg, patch.bend)
+        return lies_well(mesh, frame, patch.size_mm, patch.spin_deg, lay)
 
     middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
     step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
@@ -57,10 +57,10 @@ def _nearest(mesh: Mesh, patch: PatchSettings) -> str | None:
     return None if side is None else f'side = "{side}"'
 
 
-def lies_well(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float, bend: bool) -> bool:
+def lies_well(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float, lay: Lay) -> bool:
     """Whether a piece lies there without a warning."""
     try:
-        laid = (place_bent if bend else place_card)(mesh, frame, size_mm, spin_deg)
+        laid = lay(mesh, frame, size_mm, spin_deg)
     except Refused:
         return False
     return laid.gap_mm <= WARN_GAP_SHARE * min(size_mm) and laid.overhang_share <= WARN_OVERHANG_SHARE

@@ -42,14 +42,8 @@ class FlatScene(PieceScene):
         return drawn if per_session == 1 else replace(drawn, pose=super().draw(stream, n, seed, start).pose)
 
     @abstractmethod
-    def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
-        """N×H×W×3 uint8 sRGB: what the views show without the new piece, before exposure and the camera's effects."""
-
-    @abstractmethod
     def piece_light(self, conditions: Conditions) -> np.ndarray:
-        """N×3×6: linear light of white paper is coefficients · [1, u, v, u², uv, v²], u and v from -1 to 1 over the
-        piece, right and down.
-        """
+        """As in `PieceScene.piece_light`: what was seen on the pictures' own paper."""
 
     def lies(self) -> dict[str, Any]:
         """As in `Scene.lies`: in a plane."""

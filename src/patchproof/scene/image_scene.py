@@ -23,16 +23,17 @@ from typing import Self
 import numpy as np
 
 from patchproof.base.input import is_file
-from patchproof.base.settings import SceneSettings, identifying
+from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, expand
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
+from patchproof.scene.interface import SceneSource
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
-from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id
+from patchproof.sheets.pages import refuse_larger_than_page
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import load_template
-from patchproof.sheets.tiles import refuse_larger_than_page
 
 SPLIT_FROM = 2
 FEW = 20  # images, of which half say little of others
@@ -101,16 +102,17 @@ class ImageScene(flat.FlatScene):
         return light
 
 
-def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> ImageScene:
+def build(source: SceneSource) -> ImageScene:
     """The scene of a folder of images and their labels; images that cannot be read are warned about.
 
     The target's label counts as an image's where it is the CSV's own text, one of its comma-separated names, or the
     same index, whatever the case; so do the labels in `target.accept`.
     """
+    settings, base = source.settings, source.base
     flat.refuse_bending(settings)
     files = _files_of_class(settings, base)
     images, unread = _read_all(files, settings.camera.photo_px)
-    identity = identity or sheet_id(identifying(settings), seed)
+    identity = source.sheet_id({})
     piece = _piece(settings, identity)
     warnings = [f"{name} is left out: it cannot be read" for name in unread]
     if len(images) < SPLIT_FROM:
@@ -118,7 +120,7 @@ def load_image_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     elif len(images) < FEW:
         promised = len(images) - len(images) // 2
         warnings.append(f"the promise is made on {promised} images, and says little of others: give {FEW} or more")
-    return ImageScene(settings, base, seed, identity, piece, images, notes=tuple(warnings))
+    return ImageScene(settings, base, source.seed, identity, piece, images, notes=tuple(warnings))
 
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:

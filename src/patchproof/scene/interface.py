@@ -1,8 +1,9 @@
 """What every scene answers, whatever it is made of, and what those with a printed piece answer beside that.
 
-A scene is a mesh with a piece on it (`PatchScene`) or with a texture of its own that may change (`TextureScene`), or
-pictures: photographs of the object (`PhotoScene`) or a folder of images (`ImageScene`). Who needs a piece or a mesh
-asks `scene.needs_piece` or `scene.needs_mesh`, which refuse where there is none. N is the number of conditions.
+A scene is a mesh with a piece on it (`PatchScene`; bent: `BentScene`), one whose piece has no place yet (`OpenScene`),
+one with a texture of its own that may change (`TextureScene`), or pictures: photographs of the object (`PhotoScene`) or
+a folder of images (`ImageScene`). Each has a module of its own, whose `build` makes it of a `SceneSource`; `scene`
+knows which. Who needs a piece asks `needs_piece`, which refuses where there is none. N is the number of conditions.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -21,11 +22,30 @@ from patchproof.base.strict import Refused
 from patchproof.channel.effects import Effect
 from patchproof.channel.lens import Camera
 from patchproof.scene.conditions import Conditions, Stream, draw
-from patchproof.scene.placement import Placement
 from patchproof.scene.resolution import design_grid
 from patchproof.sheets.piece import Piece, sheet_id
 
+if TYPE_CHECKING:
+    from patchproof.scene.texture import Canvas
+
 SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """What a scene is built from: its settings, the folder that paths in them are relative to, and its seed; where
+    there are such, the sheet id that it was printed with, and the mesh that was given in Python.
+    """
+
+    settings: SceneSettings
+    base: Path
+    seed: int
+    printed_id: str | None = None
+    given_glb: bytes | None = None
+
+    def sheet_id(self, known: Mapping[str, str]) -> str:
+        """The one that it was printed with, else that of its settings, seed and of what is `known` beside them."""
+        return self.printed_id or sheet_id(identifying(self.settings) | dict(known), self.seed)
 
 
 @dataclass(frozen=True)
@@ -54,6 +74,7 @@ class Scene(ABC):
 
     HAS_OBJECT: ClassVar[bool] = False  # a surface of its own before what is behind it
     HAS_PIECE: ClassVar[bool] = False
+    HAS_PLACE: ClassVar[bool] = True  # for what is optimized; False where it has to be searched for
     EFFECT_TABLES: ClassVar[tuple[str, ...]] = ("printer", "camera")  # of the settings, whose effects show in it
     PARTS: ClassVar[tuple[Part, ...]] = ()
     OMITTED: ClassVar[tuple[str, ...]] = ()  # what is not modeled
@@ -75,6 +96,10 @@ class Scene(ABC):
         """The same at its middle in each of `SCALE_VIEWS` views that face it: the mean of all directions, or along the
         `shorter`, foreshortened one.
         """
+
+    @abstractmethod
+    def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """N×H×W×3 uint8 sRGB: what the views show behind object and piece, before exposure and the camera's effects."""
 
     def boxes(self, conditions: Conditions) -> np.ndarray | None:
         """N×4 (left, top, right, bottom) of the object in each photograph's centered square, as shares of its side;
@@ -141,12 +166,10 @@ class Scene(ABC):
         """
         return np.zeros(len(conditions)), np.zeros(len(conditions))
 
-    def other_surface(self) -> tuple[Placement | None, str | None]:
-        """(where the piece would lie with `patch.bend` the other way round, what that would be like in a sentence).
-
-        No placement where it is refused or would be the same card; no sentence where there is no surface to lie on.
-        """
-        return None, None
+    def own_texture(self) -> Canvas:
+        """The object's own texture, where that is what may change; refused of any other scene."""
+        refuse_without_place(self)
+        raise Refused("a scene of the object's own texture", "one of a patch", 'set patch.kind = "texture"')
 
     def record(self) -> dict[str, Any] | None:
         """What run.json says of the piece and how well it fits; None where there is none."""
@@ -195,6 +218,12 @@ class PieceScene(Scene):
         """
         return apply_homography(self.piece_homographies(conditions, self.photo_px)[0], piece_mm)
 
+    def piece_light(self, conditions: Conditions) -> np.ndarray | None:
+        """N×3×6: linear light of white paper is coefficients · [1, u, v, u², uv, v²], u and v from -1 to 1 over the
+        piece, right and down; None where it is the scene's lamps that light it.
+        """
+        return None
+
     @property
     def is_flat(self) -> bool:
         """Whether piece and lens are flat, so that photographs are homographies of the sheet."""
@@ -235,3 +264,18 @@ class PieceScene(Scene):
         """What run.json says of the piece."""
         piece = self.piece
         return {"piece_mm": piece.size_mm, "marker_mm": piece.marker_mm, "unreadable_share": self.unreadable_share}
+
+
+def needs_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:
+    """The scene as one with a printed piece; refused where there is only the object's own texture."""
+    if isinstance(scene, PieceScene):
+        return scene
+    refuse_without_place(scene)
+    raise Refused("a run of a patch", "one of the object's own texture", do)
+
+
+def refuse_without_place(scene: Scene) -> None:
+    """Refuse a scene whose piece has to be placed first."""
+    if not scene.HAS_PLACE:
+        do = "choose one with choose_place, or give one"
+        raise Refused("a scene whose piece has its place", 'patch.place = "auto"', do)

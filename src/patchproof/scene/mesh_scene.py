@@ -1,11 +1,12 @@
 """An object with a mesh and what is behind it, ready to be photographed: the camera of every drawn view.
 
-By itself a `MeshScene` is the bare object. In a `TextureScene` the object's own texture is what changes; a piece hangs
-on it in a `PatchScene` (see `patch_scene`).
+By itself a `MeshScene` is the bare object, which other modules put a piece on (`patch_scene`, `bent_scene`), search for
+the piece's place (`open_scene`) or paint (`texture_scene`).
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,16 +16,16 @@ import numpy as np
 
 from patchproof.base import geometry
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused
+from patchproof.base.strict import Refused, expand
 from patchproof.channel import lens
 from patchproof.channel.boxes import box_of, outermost
 from patchproof.channel.effects import Pose
+from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.backgrounds import Backgrounds
+from patchproof.scene.backgrounds import Backgrounds, load_backgrounds
 from patchproof.scene.conditions import Conditions, Stream
-from patchproof.scene.interface import SCALE_VIEWS, Part, Scene
+from patchproof.scene.interface import SCALE_VIEWS, Part, Scene, SceneSource
 from patchproof.scene.placement import Frame, view_frame
-from patchproof.scene.texture import Canvas
 
 CLEARANCE = 5e-3  # of the object's length between it and a camera: what is nearer than the near plane would vanish
 
@@ -115,6 +116,11 @@ class MeshScene(Scene):
             return lens.matrix_px(self.camera, size_px)
         return geometry.intrinsics(self.settings.view.fov_deg, size_px)
 
+    def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
+        """As in `Scene.pictures`: the backgrounds."""
+        choices = conditions.pose.background
+        return np.stack([self.backgrounds.picture(choice, self.photo_px, size_px) for choice in choices])
+
     def boxes(self, conditions: Conditions) -> np.ndarray:
         """As in `Scene.boxes`, of the whole mesh."""
         side_px = min(self.photo_px)
@@ -143,12 +149,35 @@ class MeshScene(Scene):
         return self.matrix_px(size_px)[0, 0] / self.draw("select", SCALE_VIEWS, 0).pose.distance_mm
 
 
-@dataclass(frozen=True)
-class TextureScene(MeshScene):
-    """An object some of whose own texels may change."""
+def needs_mesh(scene: Scene, expected: str = "a scene with a mesh", do: str = "name object.mesh") -> MeshScene:
+    """The scene as one with a mesh; refused of pictures."""
+    if isinstance(scene, MeshScene):
+        return scene
+    raise Refused(expected, "one of pictures", do)
 
-    canvas: Canvas
-    LEARNED = True
+
+def load_bare(source: SceneSource) -> MeshScene:
+    """The object of a scene's settings, with nothing on it."""
+    settings, base, given_glb = source.settings, source.base, source.given_glb
+    settings_object, camera = settings.object, settings.camera
+    if settings_object.mesh is None or settings_object.length_mm is None:
+        raise ValueError("a scene with a mesh names it")
+    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
+    backgrounds = load_backgrounds(settings.background, base)
+    known = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
+    return MeshScene(
+        settings,
+        base,
+        source.seed,
+        source.sheet_id(known),
+        mesh,
+        view_frame(mesh, settings),
+        backgrounds,
+        notes=(*mesh.warnings, *backgrounds.notes),
+        known=known,
+        camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
+        given_glb=given_glb,
+    )
 
 
 def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) -> MeshScene:

@@ -1,36 +1,31 @@
-"""A mesh with a piece on it, and the door to all scenes with a mesh.
+"""A mesh with a piece on it, by itself a flat card (bent: see `bent_scene`).
 
 In: settings. Out: a `PatchScene`, which knows its sheet id (a hash of settings and seed, fixed before optimizing), the
-layout of the printed piece (the design and its markers, whose size follows from the views) and where the piece lies;
-an `OpenScene`, whose piece has no place yet; or a `TextureScene`, where the object's own texture is what changes.
+layout of the printed piece (the design and its markers, whose size follows from the views) and where the piece lies.
 """
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from patchproof.base import geometry
-from patchproof.base.settings import SceneSettings, SearchSettings, identifying
-from patchproof.base.strict import Refused, Side, expand
+from patchproof.base.strict import Refused, Side
 from patchproof.channel import lens
-from patchproof.mesh.load_mesh import load_mesh
-from patchproof.scene.backgrounds import load_backgrounds
-from patchproof.scene.bend import place_bent
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.fitting import advice
-from patchproof.scene.interface import SCALE_VIEWS, PieceScene
-from patchproof.scene.mesh_scene import MeshScene, TextureScene, camera_poses
-from patchproof.scene.placement import Placement, patch_frame, place_card, view_frame
+from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSource, refuse_without_place
+from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
+from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
-from patchproof.scene.texture import texture_canvas
-from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, sheet_id, smallest_piece_mm
+from patchproof.sheets.pages import refuse_larger_than_page
+from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import load_template
-from patchproof.sheets.tiles import refuse_larger_than_page
+
+if TYPE_CHECKING:
+    from patchproof.scene.tape import Tape
 
 At = tuple[float, float, float] | Side  # a point of the scene in millimeters, or the middle of a side
 
@@ -42,6 +37,14 @@ class PatchScene(PieceScene, MeshScene):
     placement: Placement
     unreadable: float
     EFFECT_TABLES = ("light", "printer", "camera")
+    LAY: ClassVar[Lay] = staticmethod(place_card)  # how the piece lies on the surface
+
+    @classmethod
+    def on(cls, bare: MeshScene) -> Self:
+        """The bare object with its piece at the settings' place; refused where it cannot lie there."""
+        piece, placement, unreadable, notes = _hang(bare, cls.LAY)
+        own = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
+        return cls(**vars(bare) | own)
 
     def lies(self) -> dict[str, Any]:
         """As in `Scene.lies`."""
@@ -75,7 +78,7 @@ class PatchScene(PieceScene, MeshScene):
         return self.placement.is_flat and not (self.camera is not None and self.camera.bends)
 
     def _laid_out(self) -> Self:
-        piece, placement, unreadable, notes = _hang(self)
+        piece, placement, unreadable, notes = _hang(self, self.LAY)
         return replace(self, piece=piece, placement=placement, unreadable=unreadable, notes=notes)
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
@@ -103,6 +106,10 @@ class PatchScene(PieceScene, MeshScene):
         poses = self.camera_from_world(conditions) @ self.placement.world_from_piece
         return np.array([geometry.view_angles(pose, middle)[0] for pose in poses])
 
+    def tapes(self) -> tuple[Tape, ...]:
+        """What a tape measure says beside the piece, as one faces its side; of a card, whose edges do, nothing."""
+        return ()
+
     def white_light(self, conditions: Conditions) -> np.ndarray:
         """N: the light on white paper at the piece's middle, without lamps."""
         light = conditions.light
@@ -120,92 +127,31 @@ class PatchScene(PieceScene, MeshScene):
         frame = placement.world_from_piece @ about
         return replace(self, placement=replace(placement, vertices_mm=vertices, world_from_piece=frame))
 
-    def other_surface(self) -> tuple[Placement | None, str | None]:
-        """As in `Scene.other_surface`."""
-        patch, placement = self.settings.patch, self.placement
-        place, flag = (place_card, "false") if patch.bend else (place_bent, "true")
-        try:
-            other = place(self.mesh, patch_frame(self.mesh, patch), self.piece.size_mm, patch.spin_deg)
-        except Refused as refused:
-            return None, f"bend = {flag} is refused. {refused}"
-        if other.family == placement.family:
-            return None, f"bend = {flag} would be a card, too: leave bend out"
-        gaps = f"{other.gap_mean_mm:.2f} mm off the surface on average, here {placement.gap_mean_mm:.2f} mm"
-        return other, f"bend = {flag} would be a {other.family} (stretch {other.stretch:.2%}), {gaps}"
+
+def build(source: SceneSource) -> PatchScene:
+    """The scene of settings that give a flat card its place."""
+    return PatchScene.on(load_bare(source))
 
 
-@dataclass(frozen=True)
-class OpenScene(MeshScene):
-    """An object whose piece has no place yet (`patch.place = "auto"`); by itself, the bare object."""
-
-    def description(self) -> str:
-        """As in `Scene.description`."""
-        return f'{super().description()} with patch.place = "auto"'
-
-    def given(self, at: At, spin_deg: float) -> SceneSettings:
-        """The settings of a scene file that gives this place itself and keeps the views."""
-        where = {"side": at} if isinstance(at, str) else {"at_mm": at}
-        patch = {"place": "given", "search": SearchSettings(), "spin_deg": spin_deg} | where
-        return self.settings.changed(patch=patch, view={"front": self.settings.patch.side})
-
-    def at(self, at: At, spin_deg: float) -> PatchScene:
-        """The scene with its piece at a place, its views as they were; refused where the piece cannot hang there. It is
-        the one of a file that gives this place itself.
-        """
-        settings = self.given(at, spin_deg)
-        identity = sheet_id(identifying(settings) | dict(self.known), self.seed)
-        return _with_piece(replace(self, settings=settings, sheet_id=identity))
+def needs_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") -> PatchScene:
+    """The scene as one with a piece that lies on a mesh; refused of any other."""
+    if isinstance(scene, PatchScene):
+        return scene
+    refuse_without_place(scene)
+    raise Refused(expected, scene.description(), 'name object.mesh, and leave patch.kind out or "patch"')
 
 
-def load_mesh_scene(
-    settings: SceneSettings, base: Path, seed: int, identity: str | None = None, given_glb: bytes | None = None
-) -> TextureScene | PatchScene | OpenScene:
-    """The scene with its mesh, piece (or canvas) and backgrounds; paths are relative to `base`."""
-    settings_object, camera = settings.object, settings.camera
-    if settings_object.mesh is None or settings_object.length_mm is None:
-        raise ValueError("a scene with a mesh names it")
-    mesh = load_mesh(expand(settings_object.mesh, base), settings_object.length_mm, settings_object.up, given_glb)
-    backgrounds = load_backgrounds(settings.background, base)
-    known = {} if given_glb is None else {"mesh": hashlib.sha256(given_glb).hexdigest()}
-    bare = MeshScene(
-        settings,
-        base,
-        seed,
-        identity or sheet_id(identifying(settings) | known, seed),
-        mesh,
-        view_frame(mesh, settings),
-        backgrounds,
-        notes=(*mesh.warnings, *backgrounds.notes),
-        known=known,
-        camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
-        given_glb=given_glb,
-    )
-    if settings.patch.kind != "patch":
-        canvas = texture_canvas(mesh, settings.patch, base)
-        own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*bare.notes, *canvas.warnings)}
-        return TextureScene(**vars(bare) | own)
-    if settings.patch.place == "auto":
-        return OpenScene(**vars(bare))
-    return _with_piece(bare)
-
-
-def _with_piece(scene: MeshScene) -> PatchScene:
-    piece, placement, unreadable, notes = _hang(scene)
-    own = {"piece": piece, "placement": placement, "unreadable": unreadable, "notes": notes}
-    return PatchScene(**vars(scene) | own)
-
-
-def _hang(scene: MeshScene) -> tuple[Piece, Placement, float, tuple[str, ...]]:
+def _hang(scene: MeshScene, lay: Lay) -> tuple[Piece, Placement, float, tuple[str, ...]]:
     """The piece with markers as large as the views need, where it lies, the share of views in which they are too small,
     and what a reader should know.
     """
     settings, mesh = scene.settings, scene.mesh
     frame = patch_frame(mesh, settings.patch)
-    patch, place = settings.patch, place_bent if settings.patch.bend else place_card
+    patch = settings.patch
     try:
-        placement = place(mesh, frame, patch.size_mm, patch.spin_deg)
+        placement = lay(mesh, frame, patch.size_mm, patch.spin_deg)
     except Refused as refused:
-        raise refused.advised(advice(mesh, patch, smallest_piece_mm())) from refused
+        raise refused.advised(advice(mesh, patch, lay, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")

@@ -24,7 +24,7 @@ from typing import Self
 import numpy as np
 
 from patchproof.base.input import is_file, is_folder
-from patchproof.base.settings import SceneSettings, identifying
+from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, expand
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
@@ -35,14 +35,14 @@ from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.interface import Part
+from patchproof.scene.interface import Part, SceneSource
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
-from patchproof.sheets.piece import Piece, sheet_id, with_ids
+from patchproof.sheets.pages import refuse_larger_than_page
+from patchproof.sheets.piece import Piece, with_ids
 from patchproof.sheets.rects import holds, moved
 from patchproof.sheets.template import load_template
-from patchproof.sheets.tiles import refuse_larger_than_page
 
 LEAST_PHOTOS = 6
 _MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small
@@ -133,11 +133,12 @@ class PhotoScene(flat.FlatScene):
         return [flat.turned(roll, zoom, shift, middle) for roll, zoom, shift in views]
 
 
-def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: str | None = None) -> PhotoScene:
+def build(source: SceneSource) -> PhotoScene:
     """The scene of a folder of photographs; those that cannot be used are warned about, fewer than six are refused.
 
     The scene's settings have the blank's `width_mm` and `height_mm`, also where the file gave none.
     """
+    settings, base = source.settings, source.base
     flat.refuse_bending(settings)
     photos, sheet = settings.object.photos, settings.object.sheet
     if photos is None or sheet is None:
@@ -147,7 +148,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
     settings = _with_size(settings, blank.size_mm)
     folder = Path(expand(photos, base))
     known = {"blank": manifest.sheet_id, "photos": _digest(folder)}
-    identity = identity or sheet_id(identifying(settings) | known, seed)
+    identity = replace(source, settings=settings).sheet_id(known)
     piece = with_ids(blank, identity, "design")
     refuse_larger_than_page(load_template(settings.sheet.template), piece)
     base_photos, skipped = _see_all(folder, manifest, piece, settings.camera.photo_px)
@@ -157,7 +158,7 @@ def load_photo_scene(settings: SceneSettings, base: Path, seed: int, identity: s
             warnings.append(
                 f"the light on the paper in {photo.name} is uneven: {photo.light.unevenness:.0%} is unexplained"
             )
-    return PhotoScene(settings, base, seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
+    return PhotoScene(settings, base, source.seed, identity, piece, base_photos, notes=tuple(warnings), known=known)
 
 
 def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:

@@ -7,6 +7,7 @@ card wider or higher than the object's side, or with nothing under it, is refuse
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,6 +91,10 @@ class Frame:
     normal: np.ndarray
     origin_mm: np.ndarray
     extent_mm: tuple[float, float]  # the object's size along right and up
+
+
+# lays a piece of that size and spin (degrees) on a mesh at a frame's origin; refuses in one sentence
+Lay = Callable[[Mesh, Frame, tuple[float, float], float], Placement]
 
 
 def patch_frame(mesh: Mesh, patch: PatchSettings) -> Frame:

@@ -20,7 +20,8 @@ from patchproof.base.strict import Refused, Side
 from patchproof.mesh.surface import Chart, crop, heights, net
 from patchproof.scene.bend import place_bent
 from patchproof.scene.mesh_scene import camera_poses
-from patchproof.scene.patch_scene import At, OpenScene
+from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.patch_scene import At
 from patchproof.scene.placement import (
     WARN_GAP_SHARE,
     WARN_OVERHANG_SHARE,

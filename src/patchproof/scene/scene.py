@@ -1,26 +1,31 @@
-"""The kinds of scene behind one door.
+"""One door to scenes of all kinds: from a scene file, or settings made in Python.
 
-In: a scene file, or settings made in Python. Out: a `Scene`, of a mesh, of photographs or of images. Whoever needs a
-piece, a mesh or pictures narrows it here and nowhere else.
+Each kind is built by a module of its own, which is imported when a scene is of that kind and not before: a card on a
+mesh needs nothing of textures, bent paper, photographs or images.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
-from typing import Any
-
-import trimesh
+from typing import TYPE_CHECKING, Any
 
 from patchproof.base.settings import SceneSettings, load_scene_settings
-from patchproof.base.strict import Refused, validated
-from patchproof.mesh.load_mesh import glb_of
-from patchproof.scene.flat import FlatScene
-from patchproof.scene.image_scene import load_image_scene
-from patchproof.scene.interface import PieceScene as PieceScene
-from patchproof.scene.interface import Scene as Scene
-from patchproof.scene.mesh_scene import MeshScene, TextureScene
-from patchproof.scene.patch_scene import OpenScene, PatchScene, load_mesh_scene
-from patchproof.scene.photo_scene import load_photo_scene
+from patchproof.base.strict import validated
+from patchproof.scene.interface import Scene, SceneSource
+
+if TYPE_CHECKING:
+    import trimesh
+
+# the module of each kind, whose `build` makes a scene of a `SceneSource`
+KINDS = {
+    "card": "patch_scene",
+    "bent": "bent_scene",
+    "open": "open_scene",
+    "texture": "texture_scene",
+    "photographs": "photo_scene",
+    "images": "image_scene",
+}
 
 
 def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:
@@ -43,73 +48,31 @@ def make_scene(
     """
     if not isinstance(settings, SceneSettings):
         settings = validated(SceneSettings, settings, "the scene's settings")
-    return build_scene(settings, Path(base), seed, given_glb=None if mesh is None else glb_of(mesh))
+    glb: Any = None if mesh is None else mesh.export(file_type="glb")
+    return build_scene(settings, Path(base), seed, given_glb=glb)
 
 
 def build_scene(
     settings: SceneSettings,
     base: Path,
     seed: int | None = None,
-    identity: str | None = None,
+    printed_id: str | None = None,
     given_glb: bytes | None = None,
 ) -> Scene:
-    """The scene of settings whose paths are relative to `base`; `identity` is the sheet id that it was printed with."""
+    """The scene of settings whose paths are relative to `base`; `printed_id` is the sheet id of its print, if any."""
     seed = settings.optimize.seed if seed is None else seed
+    module = import_module(f"patchproof.scene.{KINDS[kind_of(settings)]}")
+    return module.build(SceneSource(settings, base, seed, printed_id, given_glb))
+
+
+def kind_of(settings: SceneSettings) -> str:
+    """Which of `KINDS` the settings state."""
     if settings.object.photos is not None:
-        return load_photo_scene(settings, base, seed, identity)
+        return "photographs"
     if settings.object.images is not None:
-        return load_image_scene(settings, base, seed, identity)
-    return load_mesh_scene(settings, base, seed, identity, given_glb)
-
-
-def needs_piece(scene: Scene, do: str = "take object.glb and textures from the run") -> PieceScene:
-    """The scene as one with a printed piece; refused where there is only the object's own texture."""
-    if isinstance(scene, PieceScene):
-        return scene
-    _refuse_open(scene)
-    raise Refused("a run of a patch", "one of the object's own texture", do)
-
-
-def needs_texture(scene: Scene) -> TextureScene:
-    """The scene as one whose object's own texture may change; refused of any other."""
-    if isinstance(scene, TextureScene):
-        return scene
-    _refuse_open(scene)
-    raise Refused("a scene of the object's own texture", "one of a patch", 'set patch.kind = "texture"')
-
-
-def needs_mesh(scene: Scene, expected: str = "a scene with a mesh", do: str = "name object.mesh") -> MeshScene:
-    """The scene as one with a mesh; refused of pictures."""
-    if isinstance(scene, MeshScene):
-        return scene
-    raise Refused(expected, "one of pictures", do)
-
-
-def needs_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") -> PatchScene:
-    """The scene as one with a piece that lies on a mesh; refused of any other."""
-    if isinstance(scene, PatchScene):
-        return scene
-    _refuse_open(scene)
-    raise Refused(expected, scene.description(), 'name object.mesh, and leave patch.kind out or "patch"')
-
-
-def needs_open(scene: Scene) -> OpenScene:
-    """The scene as one whose piece has no place yet; refused of any other."""
-    if isinstance(scene, OpenScene):
-        return scene
-    raise Refused(
-        'a scene with patch.place = "auto"', scene.description(), "ask for it, or use the place that is given"
-    )
-
-
-def needs_pictures(scene: Scene) -> FlatScene:
-    """The scene as one of pictures; refused where there is a mesh."""
-    if isinstance(scene, FlatScene):
-        return scene
-    raise Refused("a scene of pictures", "one with a mesh", "name object.photos or object.images")
-
-
-def _refuse_open(scene: Scene) -> None:
-    if isinstance(scene, OpenScene):
-        do = "choose one with choose_place, or give one"
-        raise Refused("a scene whose piece has its place", 'patch.place = "auto"', do)
+        return "images"
+    if settings.patch.kind != "patch":
+        return "texture"
+    if settings.patch.place == "auto":
+        return "open"
+    return "bent" if settings.patch.bend else "card"

@@ -4,7 +4,8 @@ In: a template. Out: a PDF and its JSON; the sheet id is a hash of the template,
 A template with a [blank] table has a piece with markers alone: photographs of the object with it show where a design of
 the same size would lie and what light falls on it, all that a photographed scene needs. Its cut line and markers say
 all about the piece: `blank_piece` reads it back. A template without a place for a piece is a chart, printed to learn
-what a printer does to colors; nothing is cut, but its `cut_mm` is what photographs are to show.
+what a printer does to colors; nothing is cut, but its `cut_mm` is what photographs are to show. `blank_page` takes the
+templates of boards, too (see `board`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from patchproof.base.strict import Refused
+from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.page import lay_out_parts
@@ -30,6 +32,18 @@ from patchproof.sheets.template import Template, load_template, template_names
 from patchproof.sheets.write import write_page, write_sheet
 
 BLANK, CHART = "blank", "chart"
+
+
+def blank_page(pdf_path: str | Path, *, template: str | None, control: str | None = None) -> Manifest:
+    """Write a page that needs no run: of a template with a [blank] or a [board] table, or of a chart alone."""
+    if control is not None:
+        raise Refused(f"the run whose {control} control belongs on the page", "none", "name the run")
+    if template is None:
+        raise Refused("a run, or the template of a blank page", "neither", "name a run, or --template blank_a4")
+    if is_board(template):
+        return board_sheet(template, pdf_path)
+    page = load_template(template)
+    return chart_sheet(page, pdf_path) if page.piece is None else blank_sheet(template, pdf_path)
 
 
 def blank_sheet(template: str | Path, pdf_path: str | Path) -> Manifest:

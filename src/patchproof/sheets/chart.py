@@ -24,16 +24,36 @@ DUPLICATES: tuple[Srgb, ...] = (CORNERS[0], CORNERS[7], GRAYS[1], GRAYS[4], (1.0
 # with x or y low (below 0.1 on 12 × 6, at most 0.15). Other grids take the first.
 ORDERS = {(12, 6): 184, (8, 12): 19, (16, 6): 81, (12, 4): 80, (6, 8): 172}
 
+_BITS = 32  # of Sobol's numbers
+
 
 def chart_colors(count: int) -> list[Srgb]:
     """`count` sRGB colors, the fixed ones first, then Sobol's sequence (unscrambled, without its first point)."""
-    from scipy.stats import qmc
-
     fixed = [*CORNERS, *GRAYS, *DUPLICATES]
-    rest = max(count - len(fixed), 0)
-    points = qmc.Sobol(3, scramble=False).random_base2(int(rest + 1).bit_length())[1 : rest + 1]
+    points = sobol(max(count - len(fixed), 0) + 1)[1:]
     filling = [(r, g, b) for r, g, b in (np.rint(points * 255) / 255).tolist()]
     return (fixed + filling)[:count]
+
+
+def sobol(count: int) -> np.ndarray:
+    """The first points count×3 of Sobol's sequence in the unit cube, exact below 2^32 points.
+
+    Each point differs from the one before by the direction numbers of the lowest zero bit of its number (Antonov and
+    Saleev, 1979); those are Joe and Kuo's (2008) of the first three dimensions. scipy.stats.qmc has the same sequence,
+    but brings all of scipy.stats in.
+    """
+    first, second, third = [1, 1], [1, 3], [1, 3]
+    while len(first) < _BITS:
+        first.append(1)
+        second.append(second[-1] << 1 ^ second[-1])  # of x + 1
+        third.append(third[-1] << 1 ^ third[-2] << 2 ^ third[-2])  # of x² + x + 1
+    place = np.arange(_BITS - 1, -1, -1)[:, None]
+    directions = np.array([first, second, third]).T << place
+    points = np.zeros((count, 3), np.int64)
+    for number in range(1, count):
+        lowest_zero = (~(number - 1) & number).bit_length() - 1
+        points[number] = points[number - 1] ^ directions[lowest_zero]
+    return points / 2**_BITS
 
 
 def chart_swatches(grid: ChartGrid) -> tuple[SwatchRect, ...]:

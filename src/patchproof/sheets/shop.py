@@ -1,9 +1,9 @@
-"""What a print shop needs to know of a sheet, read from the PDF itself.
+"""What whoever prints and cuts a sheet needs to know: from its manifest, and from the PDF itself.
 
-In: SHEET.pdf. Out: sentences; those that begin with "PROBLEM" name what would not print as it should. The file is
-opened by pikepdf and every statement is looked up in it: page size and boxes, the wish not to be scaled, fonts, images
-with their resolution, compression and color space. Left out on purpose: total ink and separations, which an RGB file
-leaves to the printer, as it should; and PDF/X, which asks for one intended press.
+In: a manifest; SHEET.pdf. Out: sentences; those that begin with "PROBLEM" name what would not print as it should. The
+PDF is opened by pikepdf and every statement is looked up in it: page size and boxes, the wish not to be scaled, fonts,
+images with their resolution, compression and color space. Left out on purpose: total ink and separations, which an RGB
+file leaves to the printer, as it should; and PDF/X, which asks for one intended press.
 """
 
 from __future__ import annotations
@@ -15,9 +15,63 @@ from typing import Any
 
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.strict import Refused
+from patchproof.sheets.manifest import Manifest
 
 _MM = MM_PER_INCH / 72
 _LOSSLESS = {"/FlateDecode", "/LZWDecode", "/RunLengthDecode", "/ASCII85Decode", "/ASCIIHexDecode"}
+
+
+def check_sheet(manifest: Manifest) -> list[str]:
+    """What whoever prints this sheet should know of what is on it, in sentences; `shop_lines` reads the PDF."""
+    width, height = manifest.page_mm
+    lines = [
+        f"Print the {width:g} × {height:g} mm page at 100 %; markers, swatches and cut line stay "
+        f"{_nearest_ink_mm(manifest):.1f} mm from its edge.",
+        "Use matte white paper of 160 g/m² or more, color, best quality.",
+        f"After printing both rulers must measure {manifest.ruler_mm[0]:g} and {manifest.ruler_mm[1]:g} mm.",
+    ]
+    if manifest.kind == "board":
+        return [*lines, "Glue the uncut page to something flat and stiff."]
+    if manifest.kind == "chart":
+        return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
+    lines += _cutting(manifest)
+    if manifest.plan_page is not None:
+        piece = "the piece" if manifest.page_code is None else f"the piece of sheet {manifest.sheet_id}"
+        lines.append(
+            f"Page {manifest.plan_page} is for people, on any paper: where {piece} goes and how to photograph it."
+        )
+    if manifest.design is None:
+        lines.append("The piece carries no design: between its markers it stays white paper.")
+    return lines
+
+
+def _cutting(manifest: Manifest) -> Iterator[str]:
+    """What is cut out of which page."""
+    size = f"{manifest.cut_mm[2]:.1f} × {manifest.cut_mm[3]:.1f} mm"
+    if manifest.tiles:
+        pages = [tile.page for tile in manifest.tiles]
+        yield (
+            f"Cut the {len(pages)} tiles of pages {min(pages)} to {max(pages)} along the dashed lines, flaps and all, "
+            f"and glue them to one piece of {size} as page 1 shows; page 1 stays whole."
+        )
+    elif manifest.page_code is not None:
+        x, y = manifest.cut_mm[:2]
+        yield (
+            f"Cut each piece of the page along its own dashed line; that of sheet {manifest.sheet_id} is the one of "
+            f"{size} whose corner lies {x:.0f} mm from the left and {y:.0f} mm from the top."
+        )
+    else:
+        yield f"Cut the piece of {size} along the dashed line."
+
+
+def _nearest_ink_mm(manifest: Manifest) -> float:
+    """From the page's edge to the nearest marker, swatch or cut line."""
+    width, height = manifest.page_mm
+    rects = [tile.cut_mm for tile in manifest.tiles] or [manifest.cut_mm]
+    rects = [*rects, *(swatch.rect_mm for swatch in manifest.chart)]
+    points = [point for marker in manifest.markers for point in marker.corners_mm]
+    points += [(x + dx, y + dy) for x, y, w, h in rects for dx, dy in ((0, 0), (w, h))]
+    return min(min(x, y, width - x, height - y) for x, y in points)
 
 
 def shop_lines(pdf_path: str | Path) -> list[str]:

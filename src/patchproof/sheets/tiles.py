@@ -19,8 +19,8 @@ from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.fonts import text_width_mm
 from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
-from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES, place_pieces
-from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, marker_ids, marker_rect, moved_marker
+from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES
+from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, marker_rect, moved_marker
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
@@ -72,14 +72,6 @@ def plan_tiles(grid: TileGrid, piece: Piece) -> list[TilePlan]:
         for row in range(rows)
         for column in range(columns)
     ]
-
-
-def refuse_larger_than_page(template: Template, piece: Piece) -> None:
-    """Refuse a piece of which no sheet could be made: too large, or with more markers than there are ids."""
-    if template.tiles is None:
-        place_pieces(template, [piece])
-    tiles = plan_tiles(template.tiles, piece) if template.tiles else []
-    marker_ids("", "design", len(piece.markers) + len(template.marker.corners_mm) + MARKERS * len(tiles))
 
 
 def lay_out_tile(

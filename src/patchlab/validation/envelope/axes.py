@@ -14,7 +14,8 @@ import numpy as np
 
 from patchproof.scene.bend import curled
 from patchproof.scene.conditions import Conditions, with_values
-from patchproof.scene.scene import Scene, needs_patch
+from patchproof.scene.interface import Scene
+from patchproof.scene.patch_scene import needs_patch
 
 Point = Mapping[str, float]
 """Values by axis; what is not named is as drawn, or as the run has it."""

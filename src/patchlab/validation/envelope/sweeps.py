@@ -28,7 +28,7 @@ from patchlab.validation.envelope.pages import figures, found_and_measured, gain
 from patchlab.validation.envelope.world import measured, open_world, recognized
 from patchproof.base.strict import Finite, Refused, Strict, nearest
 from patchproof.optimizer.run import load_run
-from patchproof.scene.scene import needs_piece
+from patchproof.scene.interface import needs_piece
 
 _SEED = 1_000_000  # the study's seeds begin here, far from those of scenes: Sobol points are what runs are selected on
 Count = Annotated[int, Field(ge=1, le=4096)]

@@ -13,8 +13,7 @@ import numpy as np
 from patchproof.render.stage import Stage
 from patchproof.scene.backgrounds import Backgrounds
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.scene import needs_patch
+from patchproof.scene.patch_scene import PatchScene, needs_patch
 
 _MARGIN_SHARE, _MARGIN_PX, _BLOCK = 0.25, 32, 16  # of a window round the piece; blocks of JPEG stay where they are
 

@@ -39,7 +39,8 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, relit, see
 from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import Scene, needs_mesh, needs_piece
+from patchproof.scene.interface import Scene, needs_piece
+from patchproof.scene.mesh_scene import needs_mesh
 
 _TAPE_SRGB = 0.45  # what hides a corner
 

@@ -25,7 +25,7 @@ from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.image_scene import label_rows
-from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.places import Ground
 from patchproof.scene.scene import build_scene
 from patchproof.sheets.manifest import load_manifest

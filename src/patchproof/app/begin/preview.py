@@ -40,10 +40,13 @@ from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
 from patchproof.report.page import page, viewer
 from patchproof.scene.bend import STRETCH_LIMIT
-from patchproof.scene.mesh_scene import MeshScene, TextureScene
-from patchproof.scene.patch_scene import OpenScene, PatchScene
-from patchproof.scene.scene import Scene, build_scene
+from patchproof.scene.interface import Scene
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.open_scene import OpenScene
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.scene import build_scene
 from patchproof.scene.texture import whole_colors
+from patchproof.scene.texture_scene import TextureScene
 from patchproof.sheets.pdf import numbered
 
 PAGE, OBJECT, LAYOUT = "preview.html", "preview.glb", "uv.png"

@@ -17,10 +17,9 @@ from patchproof.mesh.mesh import Mesh
 from patchproof.render.stage import Stage
 from patchproof.reprints.hung import straight_picture
 from patchproof.scene.bend import STRETCH_LIMIT
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import WARN_GAP_SHARE, Placement, side_frame
-from patchproof.scene.scene import needs_mesh
 
 SIDE_NAMES: dict[Side, str] = {
     "+z": "front",

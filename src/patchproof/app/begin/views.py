@@ -21,7 +21,7 @@ from patchproof.optimizer.pixels import as_pixels
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import Stage
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import PieceScene
+from patchproof.scene.interface import PieceScene
 
 VIEWS, TOP = 8, 5
 _LEAST_PX = 200  # what is smaller is hard to look at

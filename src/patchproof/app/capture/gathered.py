@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.app.capture.album import CONTROLS_FOLDER, JOURNAL, Album
+from patchproof.app.verify import forecaster
 from patchproof.base.workers import Workers
 from patchproof.evidence.batch import Item, measure_all, shot_again
 from patchproof.evidence.classify import judges_of
@@ -24,11 +25,10 @@ from patchproof.evidence.copies import without_copies
 from patchproof.evidence.grouping import FOLDERS, Grouping
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.measure import MeasuredPhoto
+from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import PhotoEntry, Report
 from patchproof.evidence.run import report_of, with_forecast
 from patchproof.evidence.task import Options, Task, task_of
-from patchproof.optimizer.run import load_run
-from patchproof.reprints.retake import retaker
 from patchproof.sheets.manifest import Manifest, load_manifest
 
 
@@ -124,9 +124,9 @@ def ready(_: object) -> None:
 
 
 def _forecast_there(source: ForecastFrom, task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> MeasuredPhoto:
-    return with_forecast(partial(shot_again, task, size_px), _retaker(source), *item)
+    return with_forecast(partial(shot_again, task, size_px), _forecaster(source), *item)
 
 
 @lru_cache(maxsize=1)
-def _retaker(source: ForecastFrom):
-    return retaker(load_run(source.run), load_manifest(source.sheet))
+def _forecaster(source: ForecastFrom) -> Callable[[Shot], float | None]:
+    return forecaster(source.run, load_manifest(source.sheet))

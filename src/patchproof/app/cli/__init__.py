@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import typer
 
-from patchproof.app.cli.begin import new, plan, preview
+from patchproof.app.cli.begin import keys, new, plan, preview
 from patchproof.app.cli.calibrate import camera, printer
 from patchproof.app.cli.capture import capture
 from patchproof.app.cli.console import carried_out, run_command_line, version_option
 from patchproof.app.cli.designs import evaluate, import_picture
 from patchproof.app.cli.journey import demo, optimize, promise, reprint, sheet, verify
-from patchproof.app.cli.keys import keys
 
 app = typer.Typer(
     no_args_is_help=True,

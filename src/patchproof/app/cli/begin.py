@@ -1,4 +1,4 @@
-"""Before anything is optimized: new, preview, plan."""
+"""Before anything is optimized: new, preview, plan, keys."""
 
 from __future__ import annotations
 
@@ -79,3 +79,12 @@ def plan(
     say(*measured_lines(planned))
     if out is not None:
         write_whole(out, planned.model_dump_json(indent=1) + "\n")
+
+
+def keys(
+    name: Annotated[str | None, typer.Argument(help="scene, template or board; without one, all.")] = None,
+) -> None:
+    """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
+    from patchproof.app.keys import DOCUMENTS, keys_page
+
+    print(keys_page(DOCUMENTS, name), end="")

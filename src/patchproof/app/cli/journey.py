@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -22,6 +22,9 @@ from patchproof.app.cli.console import (
     say,
     warn,
 )
+
+if TYPE_CHECKING:
+    from patchproof.sheets.manifest import Manifest
 
 Control = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
 Shown = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
@@ -132,11 +135,10 @@ def sheet(
     """Write the page: design, markers, chart and rulers at true size."""
     from patchproof.base.output import check_file
     from patchproof.base.settings import behind
-    from patchproof.optimizer.run import load_run
-    from patchproof.reprints.run_sheet import blank_page, sheet_of, sheet_of_several
-    from patchproof.sheets.shop import shop_lines
+    from patchproof.sheets.blank import blank_page
+    from patchproof.sheets.shop import check_sheet, shop_lines
     from patchproof.sheets.template import template_lines
-    from patchproof.sheets.write import check_sheet, manifest_paths
+    from patchproof.sheets.write import manifest_paths
 
     if templates:
         return say(*template_lines())
@@ -148,12 +150,10 @@ def sheet(
     paths = manifest_paths(out, len(runs))
     for path in (out, *paths):
         check_file(path, overwrite)
-    if not runs:
-        manifests = [blank_page(out, template=template, control=control)]
-    elif len(runs) == 1:
-        manifests = [sheet_of(load_run(runs[0]), out, template=template, control=control, copies=copies)]
+    if runs:
+        manifests = _write_sheets(runs, out, template, control, copies)
     else:
-        manifests = sheet_of_several([load_run(run) for run in runs], out, template=template, control=control)
+        manifests = [blank_page(out, template=template, control=control)]
     for manifest, path in zip(manifests, paths, strict=True):
         say(
             *(
@@ -166,6 +166,20 @@ def sheet(
     if check:
         lines = (line for manifest in manifests for line in check_sheet(manifest))
         say(*dict.fromkeys(lines), *shop_lines(out))  # what holds for several designs is said once
+
+
+def _write_sheets(
+    folders: list[Path], out: Path, template: str | None, control: Control | None, copies: int
+) -> list[Manifest]:
+    """Write the page of finished runs; a manifest for each."""
+    from patchproof.optimizer.run import load_run
+    from patchproof.reprints.run_sheet import sheet_of
+    from patchproof.reprints.several_runs import sheet_of_several
+
+    runs = [load_run(folder) for folder in folders]
+    if len(runs) == 1:
+        return [sheet_of(runs[0], out, template=template, control=control, copies=copies)]
+    return sheet_of_several(runs, out, template=template, control=control)
 
 
 def reprint(
@@ -196,7 +210,7 @@ def reprint(
     from patchproof.reprints.hung_sheet import Hanging
     from patchproof.reprints.page_photos import reprint_pages
     from patchproof.reprints.reprint import reprint as reprint_sheet
-    from patchproof.reprints.reprint import scan
+    from patchproof.reprints.scan import scan
 
     scale = pair_of(print_scale, "--print-scale")
     if scan_dpi is not None and control is not None:

@@ -23,7 +23,7 @@ from patchproof.render.pixels import Shown
 from patchproof.render.raster import rasterize
 from patchproof.render.views import Views, cameras, near_mm
 from patchproof.scene.conditions import Conditions
-from patchproof.scene.scene import needs_mesh
+from patchproof.scene.mesh_scene import needs_mesh
 
 REPEATS = 5
 

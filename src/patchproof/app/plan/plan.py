@@ -27,9 +27,11 @@ from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.places import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.scene.patch_scene import OpenScene
+from patchproof.scene.bent_scene import other_surface
+from patchproof.scene.interface import PieceScene, needs_piece
+from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
-from patchproof.scene.scene import PieceScene, load_scene, needs_piece
+from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
 
 TERM_VIEWS = 16
@@ -116,7 +118,7 @@ def plan_geometry(
         place = choose_place(scene, device=device, on_pass=partial(on_stage, "place"))
         scene = scene.at(place.at, place.spin_deg)
     problem, target = set_problem(scene, device), scene.settings.target
-    _, sentence = scene.other_surface()
+    _, sentence = other_surface(scene)
     geometry = Geometry(
         scene=Path(scene_path).name,
         kind=scene.description(),
@@ -141,7 +143,7 @@ def measured_plan(
 ) -> Plan:
     """The rest of a plan: a draft of the design, the terms and the cost."""
     scene = problem.scene
-    other, _ = scene.other_surface()
+    other, _ = other_surface(scene)
     design, draft = _draft(problem, on_stage)
     conditions = scene.draw("select", views)
     terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(on_stage, "terms"))

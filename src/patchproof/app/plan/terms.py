@@ -19,9 +19,10 @@ from patchproof.optimizer.problem import Problem
 from patchproof.render.pixels import Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.scene.conditions import Conditions, without
-from patchproof.scene.interface import Part
+from patchproof.scene.interface import Part, Scene
+from patchproof.scene.mesh_scene import needs_mesh
+from patchproof.scene.patch_scene import needs_patch
 from patchproof.scene.placement import Placement
-from patchproof.scene.scene import Scene, needs_mesh, needs_patch
 
 PRINTER = "printer's colors"
 

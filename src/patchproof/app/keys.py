@@ -16,7 +16,6 @@ from itertools import takewhile
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import typer
 from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 
@@ -41,13 +40,6 @@ DOCUMENTS: Documents = {
     "template": ("A page template: `patchproof sheet --template FILE.toml`.", Template),
     "board": ("A page template with a board that calibrates cameras.", BoardTemplate),
 }
-
-
-def keys(
-    name: Annotated[str | None, typer.Argument(help="scene, template or board; without one, all.")] = None,
-) -> None:
-    """All keys of scene files and page templates: range, unit, default and meaning, as Markdown."""
-    print(keys_page(DOCUMENTS, name), end="")
 
 
 def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -> str:

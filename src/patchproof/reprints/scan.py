@@ -1,0 +1,75 @@
+"""Flat scans of a sheet's uncut page, in place of photographs of its piece on the object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from patchproof.base import geometry
+from patchproof.base.color import photo_codes_of
+from patchproof.base.geometry import MM_PER_INCH
+from patchproof.base.output import image_bytes, new_folder
+from patchproof.channel.printer import Printer
+from patchproof.optimizer.run import Run
+from patchproof.reprints.hung_sheet import AS_MADE, Hanging, sheet_scene
+from patchproof.reprints.reprint import OWN, write_truth
+from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.raster import page_pixels
+
+SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
+
+
+def scan(
+    pdf_path: str | Path,
+    run: Run,
+    n: int,
+    out: str | Path,
+    dpi: float,
+    how: Hanging = AS_MADE,
+    *,
+    overwrite: bool = False,
+) -> dict:
+    """Write n flat scans at `dpi` of each uncut page with markers; returns the truth."""
+    (manifest, _), truth = sheet_scene(pdf_path, run), {}
+    printer, px_from_mm = how.printer_for(run.scene), np.diag([*(dpi / MM_PER_INCH * np.array(how.print_scale)), 1.0])
+    with new_folder(out, OWN, overwrite) as folder:
+        for page in sorted({marker.page for marker in manifest.markers}):
+            picture = _scanned(page_pixels(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, printer, how.print_scale)
+            corners = {
+                str(m.id): geometry.apply_homography(px_from_mm, m.corners_mm).tolist()
+                for m in manifest.markers
+                if m.page == page
+            }
+            content = image_bytes(photo_codes_of(picture), "JPEG", {"quality": SCAN_QUALITY})
+            for _ in range(n):
+                name = f"scan_{len(truth) + 1:04d}.jpg"
+                (folder / name).write_bytes(content)
+                truth[name] = {
+                    "homography_px_from_mm": (px_from_mm @ _page_from_design(manifest, page)).tolist(),
+                    "marker_corners_px": corners,
+                    "conditions": {"scan_dpi": dpi, "print_scale": list(how.print_scale)},
+                }
+        return write_truth(folder, truth)
+
+
+def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scale: tuple[float, float]) -> np.ndarray:
+    """A page's pixels, twice as fine as the scan, as the scanner shows their print: H×W×3 in [0, 1]."""
+    with torch.no_grad():
+        light = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
+    # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
+    (x, y), (width, height) = print_scale, (round(side * dpi / MM_PER_INCH) for side in page_mm)
+    matrix = np.array([[x / 2, 0, x / 4 - 0.5], [0, y / 2, y / 4 - 0.5]])
+    blurred = cv2.GaussianBlur(light, (0, 0), SCAN_BLUR_PX)
+    return cv2.warpAffine(blurred, matrix, (width, height), borderValue=(1.0, 1.0, 1.0))
+
+
+def _page_from_design(manifest: Manifest, page: int) -> np.ndarray:
+    """3×3 from the millimeters of the design's page to a tile's; pages without a tile keep their own."""
+    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
+    if page not in square:
+        return np.eye(3)
+    own = square[manifest.design.page if manifest.design else manifest.tiles[0].page]
+    return square[page] @ np.linalg.inv(own)

@@ -1,0 +1,50 @@
+"""A mesh with a piece of paper that follows its surface (`patch.bend`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from patchproof.base.strict import Refused
+from patchproof.scene.bend import place_bent
+from patchproof.scene.interface import Scene, SceneSource
+from patchproof.scene.mesh_scene import load_bare
+from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
+from patchproof.scene.tape import Tape, tapes
+
+
+@dataclass(frozen=True)
+class BentScene(PatchScene):
+    """An object with a piece that bends with it; where the surface is flat, that is a card, too."""
+
+    LAY: ClassVar[Lay] = staticmethod(place_bent)
+
+    def tapes(self) -> tuple[Tape, ...]:
+        """As in `PatchScene.tapes`."""
+        facing = patch_frame(self.mesh, self.settings.patch).normal
+        return () if self.placement.is_flat else tapes(self.mesh, self.placement, facing)
+
+
+def build(source: SceneSource) -> BentScene:
+    """The scene of settings that give a piece of paper its place."""
+    return BentScene.on(load_bare(source))
+
+
+def other_surface(scene: Scene) -> tuple[Placement | None, str | None]:
+    """(where a scene's piece would lie with `patch.bend` the other way round, what that would be like in a sentence).
+
+    No placement where it is refused or would be the same card; no sentence where there is no surface to lie on.
+    """
+    if not isinstance(scene, PatchScene):
+        return None, None
+    patch, placement = scene.settings.patch, scene.placement
+    place, flag = (place_card, "false") if patch.bend else (place_bent, "true")
+    try:
+        other = place(scene.mesh, patch_frame(scene.mesh, patch), scene.piece.size_mm, patch.spin_deg)
+    except Refused as refused:
+        return None, f"bend = {flag} is refused. {refused}"
+    if other.family == placement.family:
+        return None, f"bend = {flag} would be a card, too: leave bend out"
+    gaps = f"{other.gap_mean_mm:.2f} mm off the surface on average, here {placement.gap_mean_mm:.2f} mm"
+    return other, f"bend = {flag} would be a {other.family} (stretch {other.stretch:.2%}), {gaps}"

@@ -1,0 +1,29 @@
+"""A mesh whose own texture is what is optimized, whole or under a mask; nothing hangs on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from patchproof.scene.interface import SceneSource
+from patchproof.scene.mesh_scene import MeshScene, load_bare
+from patchproof.scene.texture import Canvas, texture_canvas
+
+
+@dataclass(frozen=True)
+class TextureScene(MeshScene):
+    """An object some of whose own texels may change."""
+
+    canvas: Canvas
+    LEARNED = True
+
+    def own_texture(self) -> Canvas:
+        """As in `Scene.own_texture`."""
+        return self.canvas
+
+
+def build(source: SceneSource) -> TextureScene:
+    """The scene of settings whose `patch.kind` is "texture" or "masked"."""
+    bare = load_bare(source)
+    canvas = texture_canvas(bare.mesh, source.settings.patch, source.base)
+    own = {"mesh": canvas.mesh, "canvas": canvas, "notes": (*bare.notes, *canvas.warnings)}
+    return TextureScene(**vars(bare) | own)
