@@ -116,7 +116,7 @@ def manifests() -> list[dict]:
         "target": {"label": "bright", "accept": []},
         "sheet": {"template": "a4"},
     }
-    control = dict(rate=0.1, interval=[0.0, 0.2], confidence=0.1, difference=0.8, difference_interval=[0.7, 0.9])
+    control = dict(n=400, rate=0.1, interval=[0.0, 0.2], confidence=0.1, difference=0.8, difference_interval=[0.7, 0.9])
     promised = promise(claims) | {"controls": {"gray": control}}
     piece = lay_out_piece((300.0, 300.0), 20.0, "FUZZFUZZ00", "design")
     with tempfile.TemporaryDirectory() as folder:

@@ -22,6 +22,11 @@ PIECE_IDS, PAGE_IDS = tuple(range(100, 108)), (200, 201, 202)
 CONDITION = dict(px_per_mm=None, tilt_deg=None, azimuth_deg=None, contrast=None, blur_px=None, recognized=True)
 
 
+def promised_conditions(n: int, rate: float, given=(CONDITION,)) -> list[dict]:
+    """The given conditions over and over, `n` in all, of which a share `rate` is recognized."""
+    return [given[i % len(given)] | {"recognized": int((i + 1) * rate) > int(i * rate)} for i in range(n)]
+
+
 def marker_squares() -> dict[int, tuple[float, float]]:
     """Top-left mm of the eight piece markers (corners and middles of its sides) and three page markers."""
     x, y, w, _ = CUT_MM

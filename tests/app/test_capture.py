@@ -57,7 +57,7 @@ def sheet(tmp_path_factory) -> Path:
     conditions = [condition(azimuth, scale) for azimuth in (-40.0, -20.0, 0.0, 20.0, 40.0) for scale in (1.0, 1.5, 2.0)]
     said = promise([c | {"tilt_deg": tilt} for c in conditions for tilt in (0.0, 60.0)])
     path = tmp_path_factory.mktemp("sheet") / "sheet.json"
-    path.write_text(dump_manifest(make_manifest(said | {"n": 30})), encoding="utf-8")
+    path.write_text(dump_manifest(make_manifest(said)), encoding="utf-8")
     return path
 
 

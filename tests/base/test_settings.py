@@ -10,7 +10,7 @@ from patchproof.base import strict
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings, identifying, load_scene_settings
 from patchproof.base.strict import Refused, Strict, expand, nearest, shipped, validated
-from patchproof.sheets.manifest import Promise, Target
+from patchproof.sheets.manifest import Target
 
 SCENE = """
 [object]
@@ -231,16 +231,6 @@ def test_numbers_stay_numbers(tmp_path):
     )
 
 
-def test_keys_of_former_runs_are_forgotten_where_they_changed_nothing(tmp_path):
-    former = load_scene_settings(
-        scene(tmp_path, extra="[optimize]\nrefresh = 1\nmine = 0\nnps = 0\nin_gamut = false\nsteps = 7")
-    )
-    assert former.optimize.steps == 7
-    for key, value in (("mine", "8"), ("in_gamut", "true")):
-        with pytest.raises(Refused, match=key):
-            load_scene_settings(scene(tmp_path, extra=f"[optimize]\n{key} = {value}"))
-
-
 def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
     plain, spelled = (load_scene_settings(scene(tmp_path, extra=text)) for text in ("", "[optimize]\nsteps = 240"))
     other = load_scene_settings(scene(tmp_path, extra="[optimize]\nsteps = 241"))
@@ -265,13 +255,3 @@ def test_a_goal_that_is_none_is_refused_wherever_it_stands(tmp_path):
     with pytest.raises(Refused, match="goal"):
         validated(Target, {"label": "jeep", "indices": [1], "goal": "confuse"}, "sheet.json")
     assert [(str(goal), goal.sign) for goal in Goal] == [("assist", 1), ("deceive", -1)]
-
-
-def test_the_former_spelling_of_gray_is_read(tmp_path):
-    former = ("[patch]\n", '[patch]\nkind = "texture"\nstart = "grey"\n')
-    assert load_scene_settings(scene(tmp_path, former)).patch.start == "gray"
-    claim = {"rate": 0.5, "interval": [0.4, 0.6], "confidence": 0.5, "difference": 0.1, "difference_interval": [0, 0.2]}
-    target = {"label": "jeep", "indices": [1], "goal": "assist"}
-    model = {"name": "net", "sha256": None, "rate": 0.6, "interval": [0.5, 0.7], "confidence": 0.6}
-    promise = {"target": target, "models": [model], "rate": 0.6, "interval": [0.5, 0.7], "n": 400, "conditions": []}
-    assert list(validated(Promise, promise | {"controls": {"grey": claim}}, "sheet.json").controls) == ["gray"]

@@ -165,7 +165,7 @@ def sheet(two_colors: bool = False) -> Manifest:
     conditions = [CONDITION | dict(contrast=c, blur_px=0.3) for c in rng.uniform(0.6, 0.9, 50)]
     model = dict(name="net", sha256=None, rate=0.9, interval=[0.85, 0.93], confidence=0.8)
     target = dict(label="striped", indices=[0], goal="assist")
-    promise = dict(target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=400)
+    promise = dict(target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=50)
     colors = striped([220, 40, 60], [30, 200, 90]) if two_colors else design()
     return make_manifest(promise | dict(controls={}, conditions=conditions), design=colors)
 
@@ -263,8 +263,8 @@ def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_le
 def test_the_piece_is_drawn_as_the_page_shows_it():
     surface = surface_of(sheet())
     promised = promised_of(sheet(), surface, identity_printer())
-    drawn = piece_picture(surface, promised.design, promised.ink)
-    x, y, w, h = (round(v * 10) for v in surface.piece_mm)
+    drawn = piece_picture(surface, promised.design)
+    x, y, w, h = (round(v * 10) for v in surface.rect_mm)
     page = cv2.resize(
         page_raster(sheet(), True)[y : y + h, x : x + w], drawn.shape[1::-1], interpolation=cv2.INTER_AREA
     )
@@ -281,9 +281,9 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
     photo = measured(taken, manifest=sheet())
     geometry, promised = photo.entry.geometry, promised_of(sheet(True), surface, identity_printer())
     shot = shot_of("a", taken, np.array(geometry.homography_px_from_mm), geometry.blur_px, photo.light, surface, 240)
-    drawn, fit = piece_picture(surface, promised.design, promised.ink), light_fit(shot, promised)
-    put = squares_with(shot, {(): drawn}, surface.piece_mm, fit, fit, Reference(0.5, 0.3, 0.0))
-    assert np.array_equal(put[True, True], square_with(shot, drawn, surface.piece_mm, fit))
+    drawn, fit = piece_picture(surface, promised.design), light_fit(shot, promised)
+    put = squares_with(shot, {(): drawn}, surface.rect_mm, fit, fit, Reference(0.5, 0.3, 0.0))
+    assert np.array_equal(put[True, True], square_with(shot, drawn, surface.rect_mm, fit))
     for on, expected in ((True, other), (False, promised_one)):
         off = np.abs(put[on, on] - square_of(expected)[0] / 255).mean()
         assert off < 0.009  # the print that was taken is 0.036 off and more

@@ -8,7 +8,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic_photos import make_manifest, noisy_design, page_raster, photograph, save, some_design, view
+from synthetic_photos import (
+    CONDITION,
+    make_manifest,
+    noisy_design,
+    page_raster,
+    photograph,
+    promised_conditions,
+    save,
+    some_design,
+    view,
+)
 
 from patchproof.base.claims import wilson
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
@@ -26,12 +36,12 @@ from patchproof.photo.quality import FrameLight, shows_nothing
 from patchproof.photo.read import Photo
 
 
-def promise(conditions=()):
+def promise(conditions=(CONDITION,)):
+    """90 % of 400 conditions, which are the given ones over and over."""
     model = dict(name="net", sha256="ab" * 32, rate=0.9, interval=[0.85, 0.93], confidence=0.8)
     target = dict(label="bright", indices=[0], goal="assist")
-    return dict(
-        target=target, models=[model], rate=0.9, interval=[0.85, 0.93], n=400, controls={}, conditions=conditions
-    )
+    rate, said = dict(rate=0.9, interval=[0.85, 0.93], n=400), promised_conditions(400, 0.9, conditions)
+    return dict(target=target, models=[model], controls={}, conditions=said) | rate
 
 
 def brightness(photos):

@@ -29,7 +29,7 @@ def promise_of(rate: float, control: float = 0.0, goal: str = "assist", correlat
         interval=(0, 1),
         n=600,
         per_session=6 if correlation else 1,
-        controls={"bare": dict(rate=control, difference=rate - control, difference_interval=(-1, 1), **claim)},
+        controls={"bare": dict(n=600, rate=control, difference=rate - control, difference_interval=(-1, 1), **claim)},
         conditions=[dict(recognized=hit, **empty) for hit in hits],
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from synthetic_photos import promised_conditions
 from typer.testing import CliRunner
 
 from patchproof.app.cli import app
@@ -23,10 +24,10 @@ def promise_of(rate: float, controls: dict[str, tuple[float, float, float]], goa
         interval=(0, 1),
         n=400,
         controls={
-            name: {"rate": own, "difference": rate - own, "difference_interval": (low, high), **claim}
+            name: {"n": 400, "rate": own, "difference": rate - own, "difference_interval": (low, high), **claim}
             for name, (own, low, high) in controls.items()
         },
-        conditions=(),
+        conditions=promised_conditions(400, rate),
     )
 
 

@@ -499,12 +499,3 @@ def test_every_goal_has_a_loss_that_falls_the_way_it_wants():
     for goal in Goal:
         likely, unlikely = target_loss(odds(logits, [0]), goal).tolist()
         assert goal.sign * (unlikely - likely) > 0
-
-
-def test_a_run_from_when_designs_lay_in_a_frame_is_refused_with_the_piece_s_size(tmp_path, few_views):
-    optimize_scene(scene_with(tmp_path, optimize__steps=1), tmp_path / "run")
-    details = json.loads((tmp_path / "run" / "run.json").read_text())
-    details["placement"]["piece_mm"] = [147.4, 147.4]
-    (tmp_path / "run" / "run.json").write_text(json.dumps(details))
-    with pytest.raises(Refused, match=r"design fills its piece.*the whole piece's width_mm = 147\.4"):
-        load_run(tmp_path / "run")

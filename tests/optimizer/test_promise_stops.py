@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
 from itertools import product
 
@@ -81,10 +80,6 @@ def test_a_scene_asks_for_a_half_width_and_a_number_of_views_for_all_of_them(tmp
     assert whole.promise.n == 20 and not whole.promise.draft
     assert promise_run(tmp_path / "run", views=40).promise.n == 40
     assert promise_run(tmp_path / "run").promise == whole.promise
-    details = json.loads((tmp_path / "run" / "run.json").read_text())
-    details["settings"]["promise"]["half_width"] = None
-    (tmp_path / "run" / "run.json").write_text(json.dumps(details))
-    assert promise_run(tmp_path / "run").promise.n == 40, "a run from before"
 
 
 def test_the_key_changes_no_sheet_and_has_a_least_value(tmp_path):

@@ -53,7 +53,7 @@ def markers_mm():
 
 def unrolled(corners_px, focal_px=None):
     blank = np.zeros((*SIZE[::-1], 3), np.uint8)
-    return unroll(blank, corners_px, markers_mm(), CUT_MM, DESIGN_MM, focal_px)
+    return unroll(blank, corners_px, markers_mm(), CUT_MM, focal_px)
 
 
 @pytest.mark.parametrize("radius_mm", [-80.0, 100.0, 400.0, 2000.0])
@@ -98,7 +98,7 @@ def test_the_unrolled_picture_shows_the_design_where_its_homography_says():
     page = page_raster(make_manifest(), only_piece=True) * np.float32(0.97) + np.float32(0.02)
     photo = curled_photograph(page, pose(), MATRIX, 1 / 150)
     corners = {i: rolled_px(mm, 1 / 150, pose()) for i, mm in markers_mm().items()}
-    flat = unroll(photo, corners, markers_mm(), CUT_MM, DESIGN_MM, MATRIX[0, 0])
+    flat = unroll(photo, corners, markers_mm(), CUT_MM, MATRIX[0, 0])
     expected = photograph(page, flat.fit.px_from_mm, SIZE, blur_px=0.9, fine=2)
     quad = apply_homography(flat.fit.px_from_mm, rect_corners(DESIGN_MM))
     (x0, y0), (x1, y1) = quad.min(0).astype(int) + 20, quad.max(0).astype(int) - 20

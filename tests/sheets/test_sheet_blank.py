@@ -1,20 +1,16 @@
 """Blank sheets: what is on the page, what the manifest says of the piece, and what is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from patchproof.base.strict import Refused, shipped
 from patchproof.sheets.blank import blank_piece, blank_sheet
-from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.raster import attached_manifest, piece_pixels
 from patchproof.sheets.template import load_template
 from test_sheet_write import words_px
 
 BLANK = shipped("print_templates", "blank_a4.toml")
-FORMER = Path(__file__).parent / "former_sheets"
 
 
 @pytest.fixture(scope="module")
@@ -59,23 +55,6 @@ def test_the_piece_is_read_back_from_cut_line_and_markers(tmp_path, piece, marke
     for mine, printed in zip(read.markers, laid_out.markers, strict=True):
         assert np.array(mine.corners_mm) == pytest.approx(np.array(printed.corners_mm), abs=2e-6)
     assert np.array(read.reserved_mm) == pytest.approx(np.array(laid_out.reserved_mm), abs=1e-5)
-
-
-def test_a_blank_of_the_former_kind_is_read_as_it_was_printed():
-    """110 mm for the design in a frame of eight 19 mm markers, 2 mm and a module inside of the cut, and swatches."""
-    manifest = load_manifest(FORMER / "blank.json")
-    piece = blank_piece(manifest)
-    assert (manifest.version, len(piece.markers), len(manifest.chart)) == (1, 8, 72 + 12)
-    assert piece.size_mm == pytest.approx((162.857143, 162.857143)) and piece.marker_mm == pytest.approx(19, abs=1e-5)
-    edge, far, middle = 2 + 19 / 7, 162.857143 - 21 - 19 / 7, (162.857143 - 19) / 2
-    corners = [(edge, edge), (far, edge), (far, far), (edge, far)]
-    corners += [(middle, edge), (middle, far), (far, middle), (edge, middle)]
-    assert np.array([m.corners_mm[0] for m in piece.markers]) == pytest.approx(np.array(corners), abs=1e-5)
-    assert [m.id for m in piece.markers] == [m.id for m in manifest.markers[:8]]
-    # the two millimeters beside a marker's white are white on the new piece, too
-    side = 19 * 9 / 7 + 2
-    assert np.array(piece.reserved_mm[0]) == pytest.approx(np.array((0, 0, side, side)), abs=1e-5)
-    assert np.array(piece.reserved_mm[4]) == pytest.approx(np.array((middle - 19 / 7, 0, 19 * 9 / 7, side)), abs=1e-5)
 
 
 def test_the_same_template_gives_the_same_bytes_and_another_one_another_id(blank, tmp_path):

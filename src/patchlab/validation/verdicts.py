@@ -71,7 +71,7 @@ def _promise(settings: VerdictsSettings, correlation: float, rng: np.random.Gene
     hits = (rng.random((sessions, PER_SESSION)) < own).ravel()
     rate, whole = float(hits.mean()), (0.0, 1.0)
     beside = ControlClaim(
-        rate=settings.control, interval=whole, confidence=0, difference=0, difference_interval=(-1, 1)
+        n=len(hits), rate=settings.control, interval=whole, confidence=0, difference=0, difference_interval=(-1, 1)
     )
     unknown = dict.fromkeys(("px_per_mm", "tilt_deg", "azimuth_deg", "contrast", "blur_px"))
     return Promise(

@@ -15,7 +15,6 @@ from pydantic import AfterValidator, Field, model_validator
 from patchproof.base.goal import Goal
 from patchproof.base.strict import (
     Finite,
-    Gray,
     NotNegative,
     NotNegativeRange,
     Positive,
@@ -85,7 +84,7 @@ class PatchSettings(Strict):
     mask: str | None = None  # an image over the UV map, white where the texture may change
     materials: tuple[str, ...] = ()  # names of the mesh's materials whose texture may change
     faces: str | None = None  # a text file of numbers of the faces whose texture may change
-    start: Annotated[Literal["original", "gray"], Gray] = "original"  # what a texture is optimized from
+    start: Literal["original", "gray"] = "original"  # what a texture is optimized from
     epsilon: Annotated[Share, Field(gt=0)] | None = None  # largest change of a texel from its start, in sRGB
 
     @property
@@ -232,22 +231,13 @@ class OptimizeSettings(Strict):
     # At 0, 0.1, 1 and 10 (one scene) 83, 80, 58 and 5 % of the pixels were over ΔE00 2 off, confidences within 0.02.
     gamut: NotNegative = 1.0  # loss for colors that the printer misses, per 100 ΔE00
 
-    @model_validator(mode="before")
-    @classmethod
-    def _forget_former_keys(cls, data):
-        # runs from before these keys went have them, nearly always at the values that changed nothing
-        former = {"refresh": 1, "mine": 0, "nps": 0.0, "in_gamut": False, "step_size": None}
-        if not isinstance(data, dict):
-            return data
-        return {key: value for key, value in data.items() if key not in former or value != former[key]}
-
 
 class PromiseSettings(Strict):
     """How well a promise has to be known; no part of what is printed."""
 
     # Of the rate's interval: half or three quarters of 400 views are taken where it is no wider after them and every
-    # control's difference is settled; all of them without one (earlier runs), and all of a number that is asked for.
-    half_width: Annotated[Share, Field(ge=0.005)] | None = 0.04
+    # control's difference is settled, and all of a number that is asked for.
+    half_width: Annotated[Share, Field(ge=0.005)] = 0.04
 
 
 class SceneSettings(Strict):

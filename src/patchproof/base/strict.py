@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 
@@ -74,10 +74,6 @@ NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(ord
 PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
 Side = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Model = TypeVar("Model", bound=BaseModel)
-
-
-# runs and sheets from before the spelling was one say "grey"
-Gray = BeforeValidator(lambda word: "gray" if word == "grey" else word)
 
 
 class Strict(BaseModel):

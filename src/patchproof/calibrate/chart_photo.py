@@ -91,9 +91,8 @@ def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -
 
 
 def chart_rows(manifest: Manifest, page: int) -> list[int]:
-    """Which swatches make up a page's chart: those outside of the piece, which may hang elsewhere by now."""
-    here = [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
-    return [i for i in here if not holds(manifest.cut_mm, manifest.chart[i].rect_mm)] or here
+    """Which swatches make up a page's chart."""
+    return [i for i, swatch in enumerate(manifest.chart) if swatch.page == page]
 
 
 def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:

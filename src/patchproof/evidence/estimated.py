@@ -50,7 +50,7 @@ def estimate_effect(
     pixels = manifest.design.pixels()
     looks = {kind: look_of(control_design(kind, pixels, ""), surface, printer) for kind in ("design", *KINDS)}
     printed, _, lights = print_and_lights(shots, looks["design"])
-    pictures = {kind: piece_picture(surface, look.design, look.ink) for kind, look in looks.items()}
+    pictures = {kind: piece_picture(surface, look.design) for kind, look in looks.items()}
     if printed is not None:
         pictures = {kind: printed(picture) for kind, picture in pictures.items()}
     answers = {
@@ -65,7 +65,7 @@ def estimate_effect(
 
 def _recognized(shot: Shot, look: np.ndarray, surface: Surface, light: ColorFit, judges: Judges) -> bool:
     """Whether the primary network recognizes the photograph with that piece in it."""
-    codes = np.rint(255 * square_with(shot, look, surface.piece_mm, light)).astype(np.uint8)
+    codes = np.rint(255 * square_with(shot, look, surface.rect_mm, light)).astype(np.uint8)
     model = judges.primary
     square = squares_of(codes, [model.input_px])[model.input_px]
     return predict(model, judges.indices[model.name], square, shot.box).recognized

@@ -79,7 +79,7 @@ def ledger_of(
     values = []
     references = _references(claims, shots, camera, promised)
     for shot, fit, print_light, reference in zip(shots, undo, print_lights, references, strict=True):
-        squares = squares_with(shot, looks, surface.piece_mm, fit, print_light, reference)
+        squares = squares_with(shot, looks, surface.rect_mm, fit, print_light, reference)
         values.append(_confidences(squares, judges, shot.box))
     steps = (GAMUT, PRINT, LIGHT, BLUR) if printed is not None else (GAMUT, PRINT_AND_LIGHT, BLUR)
     own = np.array([confidence[shot.file] for shot in shots])
@@ -134,8 +134,8 @@ def _culprit(names: Sequence[str], means: np.ndarray, resampled: np.ndarray | No
 def _looks(sent_srgb: np.ndarray, surface: Surface, promised: Promised, printed) -> dict[Switches, np.ndarray]:
     """The piece's light by (gamut, print), or by (gamut,) alone where the print is not known."""
     design = reduced(linear_from_srgb(sent_srgb / 255.0).astype(np.float32), DESIGN_PX)
-    sent = piece_picture(surface, with_markers(design, surface, np.zeros(3)), np.zeros(3))
-    looks = {False: sent, True: piece_picture(surface, promised.design, promised.ink)}
+    sent = piece_picture(surface, with_markers(design, surface, np.zeros(3)))
+    looks = {False: sent, True: piece_picture(surface, promised.design)}
     if printed is None:
         return {(gamut,): look for gamut, look in looks.items()}
     return {(gamut, on): printed(look) if on else look for on in (False, True) for gamut, look in looks.items()}

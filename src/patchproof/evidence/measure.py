@@ -166,7 +166,7 @@ def _is_uncut(placed: Placed, detected: MarkersInView, surface: Surface) -> bool
     """Whether markers of the page are about where an uncut one has them; it may be curled beyond the piece."""
     if set(placed.fit.inlier_ids) & surface.page_ids or not detected.markers.keys() & surface.piece_ids:
         return True
-    x, y, w, h = surface.piece_mm
+    x, y, w, h = surface.rect_mm
     side_px = np.linalg.norm(np.diff(placed.px(placed.parameters, np.array([[x, y], [x + w, y + h]])), axis=0))
     off_px = [
         np.linalg.norm(detected.markers[i].corners_px - placed.px(placed.parameters, surface.corners_mm[i]), axis=1)

@@ -97,7 +97,7 @@ def _unrolled(view: View, detected: MarkersInView, surface: Surface) -> Unrolled
     corners = {i: b.corners_px for i, b in detected.markers.items() if b.fitted and i in surface.piece_ids}
     focal = () if view.matrix_px is None else (float(view.matrix_px[0, 0]), view.focal_spread)
     try:
-        return unroll(view.srgb, corners, surface.corners_mm, surface.piece_mm, surface.rect_mm, *focal)
+        return unroll(view.srgb, corners, surface.corners_mm, surface.rect_mm, *focal)
     except (np.linalg.LinAlgError, ValueError):
         return None  # a shape that no camera sees is no explanation; the plane's residual decides
 

@@ -16,7 +16,6 @@ import numpy as np
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.geometry import rect_corners
 from patchproof.base.strict import Refused
-from patchproof.photo.detect import cells_of
 from patchproof.photo.label import Label, label_of
 from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest, Rect
@@ -31,13 +30,14 @@ _LARGEST_PIECE_PX = 1024  # of the piece as it is put back
 
 @dataclass(frozen=True)
 class Surface:
-    """Markers 4×2 mm by id (`piece_ids`: those inside the cut), and rectangles in mm."""
+    """Markers 4×2 mm by id (`piece_ids`: those inside the cut), and `rect_mm`: the piece, which the design fills, or
+    what shows of it on a page of tiles.
+    """
 
     dictionary: str
     corners_mm: dict[int, np.ndarray]
     piece_ids: frozenset[int]
     rect_mm: Rect
-    piece_mm: Rect
     label: Label  # what the page's code says
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
@@ -83,7 +83,7 @@ def surface_of(manifest: Manifest) -> Surface:
         return _assembled(manifest)
     corners = _corners_by_page(manifest)[page]
     piece = frozenset(i for i, c in corners.items() if _inside(manifest.cut_mm, c))
-    return _surface(manifest, corners, piece, _design_rect(manifest))
+    return _surface(manifest, corners, piece, manifest.cut_mm)
 
 
 def _assembled(manifest: Manifest) -> Surface:
@@ -101,7 +101,7 @@ def _assembled(manifest: Manifest) -> Surface:
         points = np.concatenate(list(corners[number].values()))
         x, y, w, h = (float(v) for v in (*points.min(0), *np.ptp(points, axis=0)))
         pages.append(_surface(manifest, corners[number], frozenset(), (x, y, w, h)))
-    return _surface(manifest, piece, frozenset(piece), _design_rect(manifest), tuple(pages))
+    return _surface(manifest, piece, frozenset(piece), manifest.cut_mm, tuple(pages))
 
 
 def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surface:
@@ -110,7 +110,6 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
         corners_mm=corners,
         piece_ids=piece_ids,
         rect_mm=rect_mm,
-        piece_mm=manifest.cut_mm,
         label=label_of(manifest),
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
@@ -147,12 +146,12 @@ def look_of(pixels: np.ndarray, surface: Surface, printer: Printer) -> Promised:
 
 
 def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.ndarray:
-    """Linear light H×W×3 over the design's rectangle with the markers that lie on it; `ink` is their black."""
+    """Linear light H×W×3 over the piece with the markers that lie on it; `ink` is their black."""
     on_it = {
         i: surface.corners_mm[i] for i in sorted(surface.piece_ids) if _inside(surface.rect_mm, surface.corners_mm[i])
     }
     if not on_it:
-        return design  # in a frame of markers, as pieces once were
+        return design
     finer = max(1, DESIGN_PX // max(design.shape))  # a design of few pixels: markers' modules are smaller
     design = design.repeat(finer, 0).repeat(finer, 1)
     x, y, *size_mm = surface.rect_mm
@@ -163,28 +162,15 @@ def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.nd
     return np.where(reserved[..., None], light, design)
 
 
-def piece_picture(surface: Surface, design: np.ndarray, ink: np.ndarray) -> np.ndarray:
-    """The whole piece as float32 linear light H×W×3 over `piece_mm`; `design` as `with_markers` makes it.
+def piece_picture(surface: Surface, design: np.ndarray) -> np.ndarray:
+    """The whole piece as float32 linear light H×W×3 in whole pixels; `design` as `with_markers` makes it.
 
-    Scissors, folds, what a shop adds, and the swatches that pieces once had are left out. Edges fall on whole pixels.
+    Scissors, folds and what a shop adds are left out.
     """
-    x, y, w, h = surface.piece_mm
+    _, _, w, h = surface.rect_mm
     px_per_mm = _LARGEST_PIECE_PX / max(w, h)
-    picture = np.ones((max(1, round(h * px_per_mm)), max(1, round(w * px_per_mm)), 3), np.float32)
-
-    def paste(rect, pixels: np.ndarray, how: int) -> None:
-        corners = (np.array(rect_corners(rect))[[0, 2]] - (x, y)) * px_per_mm
-        (x0, y0), (x1, y1) = np.clip(np.rint(corners), 0, picture.shape[1::-1]).astype(int)
-        if x1 > x0 and y1 > y0:
-            size = int(x1 - x0), int(y1 - y0)
-            picture[y0:y1, x0:x1] = cv2.resize(pixels.astype(np.float32), size, interpolation=how)
-
-    paste(surface.rect_mm, design, cv2.INTER_AREA)
-    beside = [i for i in sorted(surface.piece_ids) if not _inside(surface.rect_mm, surface.corners_mm[i])]
-    for i, cells in zip(beside, cells_of(surface.dictionary, beside), strict=True):
-        low, high = surface.corners_mm[i].min(0), surface.corners_mm[i].max(0)
-        paste((*low, *(high - low)), ink + cells[..., None] * (1 - ink), cv2.INTER_NEAREST)
-    return picture
+    size_px = max(1, round(w * px_per_mm)), max(1, round(h * px_per_mm))
+    return cv2.resize(design.astype(np.float32), size_px, interpolation=cv2.INTER_AREA)
 
 
 def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
@@ -194,10 +180,6 @@ def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
         if marker.dictionary == manifest.markers[0].dictionary:
             pages.setdefault(marker.page, {})[marker.id] = np.array(marker.corners_mm)
     return pages
-
-
-def _design_rect(manifest: Manifest) -> Rect:
-    return manifest.design.rect_mm if manifest.design else manifest.cut_mm
 
 
 def _inside(rect: Rect, points: np.ndarray) -> bool:

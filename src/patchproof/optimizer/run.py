@@ -26,7 +26,7 @@ from pydantic import BaseModel, Field
 from patchproof.base.input import is_file, read_json
 from patchproof.base.output import check_folder, make_folder, write_whole
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Positive, Refused, validated
+from patchproof.base.strict import Refused, validated
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
@@ -167,7 +167,6 @@ def load_run(folder: str | Path) -> Run:
     details = read_json(folder / RUN_FILE, "a finished run", "optimize again")
     record = validated(_Record, details, str(folder / RUN_FILE))
     settings, promise = record.settings, record.promise
-    _refuse_framed(settings, record.placement, folder)
     try:
         base = (folder / record.scene_folder).resolve()
         glb = (folder / _GIVEN).read_bytes() if is_file(folder / _GIVEN) else None
@@ -182,10 +181,6 @@ def load_run(folder: str | Path) -> Run:
     return Run(folder, scene, design, promise, details)
 
 
-class _Placement(BaseModel):
-    piece_mm: tuple[Positive, Positive] | None = None
-
-
 class _Imported(BaseModel):
     sha256: str
 
@@ -195,23 +190,11 @@ class _Record(BaseModel):
 
     settings: SceneSettings
     promise: Promise
-    placement: _Placement | None
     scene_folder: str
     seed: NotNegativeInt
     sheet_id: str
     printer: dict[str, Any]
     imported: _Imported | None = None
-
-
-def _refuse_framed(settings: SceneSettings, placement: _Placement | None, folder: Path) -> None:
-    """Refuse a run from when a patch's size was that of the design inside a frame of markers."""
-    width_mm, piece_mm = settings.patch.width_mm, placement and placement.piece_mm
-    if piece_mm is not None and width_mm is not None and abs(piece_mm[0] - width_mm) > 0.01:
-        raise Refused(
-            "a run whose design fills its piece",
-            f"one from before in {folder}, with a frame round its {width_mm:g} mm",
-            f"verify its sheets, but optimize again, with the whole piece's width_mm = {piece_mm[0]:.4g}",
-        )
 
 
 def _clear(out: Path) -> None:

@@ -90,23 +90,22 @@ def unroll(
     srgb: np.ndarray,
     corners_px: Mapping[int, np.ndarray],
     corners_mm: Mapping[int, np.ndarray],
-    sheet_mm,
     rect_mm,
     focal_px: float | None = None,
     focal_spread: float = UNKNOWN_FOCAL,
 ) -> Unrolled | None:
-    """The sheet (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
+    """The piece (a rectangle x, y, width, height on the page) made flat; None where a plane explains it as well.
 
-    The uncertainty is that of the corners of `rect_mm`; the focal length is known to `focal_spread` of its logarithm.
+    The uncertainty is that of its corners; the focal length is known to `focal_spread` of its logarithm.
     """
     explained = explain(corners_px, corners_mm, (srgb.shape[1], srgb.shape[0]), focal_px, focal_spread)
     if explained is None:
         return None
     flat, mm, px, best = explained.flat, explained.mm, explained.px, explained.shape
-    grid = sheet_mm[:2] + np.multiply(sheet_mm[2:], GRID)
+    grid = rect_mm[:2] + np.multiply(rect_mm[2:], GRID)
     straight = fit_homography(grid, best.px(grid))
     error = np.linalg.norm(apply_homography(flat, mm) - px, axis=1).max()  # what is moved lies this near, about
-    picture = _straightened(srgb, best.px, straight, sheet_mm, margin_px=error)
+    picture = _straightened(srgb, best.px, straight, rect_mm, margin_px=error)
     # the covariance of the homography alone says nothing about the bend: `uncertainty_mm` has it all
     ids = common_corners(corners_px, corners_mm)[0]
     left = best.px(mm) - px

@@ -71,7 +71,14 @@ def chart_manifest(count: int) -> Manifest:
     ]
     corners = [geometry.rect_corners((*at, MARKER_MM, MARKER_MM)).tolist() for at in _MARKERS_MM]
     markers = [{"dictionary": DICTIONARY, "id": 7 + i, "corners_mm": c, "page": 1} for i, c in enumerate(corners)]
-    head = {"sheet_id": "CHART00000", "kind": "blank", "page_mm": PAGE_MM, "design": None, "promise": None}
+    head = {
+        "version": 2,
+        "sheet_id": "CHART00000",
+        "kind": "blank",
+        "page_mm": PAGE_MM,
+        "design": None,
+        "promise": None,
+    }
     where = {"cut_mm": (100.0, 6.0, 1.0, 1.0), "ruler_mm": (100.0, 100.0), "settings": {}}
     return Manifest.model_validate(head | where | {"markers": markers, "chart": swatches})
 

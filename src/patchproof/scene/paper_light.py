@@ -10,7 +10,6 @@ size above its middle a bare lamp is met within 1 %, above its edge within 4 %.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,6 @@ from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.sheets.piece import Piece, marker_rect
-from patchproof.sheets.rects import RectMm
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
 _MOST_CLIPPED = 0.5  # share of the white paper
@@ -39,14 +37,9 @@ class PaperLight:
     noise: float
 
 
-def paper_light(
-    srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_px: float, swatches_mm: Sequence[RectMm] = ()
-) -> PaperLight:
-    """The light on a blank piece in a uint8 photograph; `CannotJudge` where it shows too little white paper.
-
-    `swatches_mm` are on the piece, too, as on blanks of the former kind.
-    """
-    codes, mm = _white_pixels(srgb, px_from_piece, piece, blur_px, swatches_mm)
+def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_px: float) -> PaperLight:
+    """The light on a blank piece in a uint8 photograph; `CannotJudge` where it shows too little white paper."""
+    codes, mm = _white_pixels(srgb, px_from_piece, piece, blur_px)
     if len(codes) < _LEAST_PIXELS:
         raise CannotJudge("too_small", len(codes), _LEAST_PIXELS, "come closer: too little white paper is in view")
     clipped = (codes >= CLIPPED_CODE).any(1)
@@ -68,7 +61,7 @@ def quadratic_terms(mm: np.ndarray, size_mm: tuple[float, float]) -> np.ndarray:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], 1)
 
 
-def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float, swatches_mm) -> tuple[np.ndarray, np.ndarray]:
+def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Codes N×3 and piece millimeters N×2 of pixels that see nothing but white paper."""
     whole = (0.0, 0.0, *piece.size_mm)
     quad = apply_homography(px_from_piece, rect_corners(whole))
@@ -82,7 +75,7 @@ def _white_pixels(srgb, px_from_piece, piece: Piece, blur_px: float, swatches_mm
     px_per_mm = min(mean * np.sqrt(np.cos(np.radians(tilt))) for mean, tilt in scales)
     clear_mm = (1 + 3 * blur_px) / max(px_per_mm, 1e-6)
     white = _inside(mm, whole, -clear_mm - _CUT_SLACK_MM)
-    for rect in (*map(marker_rect, piece.markers), *swatches_mm):
+    for rect in map(marker_rect, piece.markers):
         white &= ~_inside(mm, rect, clear_mm)
     return srgb[rows.ravel()[white], columns.ravel()[white]], mm[white]
 

@@ -41,7 +41,6 @@ from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, with_ids
-from patchproof.sheets.rects import holds, moved
 from patchproof.sheets.template import load_template
 
 LEAST_PHOTOS = 6
@@ -174,8 +173,7 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
     blur = float(np.sqrt((blur * scale) ** 2 + max(0.0, scale**2 - 1) / 4))
     height, width = picture.srgb.shape[:2]
     picture_from_photo = np.linalg.inv(flat.photo_from((width, height), photo_px))
-    swatches = [moved(s.rect_mm, (-x, -y)) for s in manifest.chart if holds(manifest.cut_mm, s.rect_mm)]
-    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur, swatches)
+    light = paper_light(picture.srgb, picture_from_photo @ photo_from_piece, piece, blur)
     return BasePhoto(path.name, picture, photo_from_piece, light, blur)
 
 

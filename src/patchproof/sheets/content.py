@@ -14,7 +14,7 @@ import numpy as np
 from patchproof.base.output import image_bytes
 from patchproof.base.strict import Refused
 from patchproof.sheets.layout import PageLayout
-from patchproof.sheets.manifest import WHOLE_PIECE, Design, Manifest, Promise, Swatch, design_sha256
+from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256
 from patchproof.sheets.piece import Piece, on_paper, printed
 from patchproof.sheets.rects import RectMm, size_text
 from patchproof.sheets.template import BoardTemplate, Template
@@ -93,7 +93,7 @@ def page_manifest(
 ) -> Manifest:
     """The manifest of a sheet's one page, without a design."""
     return Manifest(
-        version=WHOLE_PIECE,
+        version=2,
         sheet_id=sheet_id,
         kind=kind,
         page_mm=page.page_mm,

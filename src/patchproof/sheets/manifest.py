@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from patchproof.base.goal import Goal
 from patchproof.base.input import opened_picture, read_json
 from patchproof.base.sessions import Spread, in_sessions, spread_of
-from patchproof.base.strict import Finite, Gray, NotNegativeRange, Refused, Share, Strict, validated
+from patchproof.base.strict import Finite, NotNegativeRange, Refused, Share, Strict, validated
 
 Mm = Annotated[Finite, Field(ge=-1e5, le=1e5)]
 SizeMm = Annotated[Finite, Field(ge=0.1, le=1e5)]
@@ -28,7 +28,6 @@ Point = tuple[Mm, Mm]
 Rect = tuple[Mm, Mm, SizeMm, SizeMm]
 Interval = tuple[Share, Share]
 SignedInterval = tuple[Finite, Finite]
-WHOLE_PIECE = 2  # the design fills the piece; before (1) it lay in a frame of markers and swatches
 Worth = Literal["better", "no better", "worse"]
 PAGE_CODE = "^patchproof:([0-9A-Z]{10}):([0-9a-z]+)$"  # what a page's QR code says
 _LEAST_MARKER_MM = 1.0
@@ -128,11 +127,9 @@ class ModelClaim(Strict):
 
 
 class ControlClaim(Strict):
-    """A control on `n` of the same conditions (None: an earlier version did not say); `difference` is the design's rate
-    there minus the control's.
-    """
+    """A control on `n` of the same conditions; `difference` is the design's rate there minus the control's."""
 
-    n: Count | None = None
+    n: Count
     rate: Share
     interval: Interval
     confidence: Share
@@ -153,9 +150,9 @@ class ConditionClaim(Strict):
 
 class Promise(Strict):
     """The predicted rate of the primary (first) model, made before printing: of `n` conditions, `per_session` in a row
-    of one session. Promises from before sessions drew everything anew for each condition. `places` has a number for
-    each session's place where some share one. A `draft` was made of few conditions, to try things out. `outermost_mm`
-    are the object's outermost points in the piece's frame, where a detector's boxes are compared with it.
+    of one session. `places` has a number for each session's place where some share one. A `draft` was made of few
+    conditions, to try things out. `outermost_mm` are the object's outermost points in the piece's frame, where a
+    detector's boxes are compared with it.
     """
 
     target: Target
@@ -167,8 +164,14 @@ class Promise(Strict):
     places: tuple[Annotated[int, Field(ge=0, le=10**6)], ...] = ()
     draft: bool = False
     outermost_mm: Annotated[tuple[tuple[Mm, Mm, Mm], ...], Field(max_length=2000)] = ()
-    controls: dict[Annotated[str, Gray], ControlClaim]
+    controls: dict[str, ControlClaim]
     conditions: tuple[ConditionClaim, ...]
+
+    @model_validator(mode="after")
+    def _says_all_conditions(self) -> Promise:
+        if len(self.conditions) != self.n:
+            raise ValueError(f"must say all of its {self.n} conditions, not {len(self.conditions)}")
+        return self
 
     @property
     def sessions(self) -> int:
@@ -179,8 +182,6 @@ class Promise(Strict):
     def spread(self) -> Spread:
         """What its conditions say of photographs to come."""
         hits = [condition.recognized for condition in self.conditions]
-        if len(hits) != self.n:  # of pages that say no conditions
-            hits = [number < round(self.rate * self.n) for number in range(self.n)]
         places = self.places if len(self.places) == self.sessions else ()
         return spread_of(*in_sessions(hits, self.per_session, places))
 
@@ -243,7 +244,7 @@ class _ImportedUsed(_Loose):
 
 
 class _Used(_Loose):
-    """What is read of a manifest's settings when its sheet is judged; of them versions may differ in all else."""
+    """What is read of a manifest's settings when its sheet is judged; other keys may say anything."""
 
     printer: _PrinterUsed | None = None
     camera: _CameraUsed = _CameraUsed()
@@ -255,9 +256,9 @@ class _Used(_Loose):
 class Manifest(Strict):
     """A whole SHEET.json; `design` is null on pages that carry none, `promise` on pages that promise nothing."""
 
-    version: Annotated[int, Field(ge=1, le=WHOLE_PIECE)] = 1
+    version: Literal[2]
     sheet_id: Annotated[str, Field(pattern="^[0-9A-Z]{10}$")]
-    kind: Annotated[str, Gray]  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
+    kind: str  # "design", or a control: "mean", "gray", "noise", "shuffled", "blank"
     page_mm: tuple[SizeMm, SizeMm]
     design: Design | None
     markers: Annotated[tuple[Marker, ...], Field(min_length=1)]
@@ -276,11 +277,11 @@ class Manifest(Strict):
         _Used.model_validate(settings)
         return settings
 
-    @model_validator(mode="before")
-    @classmethod
-    def _without_card(cls, data: Any) -> Any:
-        """Pages once carried a bank card's outline; those that were printed then must still be judged."""
-        return {key: data[key] for key in data if key != "card_mm"} if isinstance(data, dict) else data
+    @model_validator(mode="after")
+    def _design_fills_the_piece(self) -> Manifest:
+        if self.design is not None and self.design.rect_mm != self.cut_mm:
+            raise ValueError("make the sheet again: design.rect_mm is not cut_mm, and a design fills its piece")
+        return self
 
 
 def design_sha256(pixels: np.ndarray) -> str:

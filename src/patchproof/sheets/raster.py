@@ -65,7 +65,7 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
     pixels = np.full((height, width, 3), 255, np.uint8)
     px_per_mm = np.array([width, height]) / manifest.cut_mm[2:]
     for tile in manifest.tiles:
-        start_mm = _piece_from_page(manifest, tile, tile.cut_mm[:2])
+        start_mm = _piece_from_page(tile, tile.cut_mm[:2])
         # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
         first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
         last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=[width, height])
@@ -81,11 +81,9 @@ def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tup
     return _of_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
 
 
-def _piece_from_page(manifest: Manifest, tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
+def _piece_from_page(tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
     """A point of a tile's page in piece millimeters."""
-    # the cut line and the first tile's design lie on one page: they differ by the frame that pieces once had
-    frame = np.array(manifest.tiles[0].page_from_design_mm)[:, 2] - manifest.cut_mm[:2]
-    return np.array(point_mm) - np.array(tile.page_from_design_mm)[:, 2] + frame
+    return np.array(point_mm) - np.array(tile.page_from_design_mm)[:, 2]
 
 
 def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:

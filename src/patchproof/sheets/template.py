@@ -136,9 +136,6 @@ class BoardTemplate(Strict):
 def load_template(name_or_file: str | Path) -> Template:
     """The shipped template of that name, or the one in that file; an unknown name is refused with the nearest."""
     path, data = template_data(name_or_file)
-    if "card" in data:  # pages once had a bank card's outline, with words in it that would be printed alone
-        do = "delete it and its text: a scan or a ruler shows a print's size"
-        raise Refused(f"no bank card in {path}", "[card]", do)
     template = validated(Template, data, str(path))
     swatches = template.chart.columns * template.chart.rows
     if swatches < 48:
