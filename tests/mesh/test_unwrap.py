@@ -19,6 +19,9 @@ from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, Part, from_parts
 from patchproof.mesh.texels import coverage
 from patchproof.mesh.unwrap import has_place, unwrap
+from patchproof.render.photograph import photograph
+from patchproof.render.stage import set_stage
+from patchproof.scene.scene import make_scene
 from patchproof.scene.texture import texture_canvas
 
 SOUP = np.random.default_rng(0).normal(size=(90, 3))
@@ -174,7 +177,19 @@ def test_needles_and_specks_do_not_blow_up_the_atlas(thin):
     assert np.isfinite(canvas.mesh.corner_uv).all()
 
 
-def test_a_missing_xatlas_is_named(monkeypatch):
+def test_without_xatlas_textures_of_such_meshes_are_refused_and_all_else_works(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    with pytest.raises(Refused, match=r"the package xatlas .* got none: pip install xatlas"):
-        atlas(soup())
+    box = trimesh.creation.box((3, 2, 2))  # without texture coordinates
+    settings = {
+        "object": {"mesh": "python:box", "length_mm": 300},
+        "patch": {"width_mm": 90, "height_mm": 90},
+        "target": {"label": "carton", "models": ["builtin"]},
+        "camera": {"photo_px": [64, 64]},
+    }
+    scene = make_scene(settings, box)
+    assert photograph(set_stage(scene), None, scene.draw("train", 1), (64, 64)).std() > 0.01
+    with pytest.raises(Refused, match=r'the package xatlas.*got none: pip install "patchproof\[textures\]"'):
+        make_scene(settings | {"patch": {"kind": "texture"}}, box)
+    mug = settings["object"] | {"mesh": "primitive:mug"}  # which has texture coordinates
+    warnings = make_scene(settings | {"object": mug, "patch": {"kind": "texture"}}).canvas.warnings
+    assert not any("unwrapped" in warning for warning in warnings)

@@ -85,9 +85,9 @@ def _packed(points: np.ndarray, faces: np.ndarray, part: np.ndarray, texels: int
     """(uv F×3×2, (width, height)) of one atlas in which no chart spans two of the parts F."""
     try:
         import xatlas
-    except ModuleNotFoundError as error:  # it has no wheels for some platforms
-        do = "pip install xatlas, or give the mesh texture coordinates"
-        raise Refused("the package xatlas for a mesh without texture coordinates", "none", do) from error
+    except ModuleNotFoundError as error:
+        do = 'pip install "patchproof[textures]", or give the mesh texture coordinates'
+        raise Refused("the package xatlas, to unwrap a mesh without texture coordinates", "none", do) from error
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     for index in np.unique(part):
         atlas.add_mesh(points.astype(np.float32), faces[part == index].astype(np.uint32))
