@@ -331,6 +331,16 @@ def test_a_new_scene_of_images_takes_their_most_frequent_label(tmp_path):
     assert not (tmp_path / "out" / OBJECT).exists()
 
 
+def test_a_preview_of_a_texture_says_how_many_texels_a_mask_is_drawn_for(tmp_path):
+    (tmp_path / "scene.toml").write_text(
+        '[object]\nmesh = "primitive:mailbox"\nlength_mm = 300\n[patch]\nkind = "masked"\nmaterials = ["body"]\n'
+        '[target]\nlabel = "mailbox"\nmodels = ["builtin"]\n[camera]\nphoto_px = [96, 96]\n'
+    )
+    found = preview_scene(tmp_path / "scene.toml", tmp_path / "out")
+    (line,) = (line for line in found.lines if line.startswith("texture: "))
+    assert re.fullmatch(r'texture: "body", 1024 × 1024 texels, of which \d+% may change', line)
+
+
 def test_a_piece_without_a_place_is_left_off_where_it_would_not_lie(tmp_path):
     scene = {
         "object": {"mesh": "primitive:mug", "length_mm": 100, "up": "y"},

@@ -149,6 +149,28 @@ def test_an_image_chooses_texels_at_any_size(tmp_path):
         assert np.array_equal(canvas.mesh.materials[0].texture_srgb, PAINT)  # the bare object stays as it is
 
 
+@pytest.mark.parametrize(("size", "said"), [((128, 256), False), ((256, 512), True), ((127, 256), True)])
+def test_a_mask_of_another_size_than_its_texture_is_said(tmp_path, size, said):
+    Image.fromarray(np.full(size[::-1], 255, np.uint8)).save(tmp_path / "mask.png")
+    gray = Material("gray", (1.0, 1.0, 1.0), np.full((256, 128, 3), 60, np.uint8))
+    warnings = texture_canvas(from_parts([square(0, material=gray)], 100), masked(mask="mask.png"), tmp_path).warnings
+    assert len(warnings) == said
+    if said:
+        assert warnings[0].startswith(
+            f"the mask of {size[0]} × {size[1]} pixels is laid over 128 × 256 texels: a texel"
+        )
+
+
+def test_a_mask_of_a_whole_multiple_of_the_texels_chooses_what_was_drawn(tmp_path):
+    drawn = np.zeros((960, 960), np.uint8)
+    drawn[320:640, 320:640] = 255
+    Image.fromarray(drawn).save(tmp_path / "mask.png")
+    material = Material("m", (1.0, 1.0, 1.0), np.full((96, 96, 3), 60, np.uint8))
+    mesh = from_parts([square(0, material=material)], 100)
+    (mask,) = texture_canvas(mesh, masked(mask="mask.png"), tmp_path).mask
+    assert mask[32:64, 32:64].all() and mask.sum() == 32 * 32
+
+
 def test_unusable_masks_are_refused(tmp_path):
     mesh = from_parts([square(0, cell(0, 0))], 100)
 

@@ -1,10 +1,10 @@
 """`preview`: a look at a scene before anything is optimized, in seconds.
 
 In: a scene file. Out: a folder with `preview.html`, which needs nothing from outside of itself and asks nobody for
-anything, and for a mesh `preview.glb`; where its own texture may change, `uv.png` to draw a mask on. Where the piece is
-refused, the page shows the object without it and says why: that is when a look helps most. A piece that is still to be
-placed is shown in the middle of the side that azimuth 0 faces. Left out on purpose: anything that a design decides;
-that is `plan`'s.
+anything, and for a mesh `preview.glb`. Where the piece is refused, the page shows the object without it and says why:
+that is when a look helps most. A piece that is still to be placed is shown in the middle of the side that azimuth 0
+faces. Left out on purpose: anything that a design decides, which is `plan`'s; layouts of texture coordinates to draw
+masks on, which 3D programs such as Blender export.
 """
 
 from __future__ import annotations
@@ -26,10 +26,9 @@ from patchproof.app.begin.sides import (
     side_views,
     stretch_colors,
 )
-from patchproof.app.begin.uv_layout import uv_layouts
 from patchproof.app.begin.views import Look, looks
 from patchproof.base.color import codes_of
-from patchproof.base.output import image_bytes, new_folder, write_whole
+from patchproof.base.output import new_folder, write_whole
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.classifier.labels import find_labels
@@ -47,9 +46,8 @@ from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import build_scene
 from patchproof.scene.texture import whole_colors
 from patchproof.scene.texture_scene import TextureScene
-from patchproof.sheets.pdf import numbered
 
-PAGE, OBJECT, LAYOUT = "preview.html", "preview.glb", "uv.png"
+PAGE, OBJECT = "preview.html", "preview.glb"
 _TEXTURE_PX = 1024  # of the object's textures in the page
 _MOST_BYTES = 16 << 20  # of an object that the page itself turns
 _DESIGN_PX = 256  # of the gray design on the piece, along its longer side
@@ -69,7 +67,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
     """Look at the scene of a file; what cannot be read, and networks that cannot be used, are refused."""
     path = Path(scene_path)
     settings = load_scene_settings(path)
-    with new_folder(out, (PAGE, OBJECT, "uv*.png"), overwrite) as folder:
+    with new_folder(out, (PAGE, OBJECT), overwrite) as folder:
         scene, refused = _scene(settings, path.resolve().parent)
         classifiers = [load_classifier(name, scene.base) for name in settings.target.models]
         indices, unknown = _indices(settings, [classifier.labels for classifier in classifiers])
@@ -78,8 +76,7 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
         warnings = (*scene.warnings, *_lying(scene, settings))
         if isinstance(scene, MeshScene):
             _write_object(stage, folder / OBJECT)
-        layouts = _write_layouts(scene, folder)
-        facts = _facts(scene, settings) + [("texture", text) for text, _ in layouts]
+        facts = _facts(scene, settings)
         lines = tuple(f"{name}: {text}" for name, text in facts) + tuple(_answers(settings, seen))
         problems = [text for text in (refused, unknown) if text]
         text = page(
@@ -93,7 +90,6 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             if isinstance(scene, MeshScene)
             else [],
             maps=_maps(scene) if isinstance(scene, PatchScene) else [],
-            layouts=layouts,
             model=_model(folder / OBJECT, scene) if isinstance(scene, MeshScene) else None,
             viewer=viewer() if scene.HAS_OBJECT else "",
             looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
@@ -175,11 +171,23 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
         facts.append(("piece", "not placed"))
     else:
         facts.append(("piece", f"{width:g} × {height:g} mm: {lies['reason']}"))
+    if isinstance(scene, TextureScene):
+        facts.extend(("texture", text) for text in _textures(scene))
     if settings.patch.place == "auto":
         side = settings.patch.side
         tried = f"until then it is tried on the {SIDE_NAMES[side]} ({side})" if isinstance(scene, PatchScene) else ""
         facts.append(("place", f'"auto": optimize searches the object for it{"; " if tried else ""}{tried}'))
     return facts
+
+
+def _textures(scene: TextureScene) -> list[str]:
+    """Each texture that may change, of how many texels a mask is drawn for."""
+    canvas = scene.canvas
+    return [
+        f'"{name}", {mask.shape[1]} × {mask.shape[0]} texels, of which {mask.mean():.0%} may change'
+        for name, mask in zip(canvas.names, canvas.mask, strict=True)
+        if mask.any()
+    ]
 
 
 def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
@@ -221,21 +229,6 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
             }
         )
     return maps
-
-
-def _write_layouts(scene: Scene, folder: Path) -> list[tuple[str, str]]:
-    """A picture beside the page for each texture that may change: what it is, and itself for the page."""
-    layouts, shown = uv_layouts(scene.canvas) if isinstance(scene, TextureScene) else [], []
-    for number, layout in enumerate(layouts):
-        name = LAYOUT if len(layouts) == 1 else numbered(LAYOUT, number)
-        write_whole(folder / name, image_bytes(layout.picture, "PNG"))
-        width, height = layout.texels
-        text = (
-            f'{name} is the layout of "{layout.material}", {width} × {height} texels; {len(layout.numbered)} of its '
-            f"{layout.faces} faces have room for their numbers"
-        )
-        shown.append((text, data_uri(jpeg(_reduced(layout.picture)))))
-    return shown
 
 
 def _model(path: Path, scene: MeshScene) -> dict[str, str] | None:
