@@ -120,7 +120,7 @@ def write_together(contents: dict[Path, bytes]) -> None:
 
 
 def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None = None) -> bytes:
-    """uint8 sRGB H×W×3 (or with alpha) as a "PNG" or "JPEG" file; `options` are Pillow's of that kind."""
+    """uint8 sRGB H×W×3 (or with alpha) as a "PNG", "JPEG" or "WEBP" file; `options` are Pillow's of that kind."""
     from PIL import Image
 
     buffer = io.BytesIO()

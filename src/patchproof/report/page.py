@@ -1,8 +1,4 @@
-"""One HTML page from a template; values in it are escaped, an unknown one is an error.
-
-A page that turns a 3D object has Google's model-viewer inside, which this folder keeps as it was published, with its
-license beside it: a page that is opened as a file may not load modules or models from others.
-"""
+"""One HTML page from a template; values in it are escaped, an unknown one is an error."""
 
 from __future__ import annotations
 
@@ -25,12 +21,6 @@ def page(template: str, folder: Path = Path(__file__).parent, **values: object) 
     environment.filters |= {"percent": _percent, "figure": _figure}
     environment.tests["figure"] = lambda value: isinstance(value, (int, float, Estimate)) or value is None
     return environment.get_template(template).render(values)
-
-
-def viewer() -> str:
-    """The script that knows `<model-viewer>`, without the line that names a file for debuggers."""
-    script = (Path(__file__).parent / "model-viewer-umd.min.js").read_text(encoding="utf-8")
-    return script.partition("//# sourceMappingURL=")[0]
 
 
 def _percent(share: float | None) -> str:

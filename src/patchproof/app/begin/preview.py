@@ -26,9 +26,10 @@ from patchproof.app.begin.sides import (
     side_views,
     stretch_colors,
 )
+from patchproof.app.begin.turntable import turntable
 from patchproof.app.begin.views import Look, looks
 from patchproof.base.color import codes_of
-from patchproof.base.output import new_folder, write_whole
+from patchproof.base.output import image_bytes, new_folder, write_whole
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.classifier.labels import find_labels
@@ -37,10 +38,10 @@ from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, Part
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.images import base64_uri, data_uri, jpeg, png
-from patchproof.report.page import page, viewer
+from patchproof.report.page import page
 from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.interface import Scene
-from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.scene import build_scene
@@ -48,8 +49,8 @@ from patchproof.scene.texture import whole_colors
 from patchproof.scene.texture_scene import TextureScene
 
 PAGE, OBJECT = "preview.html", "preview.glb"
-_TEXTURE_PX = 1024  # of the object's textures in the page
-_MOST_BYTES = 16 << 20  # of an object that the page itself turns
+_TEXTURE_PX = 1024  # of the textures in the GLB file
+_FIRST_DEG = 30  # to the right of the front: shown before the slider is moved
 _DESIGN_PX = 256  # of the gray design on the piece, along its longer side
 
 
@@ -74,8 +75,12 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
         stage = set_stage(scene)
         seen = looks(stage, classifiers, indices)
         warnings = (*scene.warnings, *_lying(scene, settings))
+        sides, turns = [], []
         if isinstance(scene, MeshScene):
-            _write_object(stage, folder / OBJECT)
+            design = _gray_design(stage)
+            _write_object(stage, design, folder / OBJECT)
+            sides = [(view, data_uri(png(view.picture))) for view in side_views(stage)]
+            turns = [(turn, _webp(turn.picture)) for turn in turntable(stage, design)]
         facts = _facts(scene, settings)
         lines = tuple(f"{name}: {text}" for name, text in facts) + tuple(_answers(settings, seen))
         problems = [text for text in (refused, unknown) if text]
@@ -86,12 +91,10 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             facts=facts,
             problems=problems,
             warnings=warnings,
-            sides=[(view, data_uri(png(view.picture))) for view in side_views(stage)]
-            if isinstance(scene, MeshScene)
-            else [],
+            sides=sides,
             maps=_maps(scene) if isinstance(scene, PatchScene) else [],
-            model=_model(folder / OBJECT, scene) if isinstance(scene, MeshScene) else None,
-            viewer=viewer() if scene.HAS_OBJECT else "",
+            turns=turns,
+            first_deg=_FIRST_DEG,
             looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
             summaries=_answers(settings, seen),
         )
@@ -231,33 +234,30 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
     return maps
 
 
-def _model(path: Path, scene: MeshScene) -> dict[str, str] | None:
-    """What the page's viewer turns and from where it first looks; None where that is too much for a page."""
-    content = path.read_bytes()
-    if len(content) > _MOST_BYTES:
-        return None
-    x, _, z = scene.normal
-    azimuth_deg = np.degrees(np.arctan2(x, z)) + 25
-    return {"source": base64_uri(content, "model/gltf-binary"), "orbit": f"{azimuth_deg:.0f}deg 72deg auto"}
-
-
-def _write_object(stage: Stage, path: Path) -> None:
-    scene = stage.scene
-    if not isinstance(scene, MeshScene):
-        raise ValueError("a scene of pictures has no object to turn")
+def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
+    """The object as a GLB file, with the piece that shows `design` where a scene has one."""
+    scene = needs_mesh(stage.scene)
     mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
     textures = [_reduced(m.texture_srgb) for m in mesh.materials if m.texture_srgb is not None]
-    piece = _gray_piece(stage, scene) if isinstance(scene, PatchScene) else None
+    piece = None
+    if isinstance(scene, PatchScene):
+        laid, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
+        piece = Part(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
     write_whole(path, lambda part: write_glb(mesh, textures, part, piece))
 
 
-def _gray_piece(stage: Stage, scene: PatchScene) -> Part:
-    """The printed piece with a gray design where it lies."""
-    laid, scale = scene.placement, _DESIGN_PX / max(scene.piece.size_mm)
-    width, height = (max(8, round(side * scale)) for side in scene.piece.size_mm)
-    shown = stage.look.shown(torch.full((3, height, width), 0.5))
-    material = Material("piece", (1.0, 1.0, 1.0), codes_of(shown.srgb).cpu().numpy())
-    return Part(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
+def _gray_design(stage: Stage) -> np.ndarray | None:
+    """The printed piece with a gray design, uint8 h×w×3; None where no piece hangs on the object."""
+    if not isinstance(stage.scene, PatchScene):
+        return None
+    size_mm = stage.scene.piece.size_mm
+    width, height = (max(8, round(side * _DESIGN_PX / max(size_mm))) for side in size_mm)
+    return codes_of(stage.look.shown(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()
+
+
+def _webp(picture: np.ndarray) -> str:
+    """A picture for the page in 3 to 10 kB: as JPEG it would be twice as large."""
+    return base64_uri(image_bytes(picture, "WEBP", {"quality": 80}), "image/webp")
 
 
 def _reduced(texture: np.ndarray) -> np.ndarray:
