@@ -224,8 +224,12 @@ def _even_for_sun(light: Light, facing: Facing) -> Light:
     return _evenly(light, "directional", light.directional * cosine)
 
 
-def _even_for_lamp(light: Light, facing: Facing) -> Light:
-    return _evenly(light, "point", light.point * facing(light.point_azimuth_deg, light.point_elevation_deg))
+def _sun_for_lamp(light: Light, facing: Facing) -> Light:
+    """Where there is no sun, one that stands where the lamp stood, as strong on the patch; else even light."""
+    if light.directional.any():
+        return _evenly(light, "point", light.point * facing(light.point_azimuth_deg, light.point_elevation_deg))
+    place = {"light_azimuth_deg": light.point_azimuth_deg, "light_elevation_deg": light.point_elevation_deg}
+    return replace(light, directional=light.point, point=np.zeros_like(light.point), **place)
 
 
 def _evenly(light: Light, source: str, on_patch: np.ndarray) -> Light:
@@ -262,7 +266,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("background", _PLACE, 11, ("background",), _stacked, anew=("x", "y"), switch=False),
     Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
     Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
-    Effect("lamp", _LAMP | _LAMP_MM, 25, instead=_even_for_lamp),
+    Effect("lamp", _LAMP | _LAMP_MM, 25, instead=_sun_for_lamp),
     Effect("uneven ambient", _SH2, 29, ("sh2", "sh2_coefficients"), _uneven),
     Effect("gloss", {"gloss": "light.gloss", "shininess": "light.shininess"}, 38, only_paper=True),
     Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
