@@ -9,7 +9,8 @@ What takes an effect's place is what `plan` puts there (`plan.terms`): even ligh
 joined by " + " go together; a scene in which all of them are off is left out.
 
 All designs of a scene, network and seed share their draws, but each is another design: its own luck is in what an
-effect earned, so intervals are over such groups, not over conditions. Views keep their poses for one step. Left out on
+effect earned, so intervals are over such groups, not over conditions; those of what a promise is off by, which hardly
+depends on the design, are over pairs of scene and network. Views keep their poses for one step. Left out on
 purpose: what an effect takes of a step's time. The table's figures were within some 20 %, which told nothing.
 """
 
@@ -24,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import GridSettings, Names, Values, cell_of, grouped, pairs, problem_of, who
+from patchlab.study.grid import GridSettings, Names, Values, cell_of, grouped, of_values, pairs, problem_of, who
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
@@ -195,12 +196,21 @@ def _promised(result: Result) -> Estimate:
 
 def _missed(results: Sequence[Result]) -> tuple:
     """(designs, rate, confidence, largest change of rate, mean half width of the promises, how many lie outside)."""
-    promises, rates = [_promised(result) for result in results], [_mean_of(r, "modeled", "hits") for r in results]
-    moved = [rate - promise.value for rate, promise in zip(rates, promises, strict=True)]
-    surer = [_mean_of(r, "modeled", "confidence") - _mean_of(r, "promised", "confidence") for r in results]
-    outside = sum(not promise.low <= rate <= promise.high for rate, promise in zip(rates, promises, strict=True))
+    of_pairs = grouped(results, of_values("name", "network")).values()
+    rate, confidence = (
+        mean([float(np.mean([_off(result, kind) for result in pair])) for pair in of_pairs])
+        for kind in ("hits", "confidence")
+    )
+    promises = [_promised(result) for result in results]
     half = float(np.mean([(promise.high - promise.low) / 2 for promise in promises]))
-    return len(results), mean(moved), mean(surer), max(moved, key=abs), half, outside
+    rates = [_mean_of(result, "modeled", "hits") for result in results]
+    outside = sum(not promise.low <= rate <= promise.high for rate, promise in zip(rates, promises, strict=True))
+    return len(results), rate, confidence, max((_off(r, "hits") for r in results), key=abs), half, outside
+
+
+def _off(result: Result, kind: str) -> float:
+    """What a design shows in the whole world more than it would be promised."""
+    return _mean_of(result, "modeled", kind) - _mean_of(result, "promised", kind)
 
 
 def _mean_of(result: Result, world: str, kind: str) -> float:
