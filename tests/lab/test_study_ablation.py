@@ -10,7 +10,7 @@ from patchlab.validation import ablation
 from patchlab.validation.ablation import ALL, PRINTER, AblationSettings, without
 from patchproof.base.strict import Refused
 from patchproof.channel.printer import load_printer
-from patchproof.optimizer import loop
+from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.render.photograph import expose
 from patchproof.scene.conditions import with_values
@@ -56,13 +56,13 @@ def test_views_without_it_are_looked_at_in_the_same_way(problem):
 
 
 def test_training_never_meets_it(problem, monkeypatch):
-    met, part_of = [], loop.part_of
+    met, score = [], expectation.score
 
-    def noting(problem, printed, views, *more):
-        met.extend(views.conditions.sensor.noise)
-        return part_of(problem, printed, views, *more)
+    def noting(problem, pictures, conditions, *more):
+        met.extend(conditions.sensor.noise)
+        return score(problem, pictures, conditions, *more)
 
-    monkeypatch.setattr(loop, "part_of", noting)
+    monkeypatch.setattr(expectation, "score", noting)
     next(loop.steps(without(problem, "noise")))
     assert len(met) == problem.scene.settings.optimize.views and not any(met)
 
