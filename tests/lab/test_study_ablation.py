@@ -75,7 +75,9 @@ def test_a_scene_in_which_it_is_off_is_left_out(tmp_path):
     assert cells == [*(("on", name) for name in (ALL, *settings.effects)), ("off", ALL), ("off", "noise + exposure")]
 
 
-@pytest.mark.parametrize(("effect", "says"), [("lamp", "with lamp in it"), ("smell", "this kind of scene has")])
+@pytest.mark.parametrize(
+    ("effect", "says"), [("motion blur", "one where it is off"), ("smell", "this kind of scene has")]
+)
 def test_an_effect_that_is_not_there_is_refused(problem, effect, says):
     with pytest.raises(Refused, match=says):
         without(problem, effect)

@@ -50,7 +50,7 @@ from patchproof.scene.conditions import without as drawn_without
 
 ALL = "all"
 # What goes together, because alone it is too little to tell.
-_TOGETHER = ("dot gain + ink density + printed black + paper white", "blur + motion blur")
+_TOGETHER = ("dot gain + ink density + printed black", "blur + motion blur")
 _UNSEEN = "JPEG"  # training's views are too small to show it
 
 
