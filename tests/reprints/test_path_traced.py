@@ -78,7 +78,6 @@ def test_refused_in_a_sentence(scene, monkeypatch):
     [
         {"ambient": 0.6, "directional": 0.0},
         {"ambient": 0.2, "directional": 0.5},
-        {"ambient": 0.2, "directional": 0.0, "point": 0.5, "point_azimuth_deg": -20.0, "point_elevation_deg": 20.0},
     ],
 )
 def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch):
