@@ -84,7 +84,7 @@ def test_every_scene_is_one_and_every_option_exists(capsys):
     ("folder", "name", "count"),
     [
         ("promises", "promises", 6 * 2),
-        ("ablation", "ablation", 4 * (1 + 16)),
+        ("ablation", "ablation", 4 * (1 + 11)),
         ("families", "transfer", 7 * (1 + 5 + 3)),
     ],
 )
@@ -603,6 +603,20 @@ def test_figures_of_the_ablation_are_the_stored_ones():
         )
         name = told.get(row["trained without"], row["trained without"])
         assert any(line.startswith(f"| {name} | {earned} | {traced} | ") for line in lines), name
+
+
+@pytest.mark.parametrize(("name", "count"), [("chances", 8), ("again", 2)])
+def test_figures_of_terms_in_their_best_scenes_are_the_stored_ones(name, count):
+    missed, earned = (rows_of(f"ablation/chances/{name}_{table}.csv") for table in ("missed", "earned"))
+    lines = NOTEBOOK.read_text(encoding="utf-8").splitlines()
+    assert len(missed) == len(earned) == count
+    for row, other in zip(missed, earned, strict=True):
+        off, knowing = (
+            interval(*(float(each[f"rate{end}"]) for end in ("", "_low", "_high"))) for each in (row, other)
+        )
+        figures = f"{off} | {float(row['confidence']):+.3f} | {100 * float(row['largest']):+.1f}"
+        end = f"| {figures} | {row['outside']} of {row['designs']} | {knowing} |"
+        assert sum(line.endswith(end) for line in lines) == 1, row["left out"]
 
 
 @pytest.mark.parametrize(

@@ -134,11 +134,7 @@ def test_lengths_are_finite_positive_numbers(tmp_path, value):
         "[camera]\nwhite_balance = 0.6",
         "[background]\ncolor = [0.5, 0.5, 1.1]",
         "[background]\nimages = 'x'\ncolor = [0.5, 0.5, 0.5]",
-        "[light]\npoint = [1, 0.5]",
-        "[light]\npoint_distance_mm = [0, 100]",
-        "[light]\nsh2 = [0, 1.1]",
-        "[light]\nshininess = [0, 20]",
-        "[camera]\nvignetting = [0, 0.99]",
+        "[light]\ndirectional = [1, 0.5]",
         "[camera]\nmotion_px = [-1, 2]",
         "[optimize]\nviews = 0",
         "[view]\npatch_share = [0.1, 1.2]",
@@ -239,9 +235,9 @@ def test_only_what_differs_from_a_default_names_a_sheet(tmp_path):
 
 def test_settings_change_through_a_door_that_checks(tmp_path):
     plain = load_scene_settings(scene(tmp_path))
-    changed = plain.changed(optimize={"steps": 3}, light={"gloss": (0.1, 0.2)})
-    assert (changed.optimize.steps, changed.light.gloss) == (3, (0.1, 0.2))
-    assert changed.changed(optimize={"steps": 240}, light={"gloss": (0, 0)}) == plain
+    changed = plain.changed(optimize={"steps": 3}, light={"ambient": (0.1, 0.2)})
+    assert (changed.optimize.steps, changed.light.ambient) == (3, (0.1, 0.2))
+    assert changed.changed(optimize={"steps": 240}, light={"ambient": (0.3, 0.7)}) == plain
     for wrong, named in (({"steps": -3}, "steps"), ({"stepz": 3}, 'did you mean "steps"')):
         with pytest.raises(Refused, match=named):
             plain.changed(optimize=wrong)

@@ -16,14 +16,12 @@ from patchproof.channel.camera import (
     blurred,
     compressed,
     develop,
-    diagonal_share_of,
     encoded,
     encoded_by_table,
     gains,
     is_pointwise,
     moved,
     noisy,
-    vignetted,
 )
 from patchproof.channel.lens import load_camera
 from patchproof.scene.conditions import draw
@@ -83,26 +81,6 @@ def test_blur_too_small_to_be_seen_costs_nothing():
     assert blurred(picture, torch.tensor([0.0, 0.3])) is picture
 
 
-def test_vignetting_leaves_the_middle_and_takes_its_share_in_the_corners():
-    seen = vignetted(torch.ones(2, 3, 301, 401), torch.tensor([0.3, 0.0]))
-    assert float(seen[0, 0, 150, 200]) == 1
-    assert float(seen[0, 0, 0, 0]) == pytest.approx(0.7, abs=0.003)  # half a pixel inside the corner
-    # halfway to the corner: t² = 0.7^-½ - 1, 1 / (1 + t²/4)² = 0.9092
-    assert float(seen[0, 1, 75, 100]) == pytest.approx((1 + (0.7**-0.5 - 1) / 4) ** -2, abs=0.003)
-    assert bool((seen[1] == 1).all())
-
-
-def test_vignetting_of_the_centered_square_is_that_of_the_whole_photograph():
-    lost = torch.tensor([0.5])
-    whole = vignetted(torch.ones(1, 3, 90, 160), lost, diagonal_share_of((160, 90), (1600, 900)))
-    square = vignetted(torch.ones(1, 3, 90, 90), lost, diagonal_share_of((90, 90), (1600, 900)))
-    torch.testing.assert_close(square, whole[..., 35:125])
-    small = vignetted(torch.ones(1, 3, 30, 30), lost, diagonal_share_of((30, 30), (1600, 900)))
-    torch.testing.assert_close(small, torch.nn.functional.avg_pool2d(square, 3), atol=5e-4, rtol=0)
-    assert diagonal_share_of((160, 90), (1600, 900)) == 1
-    assert diagonal_share_of((224, 224), (1600, 1200)) == pytest.approx(0.6 * 2**0.5)  # 1200 √2 / 2000
-
-
 @pytest.mark.parametrize("length, angle", [(6.0, 0.0), (6.0, 90.0), (7.0, 30.0), (3.0, 135.0)])
 def test_motion_spreads_a_point_along_its_line_only_and_keeps_its_light(length, angle):
     point = torch.zeros(1, 1, 31, 31, dtype=torch.float64)
@@ -145,7 +123,7 @@ def test_only_what_treats_pixels_alone_is_pointwise():
     def pointwise(**camera):
         return is_pointwise(sensor(3, **camera), 1.0, False)
 
-    assert pointwise() and pointwise(exposure_ev=[-1, 1], white_balance=0.1, motion_px=[0, 1], vignetting=[0, 0.2])
+    assert pointwise() and pointwise(exposure_ev=[-1, 1], white_balance=0.1, motion_px=[0, 1])
     for term in ({"motion_px": [4, 4]}, {"blur_px": [2, 2]}, {"noise": [0.05, 0.05]}):
         assert not pointwise(**term), term
 
@@ -154,17 +132,11 @@ def test_terms_that_are_off_change_no_bit():
     linear = torch.rand(3, 3, 16, 16)
     drawn = sensor(3, exposure_ev=[-0.5, 0.5], blur_px=[0, 2], noise=[0, 0.02])
     spread = blurred(linear, torch.as_tensor(drawn.blur_px).float())
-    assert vignetted(linear, torch.zeros(3)) is linear and moved(linear, torch.zeros(3), [0.0] * 3) is linear
+    assert moved(linear, torch.zeros(3), [0.0] * 3) is linear
     exposed = noisy(
         spread * gains(drawn, linear)[:, :, None, None], torch.as_tensor(drawn.noise).float(), drawn.noise_seed
     )
     assert torch.equal(develop(linear, drawn, 1.0, jpeg=False), encoded(exposed))
-
-
-def test_vignetting_takes_light_before_the_sensor_clips():
-    drawn = sensor(1, vignetting=[0.5, 0.5], exposure_ev=[2, 2])
-    corner = linear_from_srgb(develop(torch.full((1, 3, 99, 99), 0.4), drawn, 0.1))[0, 0, 0, 0]
-    assert float(corner) == pytest.approx(0.8, abs=0.01)  # 0.4 · 4 · 0.5; clipped first, it would be 0.5
 
 
 def test_noise_has_the_stated_variance_and_is_each_views_own():
@@ -205,8 +177,7 @@ def test_jpeg_is_near_a_real_encoder_and_carries_gradients():
 
 
 def test_develop_matches_finite_differences():
-    terms = {"motion_px": [8, 8], "vignetting": [0.3, 0.3]}
-    drawn = sensor(1, exposure_ev=[-0.3, -0.3], white_balance=0.05, blur_px=[2, 2], **terms)
+    drawn = sensor(1, exposure_ev=[-0.3, -0.3], white_balance=0.05, blur_px=[2, 2], motion_px=[8, 8])
     linear = (torch.rand(1, 3, 6, 6, dtype=torch.float64) * 0.8 + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: develop(x, drawn, 0.4), linear, atol=1e-6)
 

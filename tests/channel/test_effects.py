@@ -25,16 +25,16 @@ from test_optimize import scene_with
 
 # Of the fields below in rows 0 to 39 of seed 3, as they were drawn when one function sampled all of them in order.
 DIGESTS = {
-    "train": "1f8d2cad18464990",
-    "select": "7b8b0e7fd80c00cc",
-    "promise": "c3bb05292ec84509",
-    "reprint": "9c1361ef254dab1f",
-    "evaluate": "062d91521442e414",
+    "train": "81f3f52c0f7bf995",
+    "select": "af5eb391801e2f4c",
+    "promise": "9472486a5b80425b",
+    "reprint": "feadc83558f6a783",
+    "evaluate": "1cd6de75e116662e",
 }
 SWITCHED = [effect for effect in EFFECTS if effect.switch]
 # Those without which a step takes fewer operations.
-SLOWS = {"lamp", "uneven ambient", "gloss", "misregistration", "vignetting", "motion blur", "blur", "noise", "JPEG"}
-MADE_UP = Effect("smell", {"smell": "light.gloss", "sweetness": (0.0, 1.0)})
+SLOWS = {"motion blur", "blur", "noise", "JPEG"}
+MADE_UP = Effect("smell", {"smell": "light.ambient", "sweetness": (0.0, 1.0)})
 # Settings of light, print and camera that are no ranges of an effect.
 NO_RANGES = {"printer.profile", "camera.photo_px", "camera.file"}
 
@@ -56,7 +56,7 @@ def test_draws_are_those_of_all_runs_before(stream):
 def test_an_effect_more_moves_no_other_draw(stream, place):
     before = sampled(EFFECTS, EVERYTHING, stream, 20, 5, 3)
     after = sampled((*EFFECTS[:place], MADE_UP, *EFFECTS[place:]), EVERYTHING, stream, 20, 5, 3)
-    low, high = EVERYTHING.light.gloss
+    low, high = EVERYTHING.light.ambient
     smell, sweetness = after.pop("smell"), after.pop("sweetness")
     assert (low <= smell).all() and (smell <= high).all() and np.ptp(smell) > 0.5 * (high - low)
     assert np.ptp(sweetness) > 0.5 and abs(np.corrcoef(smell, sweetness)[0, 1]) < 0.8
@@ -78,7 +78,7 @@ def test_every_field_has_one_effect_and_no_two_share_a_column():
     assert set(FIELDS) == {part.name for kind in RECORDS.values() for part in fields(kind)}
     assert len(EFFECT) == len(EFFECTS) and all(len({RECORD_OF[name] for name in e.fields}) == 1 for e in EFFECTS)
     taken = [e.first + i for e in EFFECTS if e.first is not None for i in range(len(e.columns))]
-    assert sorted(taken) == list(range(49))
+    assert len(set(taken)) == len(taken) and max(taken) == 48
 
 
 def test_every_range_is_read_by_an_effect():
@@ -105,10 +105,8 @@ def test_a_range_moves_the_fields_of_its_effect_and_no_others(effect, key):
 def problem(tmp_path_factory):
     """A scene in which every effect is on and shows."""
     folder = tmp_path_factory.mktemp("scene")
-    on = {"paper_white": [0.9, 1], "misregistration_mm": [1, 2], "scale": [0.9, 0.95], "density": [0.1, 0.2]}
-    light = {"point": [0.5, 0.6], "sh2": [0.2, 0.3], "gloss": [0.1, 0.2]}
-    camera = {"blur_px": [2, 3], "noise": [0.05, 0.1], "motion_px": [5, 6], "vignetting": [0.2, 0.3]}
-    tables = {"printer": on, "light": light, "camera": camera | {"photo_px": [160, 120]}}
+    camera = {"blur_px": [2, 3], "noise": [0.05, 0.1], "motion_px": [5, 6], "photo_px": [160, 120]}
+    tables = {"printer": {"scale": [0.9, 0.95], "density": [0.1, 0.2]}, "camera": camera}
     return set_problem(
         scene_with(folder, **{f"{t}__{k}": v for t, values in tables.items() for k, v in values.items()})
     )
@@ -135,7 +133,7 @@ def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(p
     before, after = fields_of(setup.conditions), fields_of(less.conditions)
     moved = {name for name in FIELDS if not np.array_equal(before[name], after[name])}
     # light that is left out is made up for by other light
-    others = {"ambient", "directional", "sh2"} if effect.instead else set()
+    others = {"ambient", "directional"} if effect.instead else set()
     assert effect.fields[0] in moved <= {effect.fields[0]} | others
     views = (setup.conditions, setup.conditions, less.conditions)  # the first time, the scene's own textures are made
     (_, count, less_count), (whole, _, plain) = zip(

@@ -1,6 +1,5 @@
-"""Training without an effect: the views that it sees, what is refused, and what an effect has earned, by hand."""
+"""Training without an effect: the views that it sees, what is refused, and what an effect earns and moves, by hand."""
 
-import time
 from pathlib import Path
 
 import pytest
@@ -9,11 +8,13 @@ import torch
 from patchlab.study.study import Cell, Result
 from patchlab.validation import ablation
 from patchlab.validation.ablation import ALL, PRINTER, AblationSettings, without
-from patchproof.app.plan import cost as plan_cost
 from patchproof.base.strict import Refused
 from patchproof.channel.printer import load_printer
+from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem
-from test_optimize import scene_with
+from patchproof.render.photograph import expose
+from patchproof.scene.conditions import with_values
+from test_optimize import scene_with, toml
 
 
 @pytest.fixture(scope="module")
@@ -46,34 +47,68 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
     assert load_printer("coated").apply(design[None])[0, :, 5, 5].tolist() != pytest.approx(green.tolist(), abs=0.1)
 
 
-def test_an_effect_that_takes_time_costs_a_share_of_a_step(problem, monkeypatch):
-    slow = ablation.Without.see
-    monkeypatch.setattr(ablation.Without, "see", lambda *a: (time.sleep(0.3), slow(*a))[1])
-    monkeypatch.setattr(plan_cost, "REPEATS", 1)
-    costs = ablation._costs(problem, ["noise"])
-    assert list(costs) == ["noise"] and costs["noise"] < -0.5  # without it, a step takes far longer
+def test_views_without_it_are_looked_at_in_the_same_way(problem):
+    drawn, shown = problem.scene.draw("evaluate", 2), problem.subject.shown(problem.subject.start())
+    less = without(problem, "noise")
+    for side_px in (problem.training_px, problem.figure_px):
+        by_hand = problem.see(shown, with_values(drawn, noise=0.0), side_px)
+        assert torch.equal(expose(less.see(shown, drawn, side_px), shown), expose(by_hand, shown))
 
 
-@pytest.mark.parametrize(("effect", "says"), [("lamp", "with lamp in it"), ("smell", "this kind of scene has")])
+def test_training_never_meets_it(problem, monkeypatch):
+    met, score = [], expectation.score
+
+    def noting(problem, pictures, conditions, *more):
+        met.extend(conditions.sensor.noise)
+        return score(problem, pictures, conditions, *more)
+
+    monkeypatch.setattr(expectation, "score", noting)
+    next(loop.steps(without(problem, "noise")))
+    assert len(met) == problem.scene.settings.optimize.views and not any(met)
+
+
+def test_a_scene_in_which_it_is_off_is_left_out(tmp_path):
+    toml(tmp_path / "on.toml", camera__noise=[0.01, 0.02])
+    toml(tmp_path / "off.toml", camera__noise=[0, 0])
+    settings = AblationSettings(scenes=("on.toml", "off.toml"), effects=("noise", "noise + exposure"))
+    cells = [(cell.values["name"], cell.values["effect"]) for cell in ablation.cells(settings, tmp_path)]
+    assert cells == [*(("on", name) for name in (ALL, *settings.effects)), ("off", ALL), ("off", "noise + exposure")]
+
+
+@pytest.mark.parametrize(
+    ("effect", "says"), [("motion blur", "one where it is off"), ("smell", "this kind of scene has")]
+)
 def test_an_effect_that_is_not_there_is_refused(problem, effect, says):
     with pytest.raises(Refused, match=says):
         without(problem, effect)
 
 
-def test_what_an_effect_earned_by_hand():
+def result_by_hand(seed, effect, **counts):
+    """Of so many hits of ten in each world, confidences half as high."""
+    answers = {
+        world: {"hits": {"design": ["1" * n + "0" * (10 - n)]}, "confidence": {"design": [[n / 20] * 10]}}
+        for world, n in counts.items()
+    }
+    values = {"name": "s", "networks": ["n"], "network": f"n{seed // 2}", "seed": seed, "effect": effect}
+    return Result(Cell(f"{seed}{effect}", values), answers, Path())
+
+
+def test_what_an_effect_earned_and_moved_by_hand():
     settings = AblationSettings(scenes=("s",), networks=("n",), seeds=(0, 1), effects=("noise",), n=10, photos=0)
+    counts = ((0, 8, 6, 6), (1, 9, 5, 6), (2, 8, 6, 10), (3, 9, 5, 10))  # seed, with it, without, promised
     results = []
-    for seed, counts in enumerate(((8, 6), (9, 5))):
-        for effect, count in zip((ALL, "noise"), counts, strict=True):
-            hits = "1" * count + "0" * (10 - count)
-            answers = {"modeled": {"hits": {"design": [hits]}, "confidence": {"design": [[count / 20] * 10]}}}
-            answers["cost"] = {"noise": 0.1 + 0.2 * seed} if effect == ALL else {}
-            values = {"name": "s", "networks": ["n"], "network": "n", "seed": seed, "effect": effect}
-            results.append(Result(Cell(f"{seed}{effect}", values), answers, Path()))
-    earned, designs = ablation.tables(settings, results)
-    ((effect, groups, rate, confidence, *traced, cost),) = earned.rows
-    assert (effect, groups, traced) == ("noise", 2, [None, None]) and cost.value == pytest.approx(0.2)
+    for seed, whole, less, promised in counts:
+        results.append(result_by_hand(seed, ALL, modeled=whole))
+        results.append(result_by_hand(seed, "noise", modeled=less, promised=promised))
+    earned, missed, designs = ablation.tables(settings, results)
+    ((effect, groups, rate, confidence, *traced),) = earned.rows
+    assert (effect, groups, traced) == ("noise", 4, [None, None])
     assert rate.value == pytest.approx(0.3) and confidence.value == pytest.approx(0.15)
-    # Student's t of one degree of freedom, 12.706, times 0.1
-    assert rate.high - rate.value == pytest.approx(1.2706, rel=1e-3)
-    assert len(designs.rows) == 4 and designs.rows[0][4] == 0.8
+    # Student's t of three degrees of freedom, 3.1824, times 0.1 / √3
+    assert rate.high - rate.value == pytest.approx(0.1837, rel=1e-3)
+    ((_, count, moved, surer, largest, half, outside),) = missed.rows
+    assert (count, largest) == (4, -0.5) and 0.1 < half < 0.4
+    # pairs were off by -0.05 and -0.45; Student's t of one degree of freedom, 12.706, times 0.2
+    assert moved.value == pytest.approx(-0.25) and moved.high - moved.value == pytest.approx(2.541, rel=1e-3)
+    assert surer.value == pytest.approx(-0.125) and outside == 2
+    assert len(designs.rows) == 8 and designs.rows[0][4] == 0.8 and designs.rows[1][8].value == 0.6

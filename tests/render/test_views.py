@@ -33,12 +33,12 @@ from patchproof.sheets.piece import marker_image
 WHITE = PiecePicture.of(torch.ones(64, 64, 3))
 
 
-def scene_of(folder, *changes, tables=""):
+def scene_of(folder, *changes):
     text = SCENE
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
-    (folder / "scene.toml").write_text(text + tables, encoding="utf-8")
+    (folder / "scene.toml").write_text(text, encoding="utf-8")
     return load_scene(folder / "scene.toml")
 
 
@@ -147,14 +147,6 @@ def test_what_the_object_hides_does_not_shine_through(tmp_path):
     assert 0 < float(back) == float(seen.piece.back_share.sum())  # the ball hides all of it at 180°
 
 
-LIGHT = """
-[light]
-point = [0.3, 0.6]
-sh2 = [0.2, 0.4]
-gloss = [0.1, 0.3]
-"""
-
-
 def the_same(one, other) -> bool:
     """Two records field by field, to the bit."""
     if isinstance(one, torch.Tensor):
@@ -167,13 +159,12 @@ def the_same(one, other) -> bool:
 
 
 @pytest.mark.parametrize("taps", [1, 3])
-@pytest.mark.parametrize("tables", ["", LIGHT])
-def test_views_seen_together_come_apart_as_if_each_had_been_seen_alone(tmp_path, tables, taps):
+def test_views_seen_together_come_apart_as_if_each_had_been_seen_alone(tmp_path, taps):
     """To the bit, so that what a process sees ahead changes no design; one view sees the back of the overhanging
     piece, another nothing of it.
     """
     trimesh.creation.icosphere(2, 150).export(tmp_path / "ball.ply")
-    scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"), tables=tables)
+    scene = scene_of(tmp_path, ("primitive:carton", "ball.ply"), ("_mm = 90", "_mm = 150"))
     conditions = posed(scene, 5, azimuth_deg=[-60, -20, 110, 180, 30], distance_mm=900)
     stage, look = set_stage(scene), replace(PHOTOGRAPHED, taps=taps)
     together = see(stage, WHITE, conditions, (64, 64), look)
@@ -181,14 +172,13 @@ def test_views_seen_together_come_apart_as_if_each_had_been_seen_alone(tmp_path,
     for sizes in ([1] * 5, [2, 2, 1], [1, 4]):
         for part, last in zip(apart(together, sizes), np.cumsum(sizes), strict=True):
             alone = see(stage, WHITE, conditions[last - len(part.conditions) : last], (64, 64), look)
-            for name in ("background", "light", "eye_mm", "object", "piece", "outlines"):
+            for name in ("background", "light", "object", "piece", "outlines"):
                 assert the_same(getattr(part, name), getattr(alone, name)), name
 
 
-@pytest.mark.parametrize("tables", ["", LIGHT])
-def test_views_lit_anew_are_views_seen_anew(tmp_path, tables):
+def test_views_lit_anew_are_views_seen_anew(tmp_path):
     """To the bit, for the piece, the bare object and the object's textures."""
-    scene = scene_of(tmp_path, tables=tables)
+    scene = scene_of(tmp_path)
     stage, piece, poses, other = set_stage(scene), piece_of(scene), scene.draw("train", 3), scene.draw("select", 3)
     textures = ObjectTextures(stage.object.textures_srgb)
     there = with_poses_of(other, poses)
@@ -235,14 +225,13 @@ def both_ways(monkeypatch, stage, shown, conditions, side):
         return quick, photograph(stage, shown, conditions, (side, side))
 
 
-@pytest.mark.parametrize("lost", [0.0, np.array([0.3, 0.2, 0.0])])
-def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch, lost):
-    """Front, back and bare object, with lamp, gloss and vignetting; but for pixels that the piece's edge or an outline
-    cuts, whose parts the short cut clips and mixes as they are in the end.
+def test_the_short_cut_is_the_long_way(tmp_path, monkeypatch):
+    """Front, back and bare object; but for pixels that the piece's edge or an outline cuts, whose parts the short cut
+    clips and mixes as they are in the end.
     """
-    scene = scene_of(tmp_path, tables=LIGHT)
+    scene = scene_of(tmp_path)
     stage, piece = set_stage(scene), piece_of(scene)
-    conditions = with_values(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]), vignetting=lost)
+    conditions = with_values(scene.draw("promise", 3), azimuth_deg=np.array([10.0, 160.0, -30.0]))
     seen = see(stage, piece, conditions, (192, 192))
     part, cut = seen.piece, torch.zeros(3 * 192 * 192, dtype=torch.bool)
     for pixel, share in ((part.pixel, part.share), (part.back_pixel, part.back_share)):
@@ -282,23 +271,9 @@ def test_an_object_shown_with_its_own_textures_is_the_bare_object(tmp_path, mesh
         torch.testing.assert_close(own, photograph(stage, None, conditions, size, jpeg=False), atol=BY_TABLE, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("table", "line"),
-    [
-        ("light", "point = [0.5, 1]"),
-        ("light", "sh2 = [0.3, 0.6]"),
-        ("light", "gloss = [0.2, 0.4]\nshininess = [20, 40]"),
-        ("camera", "vignetting = [0.4, 0.6]"),
-        ("camera", "motion_px = [20, 30]"),
-        ("camera", 'file = "phone"'),
-    ],
-)
-def test_each_term_of_light_and_camera_shows_and_lets_gradients_pass(tmp_path, table, line):
-    plain = scene_of(tmp_path)
-    if table == "camera":
-        scene = scene_of(tmp_path, ("[camera]", f"[camera]\n{line}"))
-    else:
-        scene = scene_of(tmp_path, tables=f"[{table}]\n{line}\n")
+@pytest.mark.parametrize("line", ["motion_px = [20, 30]", 'file = "phone"', "blur_px = [3, 4]", "noise = [0.1, 0.2]"])
+def test_each_term_of_the_camera_shows_and_lets_gradients_pass(tmp_path, line):
+    plain, scene = scene_of(tmp_path), scene_of(tmp_path, ("[camera]", f"[camera]\n{line}"))
     piece = piece_of(plain, 64)
     srgb = piece.srgb.clone().requires_grad_()
     pictures = [

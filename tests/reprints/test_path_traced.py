@@ -13,14 +13,12 @@ import torch
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.strict import Refused
-from patchproof.channel.light import irradiance, lighting_of
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.views import lens_frame
 from patchproof.reprints import path_traced
 from patchproof.reprints.path_traced import Optics, draw_optics, photograph_traced
-from patchproof.reprints.traced_light import sky_directions, sky_radiance
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
 
@@ -43,20 +41,6 @@ def facing(scene, **values):
 
 def plain(scene, level: float) -> PiecePicture:
     return PiecePicture.of(torch.full((64, 64, 3), level))
-
-
-def test_surroundings_light_a_surface_as_ours_do(scene):
-    conditions = facing(scene, ambient=0.5, directional=0.0, sh2=0.1)
-    toward = sky_directions()
-    radiance = sky_radiance(toward, conditions.light)
-    theta = np.arccos(toward[..., 1])
-    solid = np.sin(theta) * (np.pi / toward.shape[0]) * (2 * np.pi / toward.shape[1])
-    normals = np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.48, -0.64]]])
-    found = [(radiance * (toward @ n).clip(0) * solid).sum() / np.pi for n in normals]
-    light = lighting_of(conditions.light, scene.frame.normal, scene.frame.up, scene.middle_mm)
-    ours = irradiance(torch.tensor(normals, dtype=torch.float32), torch.zeros(len(normals), dtype=torch.long), light)
-    assert np.ptp(found) > 0.05  # it is uneven
-    np.testing.assert_allclose(found, ours, rtol=3e-3)
 
 
 def test_what_is_traced_holds_all_of_piece_and_object(scene):
@@ -94,7 +78,6 @@ def test_refused_in_a_sentence(scene, monkeypatch):
     [
         {"ambient": 0.6, "directional": 0.0},
         {"ambient": 0.2, "directional": 0.5},
-        {"ambient": 0.2, "directional": 0.0, "point": 0.5, "point_azimuth_deg": -20.0, "point_elevation_deg": 20.0},
     ],
 )
 def test_levels_are_ours_where_nothing_is_in_the_way(scene, lights, monkeypatch):

@@ -92,15 +92,14 @@ def test_a_session_s_photographs_share_print_light_camera_and_place_and_nothing_
             "object": {"mesh": "primitive:carton", "length_mm": 300},
             "patch": {"width_mm": 120, "height_mm": 120},
             "target": {"label": "carton", "models": ["builtin"]},
-            "camera": {"motion_px": [0, 4], "vignetting": [0, 0.5]},
-            "light": {"point": [0, 1], "sh2": [0, 0.3], "gloss": [0, 0.1]},
+            "camera": {"motion_px": [0, 4]},
         }
     )
     drawn = scene.draw("promise", 12, per_session=4)
     alone = scene.draw("promise", 12)
     of_session = [getattr(drawn.light, name) for name in vars(drawn.light)]
     of_session += [getattr(drawn.print, name) for name in ("dot_gain", "density", "black")]
-    of_session += [drawn.sensor.white_balance, drawn.sensor.vignetting, drawn.sensor.jpeg]
+    of_session += [drawn.sensor.white_balance, drawn.sensor.jpeg]
     of_session += [drawn.pose.background[:, [0, 1, 4]]]
     for values in of_session:
         rows = values.reshape(3, 4, -1)

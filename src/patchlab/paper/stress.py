@@ -206,10 +206,9 @@ def worst_case(
 
 
 def _varied(drawn: Conditions, names: Sequence[str]) -> list[str]:
-    """Fields of one figure whose range is more than a value; a lamp's only where there are lamps."""
-    lamps, fields = drawn.light.point.max() > 0, fields_of(drawn)
-    figures = {name: fields[name] for name in names if lamps or not name.startswith("point")}
-    return [name for name, values in figures.items() if values.ndim == 1 and np.ptp(values) > 0]
+    """Fields of one figure whose range is more than a value."""
+    fields = fields_of(drawn)
+    return [name for name in names if fields[name].ndim == 1 and np.ptp(fields[name]) > 0]
 
 
 def tables(settings: StressSettings, results: Sequence[Result]) -> tuple[Table, ...]:

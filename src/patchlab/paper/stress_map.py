@@ -37,7 +37,7 @@ PoseAxis = Literal["azimuth_deg", "elevation_deg", "distance_mm", "roll_deg"]
 LightAxis = Literal["ambient", "directional", "light_azimuth_deg", "light_elevation_deg", "exposure_ev"]
 # What of a draw is the pose and the light; the rest is background, print and camera.
 POSE = EFFECT["viewpoint"].fields
-_LIGHT = ("ambient light", "directional light", "exposure", "lamp", "uneven ambient")
+_LIGHT = ("ambient light", "directional light", "exposure")
 LIGHT = tuple(name for effect in _LIGHT for name in EFFECT[effect].fields)
 WORST_SHARE = 0.1
 

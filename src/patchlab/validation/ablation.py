@@ -1,14 +1,17 @@
-"""What each modeled effect earns when training knows it.
+"""What each modeled effect earns when training knows it, and what a promise without it is off by.
 
-It is left out of training, and the design is tried in the whole world.
+It is left out of training, and the design is tried in the whole world and in the world without it.
 In: scene files in which the effects of interest are on, networks, seeds. Out: for each effect how much rate and
 confidence designs lose that were trained without it, against designs trained with all, under the same conditions; by
-our renderer, and in path-traced photographs (`path_traced`), whose light is not ours. What takes an effect's place is
-what `plan` puts there (`plan.terms`): even light for the sun, not darkness. Effects joined by " + " go together.
+our renderer, and in path-traced photographs (`path_traced`), whose light is not ours. And what such a design shows in
+the whole world more than without the effect, which is what it would be promised: the same design in the same sessions.
+What takes an effect's place is what `plan` puts there (`plan.terms`): even light for the sun, not darkness. Effects
+joined by " + " go together; a scene in which all of them are off is left out.
 
-All designs of a scene, network and seed share their draws, but each is another design: its own luck is in every
-difference, so intervals are over such groups, not over conditions. Views keep their poses for one step. What an effect
-costs is the share of a step's time that goes when it is left out, steps taken in turn; on a busy machine it is noise.
+All designs of a scene, network and seed share their draws, but each is another design: its own luck is in what an
+effect earned, so intervals are over such groups, not over conditions; those of what a promise is off by, which hardly
+depends on the design, are over pairs of scene and network. Views keep their poses for one step. Left out on
+purpose: what an effect takes of a step's time. The table's figures were within some 20 %, which told nothing.
 """
 
 from __future__ import annotations
@@ -22,28 +25,32 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
-from patchlab.study.record import Record, recorded
+from patchlab.study.grid import GridSettings, Names, Values, cell_of, grouped, of_values, pairs, problem_of, who
+from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.app.plan.cost import relative_costs
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.claims import Estimate
-from patchproof.base.strict import Refused
+from patchproof.base.sessions import in_sessions, spread_of
+from patchproof.base.settings import SceneSettings
+from patchproof.base.strict import Refused, validated
+from patchproof.channel.effects import EFFECT
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.promise import PER_SESSION
 from patchproof.optimizer.responses import ask, joined, responses
 from patchproof.render.photograph import Shown
 from patchproof.render.pixels import PiecePicture
-from patchproof.render.views import Views, see
+from patchproof.render.views import Views, seen_again
 from patchproof.report.tables import Table
 from patchproof.reprints.path_traced import photograph_traced
-from patchproof.scene.conditions import Conditions
+from patchproof.scene.conditions import Conditions, draw
+from patchproof.scene.conditions import without as drawn_without
 
 ALL = "all"
 # What goes together, because alone it is too little to tell.
-_TOGETHER = ("dot gain + ink density + printed black + paper white", "blur + motion blur")
+_TOGETHER = ("dot gain + ink density + printed black", "blur + motion blur")
 _UNSEEN = "JPEG"  # training's views are too small to show it
 
 
@@ -63,7 +70,7 @@ class AblationSettings(GridSettings):
     """A design for each scene, network and seed with all effects, and one without each."""
 
     effects: Names = EFFECTS  # left out one by one; "a + b" leaves out both at once
-    n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design
+    n: Annotated[int, Field(ge=10)] = 400  # unseen conditions for each design, in sessions as a promise has them
     photos: Annotated[int, Field(ge=0, le=1000)] = 40  # path-traced photographs of each design
 
 
@@ -75,10 +82,18 @@ class Without(Problem):
 
     def see(self, shown: Shown, conditions: Conditions, side_px: int) -> Views:
         """Views in which what is left out is as in the simpler model."""
+        setup = self._simpler(shown, conditions)
+        return Problem.see(replace(self, stage=setup.stage), shown, setup.conditions, side_px)
+
+    def see_again(self, views: Views, conditions: Conditions) -> Views:
+        """As in `Problem`, and without what is left out, too."""
+        return seen_again(views, self._simpler(self.laid_out, conditions).conditions)
+
+    def _simpler(self, shown: Shown, conditions: Conditions) -> Setup:
         setup = Setup(self.stage, shown, conditions)
         for change in self.changes:
             setup = change(setup) or setup
-        return see(setup.stage, shown, setup.conditions, (side_px, side_px))
+        return setup
 
 
 def without(problem: Problem, effect: str) -> Problem:
@@ -100,21 +115,35 @@ def without(problem: Problem, effect: str) -> Problem:
 
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
-    """For each scene, network and seed: a design trained with all effects, and one without each."""
+    """For each scene, network and seed: a design trained with all effects, and one without each that is on."""
     return [
         cell_of(values | {"effect": effect}, seed, values["network"], effect[:40])
         for values in pairs(settings, base)
         for seed in settings.seeds
-        for effect in (ALL, *settings.effects)
+        for effect in (ALL, *(effect for effect in settings.effects if _is_on(values, effect)))
     ]
 
 
+def _is_on(values: Values, effect: str) -> bool:
+    """Whether the scene has one of the effects joined by " + "; one that is no row of `EFFECTS` counts as on."""
+    scene = validated(SceneSettings, values["scene"], values["file"])
+    drawn = draw(scene, "select", 64, 0)
+    names = [name for name in effect.split(" + ") if name in EFFECT]
+    on = [drawn_without(drawn, EFFECT[name], lambda azimuth, _: np.ones(azimuth.shape)) is not None for name in names]
+    return any(on) or len(on) < len(effect.split(" + "))
+
+
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
-    """Train without the effect; hits and confidences in the whole world."""
+    """Train without the effect; hits and confidences in the whole world, and without the effect in it."""
     problem, effect = problem_of(base, cell.values), cell.values["effect"]
-    design = best_design(problem if effect == ALL else without(problem, effect))
+    simpler = problem if effect == ALL else without(problem, effect)
+    design = best_design(simpler)
     shown = problem.subject.shown(from_pixels(design, problem.device))
-    answers = {"modeled": responses(problem, {"design": shown}, problem.scene.draw("evaluate", settings.n))}
+    conditions = problem.scene.draw("evaluate", settings.n, per_session=PER_SESSION)
+    answers = {"modeled": responses(problem, {"design": shown}, conditions)}
+    if effect != ALL:
+        as_trained = simpler.subject.shown(from_pixels(design, problem.device))
+        answers["promised"] = responses(simpler, {"design": as_trained}, conditions)
     if settings.photos:
         drawn = problem.scene.draw("reprint", settings.photos)
         piece = shown if isinstance(shown, PiecePicture) else None
@@ -122,35 +151,72 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
         photos = (photograph_traced(problem.stage, piece, each) for each in alone)
         asked = (ask(problem, photo, problem.boxes(each)) for photo, each in zip(photos, alone, strict=True))
         answers["path_traced"] = joined([{"design": answer} for answer in asked])
-    costs = _costs(problem, settings.effects) if effect == ALL else {}
-    return {"cost": costs, **{world: recorded(some) for world, some in answers.items()}}
-
-
-def _costs(problem: Problem, effects: Sequence[str]) -> dict[str, float]:
-    """The share of a step's time that goes where each effect is left out."""
-    less = {effect: without(problem, effect) for effect in effects}
-    return {name: 1 - ratio for name, ratio in relative_costs(problem, less, problem.subject.start()).items()}
+    return {world: recorded(some) for world, some in answers.items()}
 
 
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
-    """What each effect earned over all groups, and in each."""
-    head = ("trained without", "groups", "rate", "confidence", "rate, path-traced", "confidence, path-traced")
+    """What each effect earned and what promises without it were off by, over all groups and in each."""
+    head = ("rate", "confidence", "rate, path-traced", "confidence, path-traced")
     about = f"trained with all effects minus without: positive is what the effect earned; {settings.n} conditions and "
     about += f"{settings.photos} photographs for each design; intervals over groups of scene, network and seed"
-    rows, designs = [], []
-    for group in _groups(results):
-        designs += [(*who(result), result.cell.values["effect"], *_means(result)) for result in group.values()]
+    missed_about = "the same design, trained without the effect, in the same sessions: the whole world minus the world "
+    missed_about += (
+        "without it; “half width” is the mean of the promises' own 95 % intervals, “outside” counts designs "
+    )
+    missed_about += "whose rate in the whole world lies outside of them"
+    earned, missed, designs, groups = [], [], [], _groups(results)
+    for group in groups:
+        designs += [_design_row(result) for result in group.values()]
     for effect in settings.effects:
-        compared = [(group[ALL], group[effect]) for group in _groups(results) if ALL in group and effect in group]
+        compared = [(group[ALL], group[effect]) for group in groups if ALL in group and effect in group]
         if compared:
-            costs = [whole.answers["cost"][effect] for whole, _ in compared]
-            rows.append((effect, len(compared), *_earned(compared), mean(costs)))
-    start = ("scene", "network", "seed", "trained without", *head[2:])
-    cost = "share of a step's time"
+            earned.append((effect, len(compared), *_earned(compared)))
+            missed.append((effect, *_missed([less for _, less in compared])))
+    missed_head = ("left out", "designs", "rate", "confidence", "largest", "half width", "outside")
+    start = ("scene", "network", "seed", "trained without", *head, "promised", "promised confidence")
     return (
-        Table("earned", "What each effect earns", (*head, cost), tuple(rows), about),
+        Table("earned", "What each effect earns", ("trained without", "groups", *head), tuple(earned), about),
+        Table("missed", "What a promise without it is off by", missed_head, tuple(missed), missed_about),
         Table("designs", "Every design", start, tuple(designs), "its own rates and confidences in the whole world"),
     )
+
+
+def _design_row(result: Result) -> tuple:
+    traced_and_ours = (*who(result), result.cell.values["effect"], *_means(result))
+    if "promised" not in result.answers:
+        return (*traced_and_ours, None, None)
+    return (*traced_and_ours, _promised(result), _mean_of(result, "promised", "confidence"))
+
+
+def _promised(result: Result) -> Estimate:
+    """The rate in the world without the effect, with its interval over sessions as a promise has it."""
+    hits = hits_of(result.answers["promised"]["hits"]["design"][0])
+    return Estimate(float(np.mean(hits)), *spread_of(*in_sessions(hits, PER_SESSION)).rate, len(hits))
+
+
+def _missed(results: Sequence[Result]) -> tuple:
+    """(designs, rate, confidence, largest change of rate, mean half width of the promises, how many lie outside)."""
+    of_pairs = grouped(results, of_values("name", "network")).values()
+    rate, confidence = (
+        mean([float(np.mean([_off(result, kind) for result in pair])) for pair in of_pairs])
+        for kind in ("hits", "confidence")
+    )
+    promises = [_promised(result) for result in results]
+    half = float(np.mean([(promise.high - promise.low) / 2 for promise in promises]))
+    rates = [_mean_of(result, "modeled", "hits") for result in results]
+    outside = sum(not promise.low <= rate <= promise.high for rate, promise in zip(rates, promises, strict=True))
+    return len(results), rate, confidence, max((_off(r, "hits") for r in results), key=abs), half, outside
+
+
+def _off(result: Result, kind: str) -> float:
+    """What a design shows in the whole world more than it would be promised."""
+    return _mean_of(result, "modeled", kind) - _mean_of(result, "promised", kind)
+
+
+def _mean_of(result: Result, world: str, kind: str) -> float:
+    """The rate ("hits") or mean confidence of a design in one of the worlds."""
+    values = result.answers[world][kind]["design"][0]
+    return float(np.mean(hits_of(values) if kind == "hits" else values))
 
 
 def _groups(results: Sequence[Result]) -> list[dict[str, Result]]:
@@ -161,9 +227,8 @@ def _groups(results: Sequence[Result]) -> list[dict[str, Result]]:
 
 def _means(result: Result) -> list[float | None]:
     """Rate and confidence of a design in each world; None where nothing was photographed."""
-    records = [Record([result], "design", world) if world in result.answers else None for world in WORLDS]
-    figures = [some for record in records for some in ((record.hits(), record.confidences()) if record else ((), ()))]
-    return [float(np.mean(some)) if some else None for some in figures]
+    kinds = ("hits", "confidence")
+    return [_mean_of(result, world, kind) if world in result.answers else None for world in WORLDS for kind in kinds]
 
 
 def _earned(compared: Sequence[tuple[Result, Result]]) -> list[Estimate | None]:

@@ -21,8 +21,6 @@ LUMINANCE = (0.2126390, 0.7151687, 0.0721923)  # Y of sRGB's linear primaries, D
 _XYZ_FROM_LINEAR = ((0.4123908, 0.3575843, 0.1804808), LUMINANCE, (0.0193308, 0.1191948, 0.9505322))
 _WHITE_D65 = (0.9504559, 1.0, 1.0890578)  # the matrix's own row sums, so that sRGB white is exactly L* 100, a* b* 0
 
-_LINEAR_FROM_Z = (-0.5430160, 0.0452559, 1.1511030)  # the inverse matrix's last column, times white's Z
-
 
 def linear_from_srgb(srgb: Values) -> Values:
     """Light from sRGB code values, per value; odd-symmetric below 0 so that it can be inverted and differentiated."""
@@ -78,13 +76,6 @@ def lab_from_linear(linear):
         cubic = _at_least(xp, t, (6 / 29) ** 3) ** (1 / 3)
         f.append(xp.where(t > (6 / 29) ** 3, cubic, t / (3 * (6 / 29) ** 2) + 4 / 29))
     return _stack(xp, [116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
-def tinted_white(light: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """N×3 linear sRGB of whites that are N times as light as sRGB's and of tints b* (of the color at L* 100, a* 0)."""
-    # there only Z changes: Z/Zn = (1 - b/200)³
-    blue = (1 - np.asarray(b) / 200) ** 3 - 1
-    return np.asarray(light)[:, None] * (1 + blue[:, None] * np.array(_LINEAR_FROM_Z))
 
 
 def ciede2000(lab_a, lab_b):

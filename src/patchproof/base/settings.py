@@ -153,18 +153,15 @@ class ViewSettings(Strict):
 
 
 class LightSettings(Strict):
-    """Ambient and directional light, a lamp, gloss; 1 is the light in which white paper is sRGB white at exposure 0."""
+    """Ambient and directional light; 1 is the light in which white paper is sRGB white at exposure 0."""
 
     ambient: NotNegativeRange = (0.3, 0.7)  # light from everywhere
-    directional: NotNegativeRange = (0.2, 0.8)  # light from one far side, on a surface that faces it
-    # Where the sun and lamps may stand, from the scene's front: behind it, nothing on a patch there could be seen.
-    azimuth_deg: Range = (-90.0, 90.0)  # of the sun and lamps about the vertical
-    elevation_deg: Annotated[Range, within(-90, 90)] = (10.0, 80.0)  # of the sun and lamps above the horizontal
-    point: NotNegativeRange = (0.0, 0.0)  # a lamp's light on the patch's middle where it faces the lamp
-    point_distance_mm: PositiveRange = (300.0, 2000.0)  # of the lamp from the patch's middle
-    sh2: ShareRange = (0.0, 0.0)  # standard deviation of the ambient light over directions, share of its mean
-    gloss: ShareRange = (0.0, 0.0)  # share of the light that the paper reflects as a highlight (Blinn-Phong)
-    shininess: PositiveRange = (20.0, 80.0)  # the highlight's exponent: larger is smaller and brighter
+    # A lamp is this, too: half a meter away, its fall-off moved rates promised to 9 pairs of scene and network by -0.2
+    # points [-0.9, 0.6], by 2.5 at most. With even light in place of the lamp they were up to 13 points off.
+    directional: NotNegativeRange = (0.2, 0.8)  # light from one side, of the sun or a lamp, on a surface that faces it
+    # Where it may come from, seen from the scene's front: from behind, nothing on a patch there could be seen.
+    azimuth_deg: Range = (-90.0, 90.0)  # of the directional light about the vertical
+    elevation_deg: Annotated[Range, within(-90, 90)] = (10.0, 80.0)  # of the directional light above the horizontal
 
 
 class BackgroundSettings(Strict):
@@ -190,11 +187,6 @@ class PrinterSettings(Strict):
     dot_gain: Annotated[Range, within(-0.25, 0.25)] = (-0.04, 0.04)  # added tone value at 50 %
     density: Annotated[Range, within(-0.9, 3)] = (-0.05, 0.05)  # added ink, as a share of the ink's own
     black: Annotated[Range, within(-0.1, 0.5)] = (-0.004, 0.004)  # added light of printed black; paper is 1
-    # Off: papers differ by 0.92 to 1.03 (L* 92 to 96 beside 95) and b* -8 to 7, which moved the confidence by 0.004.
-    paper_white: PositiveRange = (1.0, 1.0)  # the paper's light beside that of the sheet that the light is measured by
-    paper_b: Annotated[Range, within(-40, 40)] = (0.0, 0.0)  # the paper's b* beside it
-    # Off: 0.1 mm moved the demo's confidence by 0.001 (0.3 mm: 0.006); a print for each view takes a quarter more.
-    misregistration_mm: Annotated[NotNegativeRange, within(0, 5)] = (0.0, 0.0)  # shift of the color planes
     # Off: sheets ask for 100 % and are measured. 0.97 to 1.03 moved the demo's confidence by 0.01, 0.94 by 0.05.
     scale: Annotated[PositiveRange, within(0.5, 2)] = (1.0, 1.0)  # size over the sheet's own
 
@@ -208,8 +200,10 @@ class CameraSettings(Strict):
     white_balance: Annotated[Share, Field(le=0.5)] = 0.05  # largest error of the red and of the blue gain
     blur_px: NotNegativeRange = (0.0, 1.0)  # standard deviation of a Gaussian at photo_px
     noise: ShareRange = (0.0, 0.01)  # standard deviation at white, at photo_px
+    # Off: cameras are held still. In a hand at night, 2 to 12 px took 3.4 points [1.5, 5.2] of rates promised without
+    # it, in 5 of 9 pairs of scene and network more than the promise's interval; designs that knew it had 1.5 [0.0, 3.1]
+    # more.
     motion_px: NotNegativeRange = (0.0, 0.0)  # length of a straight motion blur at photo_px
-    vignetting: Annotated[ShareRange, within(0, 0.95)] = (0.0, 0.0)  # light lost in the corners
     file: str | None = None  # a calibrated camera: intrinsics and lens distortion in place of fov_deg
     jpeg: Annotated[
         tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]], AfterValidator(ordered)

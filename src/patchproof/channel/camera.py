@@ -1,7 +1,7 @@
 """The camera: linear light at the lens becomes a display-encoded picture.
 
 In: N×3×H×W linear light and a `Sensor`. Out: N×3×H×W sRGB in [0, 1], differentiable. Order:
-vignetting, blur (optics, focus, straight motion), exposure and white balance, shot and read noise, clipping, tone curve
+blur (optics, focus, straight motion), exposure and white balance, shot and read noise, clipping, tone curve
 (sRGB's, or that of a calibrated camera). The lens's distortion has its own module.
 
 Blur, motion, noise and JPEG are meant at the photograph's full size. A picture rendered `scale` times as large as the
@@ -12,7 +12,6 @@ by whoever writes it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -40,20 +39,17 @@ def develop(
     sensor: Sensor,
     scale: float,
     jpeg: bool = True,
-    diagonal_share: float = 1.0,
     camera: Camera | None = None,
 ) -> Tensor:
     """The picture that a camera makes, with the tone curve of `camera` if it has one; one row of `sensor` per picture.
 
     `scale` is the pictures' size over the photograph's. `jpeg=False` leaves JPEG to the writer of a real file.
-    `diagonal_share` is what vignetting needs to know, from `diagonal_share_of`.
     """
 
     def on(values) -> Tensor:
         return torch.as_tensor(values).to(linear)
 
-    light = vignetted(linear, on(sensor.vignetting), diagonal_share)
-    light = blurred(light, on(sensor.blur_px * scale))
+    light = blurred(linear, on(sensor.blur_px * scale))
     light = moved(light, on(sensor.motion_px * scale), sensor.motion_deg)
     light = light * gains(sensor, linear)[:, :, None, None]
     picture = encoded(noisy(light, on(sensor.noise * scale), sensor.noise_seed), camera)
@@ -85,13 +81,6 @@ def _is_stored(sensor: Sensor, scale: float, jpeg: bool) -> bool:
     return bool(jpeg and scale >= SMALLEST_JPEG_SCALE and sensor.jpeg.any())
 
 
-def diagonal_share_of(size_px: tuple[int, int], photo_px: tuple[int, int]) -> float:
-    """How much of the photograph's diagonal a picture of `size_px` spans: 1, or less for its centered square."""
-    width, height = size_px
-    diagonal = (width**2 + height**2) ** 0.5 / min(size_px)
-    return min(1.0, diagonal * min(photo_px) / (photo_px[0] ** 2 + photo_px[1] ** 2) ** 0.5)
-
-
 def gains(sensor: Sensor, like: Tensor) -> Tensor:
     """Exposure and white balance: N×3 factors of the light."""
     return torch.as_tensor(2 ** sensor.exposure_ev[:, None] * sensor.white_balance).to(like)
@@ -115,28 +104,6 @@ def encoded_by_table(linear: Tensor, camera: Camera | None = None) -> Tensor:
 @lru_cache(maxsize=4)
 def _code_table(camera: Camera | None, device: torch.device) -> Tensor:
     return encoded(torch.linspace(0, 1, _TABLE_STEPS + 1, dtype=torch.float64, device=device), camera).float()
-
-
-def vignetted(linear: Tensor, lost: Tensor, diagonal_share: float = 1.0) -> Tensor:
-    """Light of which the photograph's corners lose the share `lost` N, see `falloff`."""
-    left = falloff(linear.shape[-2:], lost, diagonal_share)
-    return linear if left is None else linear * left
-
-
-def falloff(size: Sequence[int], lost: Tensor, diagonal_share: float = 1.0) -> Tensor | None:
-    """What is left of the light, N×1×H×W of `size` (H, W), where it falls off from the middle as cos⁴ of an angle does
-    and the photograph's corners lose the share `lost` N, below 1; None where none loses any.
-
-    At r, as a share of the photograph's half diagonal, it is (1 + t²r²)⁻², with t² from `lost`.
-    """
-    if not bool(lost.any()):
-        return None
-    height, width = size
-    y = torch.arange(height).to(lost) + 0.5 - height / 2
-    x = torch.arange(width).to(lost) + 0.5 - width / 2
-    square = (y[:, None] ** 2 + x**2) * (4 * diagonal_share**2 / (height**2 + width**2))
-    tangent_square = (1 - lost) ** -0.5 - 1
-    return (1 + tangent_square[:, None, None, None] * square) ** -2
 
 
 def blurred(linear: Tensor, sigma_px: Tensor) -> Tensor:

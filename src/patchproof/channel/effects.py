@@ -1,6 +1,6 @@
 """What views differ by: four records of drawn values, and one table of the effects that fill them.
 
-Two levels: what is one and the same for all photographs of a session (the print, its paper, the lamp, the camera and
+Two levels: what is one and the same for all photographs of a session (the print, its paper, the light, the camera and
 its lens, the place) and what each photograph has of its own (where the camera stands, its exposure, blur and noise,
 where in the place). A session here is what one person does in one go with one print.
 
@@ -21,12 +21,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from patchproof.base.color import tinted_white
 from patchproof.base.settings import SceneSettings
 
-_UNIT = (0.0, 1.0)
-# Normal coefficients come from the middle of the unit interval: 3.1 standard deviations at most, never infinity.
-_NORMAL_MARGIN = 1e-3
 _LEAST_COSINE = 0.2  # the sun is made five times as strong at most where it has to light the patch alone
 # Settings of one number; the range is ± what this makes of it.
 _ENDS: dict[str, Callable[[float], float]] = {"view.look_at_jitter": float, "camera.white_balance": np.log1p}
@@ -78,20 +74,12 @@ class Pose(Rows):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Light(Rows):
-    """The light that falls on the object, and what glossy paper makes of it (see `channel.light`)."""
+    """The light that falls on the object (see `channel.light`)."""
 
     ambient: np.ndarray = off()
     directional: np.ndarray = off()
     light_azimuth_deg: np.ndarray = off()
     light_elevation_deg: np.ndarray = off()
-    point: np.ndarray = off()  # a lamp's light on the patch's middle where it faces the lamp
-    point_azimuth_deg: np.ndarray = off()
-    point_elevation_deg: np.ndarray = off()
-    point_distance_mm: np.ndarray = off(1.0)  # from the patch's middle
-    sh2: np.ndarray = off()  # standard deviation of the ambient light over directions, share of its mean
-    sh2_coefficients: np.ndarray = off((0.0,) * 8)  # N×8 standard normal, as `channel.light` orders them
-    gloss: np.ndarray = off()
-    shininess: np.ndarray = off(1.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,8 +89,6 @@ class Print(Rows):
     dot_gain: np.ndarray = off()  # these three as in `channel.printer.vary`
     density: np.ndarray = off()
     black: np.ndarray = off()
-    paper: np.ndarray = off((1.0, 1.0, 1.0))  # N×3 light of bare paper, beside the sheet that the light is measured by
-    misregistration_mm: np.ndarray = off(((0.0, 0.0), (0.0, 0.0)))  # N×2×2: red's and blue's shift, right and down
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,7 +103,6 @@ class Sensor(Rows):
     jpeg: np.ndarray = off(0)  # quality; 0: no JPEG, of all views or none
     motion_px: np.ndarray = off()
     motion_deg: np.ndarray = off()  # in [0, 180), counter-clockwise from the picture's x
-    vignetting: np.ndarray = off()  # share of the light lost in the photograph's corners
 
 
 RECORDS: dict[str, type[Rows]] = {"pose": Pose, "light": Light, "print": Print, "sensor": Sensor}
@@ -128,7 +113,7 @@ RECORD_OF = {part.name: record for record, kind in RECORDS.items() for part in f
 class Effect:
     """One thing that views differ by. `columns` are the numbers it takes, each with its range or the setting
     "table.name" that has it; they fill the fields of the same names, or are `made` into the fields `into`. `first` is
-    where they stand in the draws that the oldest effects share.
+    where they stand in the draws that the oldest effects share; some of those draws are nobody's.
 
     `anew` are the columns that every photograph has of its own ("all", or by name); the others are drawn once a
     session. `switch` is False of what no picture can be without. `instead` makes the light that stands in for a light
@@ -144,7 +129,6 @@ class Effect:
     switch: bool = True
     instead: Callable[[Any, Facing], Rows] | None = None
     whole: bool = False  # whether it takes whole photographs to be seen as it is
-    only_paper: bool = False  # whether nothing but paper shows it
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -199,18 +183,6 @@ def _view(azimuth, elevation, distance, roll, *offset: np.ndarray) -> tuple[np.n
     return azimuth, elevation, distance, roll, np.stack(offset, 1)
 
 
-def _uneven(sh2: np.ndarray, *coefficients: np.ndarray) -> tuple[np.ndarray, ...]:
-    from scipy.special import ndtri
-
-    return sh2, ndtri(_NORMAL_MARGIN + (1 - 2 * _NORMAL_MARGIN) * np.stack(coefficients, 1))
-
-
-def _shifts(length_mm: np.ndarray, *turns: np.ndarray) -> np.ndarray:
-    """Both planes as far, each in its own direction."""
-    angles = np.stack(turns, 1) * 2 * np.pi
-    return length_mm[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
-
-
 def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
     return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
 
@@ -220,19 +192,9 @@ def _whole(quality: np.ndarray) -> np.ndarray:
 
 
 def _even_for_sun(light: Light, facing: Facing) -> Light:
-    cosine = facing(light.light_azimuth_deg, light.light_elevation_deg)
-    return _evenly(light, "directional", light.directional * cosine)
-
-
-def _even_for_lamp(light: Light, facing: Facing) -> Light:
-    return _evenly(light, "point", light.point * facing(light.point_azimuth_deg, light.point_elevation_deg))
-
-
-def _evenly(light: Light, source: str, on_patch: np.ndarray) -> Light:
-    """What a source gives to the middle of the patch given by even light; the uneven part of that stays."""
-    ambient = light.ambient + on_patch
-    sh2 = light.sh2 * light.ambient / np.maximum(ambient, 1e-9)
-    return replace(light, ambient=ambient, sh2=sh2, **{source: np.zeros_like(on_patch)})
+    """As much even light as the sun gives to the middle of the patch."""
+    on_patch = light.directional * facing(light.light_azimuth_deg, light.light_elevation_deg)
+    return replace(light, ambient=light.ambient + on_patch, directional=np.zeros_like(on_patch))
 
 
 def _sun_alone(light: Light, facing: Facing) -> Light:
@@ -242,38 +204,23 @@ def _sun_alone(light: Light, facing: Facing) -> Light:
     return replace(light, ambient=np.zeros_like(light.ambient), directional=sun)
 
 
-def _units(*names: str) -> dict[str, tuple[float, float]]:
-    return dict.fromkeys(names, _UNIT)
-
-
 _VIEW = {name: f"view.{name}" for name in ("azimuth_deg", "elevation_deg", "distance_mm", "roll_deg")}
-_PLACE = _units("picture", "size", "x", "y", "mirrored")
+_PLACE: dict[str, tuple[float, float]] = dict.fromkeys(("picture", "size", "x", "y", "mirrored"), (0.0, 1.0))
 _JITTER = dict.fromkeys("xyz", "view.look_at_jitter")
 _BALANCE: dict[str, str] = dict.fromkeys(("red", "blue"), "camera.white_balance")
 _SUN = {"light_azimuth_deg": "light.azimuth_deg", "light_elevation_deg": "light.elevation_deg"}
-_LAMP = {"point": "light.point", "point_azimuth_deg": "light.azimuth_deg"}
-_LAMP |= {"point_elevation_deg": "light.elevation_deg"}
-_LAMP_MM = {"point_distance_mm": "light.point_distance_mm"}
-_SHIFT = {"length": "printer.misregistration_mm"} | _units("red", "blue")
-_SH2 = {"sh2": "light.sh2"} | _units(*(f"coefficient {i}" for i in range(8)))
 
 EFFECTS: tuple[Effect, ...] = (
     Effect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, anew="all", switch=False),
     Effect("background", _PLACE, 11, ("background",), _stacked, anew=("x", "y"), switch=False),
     Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
     Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
-    Effect("lamp", _LAMP | _LAMP_MM, 25, instead=_even_for_lamp),
-    Effect("uneven ambient", _SH2, 29, ("sh2", "sh2_coefficients"), _uneven),
-    Effect("gloss", {"gloss": "light.gloss", "shininess": "light.shininess"}, 38, only_paper=True),
     Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
     Effect("ink density", {"density": "printer.density"}, 23),
     Effect("printed black", {"black": "printer.black"}, 24),
-    Effect("paper white", {"light": "printer.paper_white", "b": "printer.paper_b"}, 43, ("paper",), tinted_white),
-    Effect("misregistration", _SHIFT, 45, ("misregistration_mm",), _shifts),
     Effect("print scale", {"printed_scale": "printer.scale"}, 48),
     Effect("exposure", {"exposure_ev": "camera.exposure_ev"}, 16, anew="all"),
     Effect("white balance", _BALANCE, 17, ("white_balance",), _gains),
-    Effect("vignetting", {"vignetting": "camera.vignetting"}, 42),
     Effect("motion blur", {"motion_px": "camera.motion_px", "motion_deg": (0.0, 180.0)}, 40, anew="all", whole=True),
     Effect("blur", {"blur_px": "camera.blur_px"}, 19, anew="all", whole=True),
     Effect("noise", {"noise": "camera.noise"}, 20, anew="all", whole=True),

@@ -112,19 +112,6 @@ def vary(seen_linear: Tensor, change: Tensor) -> Tensor:
     return clamped(light + black * (1 - light))
 
 
-def misregistered(seen_srgb: Tensor, shift_px: Tensor) -> Tensor:
-    """H×W×3 with its red and blue planes (what cyan and yellow ink leave) moved by `shift_px` 2×2, x right and y down;
-    the border goes on. Differentiable in the picture.
-    """
-    height, width = seen_srgb.shape[:2]
-    planes = seen_srgb[..., ::2].permute(2, 0, 1)[:, None]
-    move = torch.eye(2, 3).to(seen_srgb).repeat(2, 1, 1)
-    move[:, :, 2] = -2 * shift_px.to(seen_srgb) / torch.tensor([width, height]).to(seen_srgb)
-    grid = torch.nn.functional.affine_grid(move, list(planes.shape), align_corners=False)
-    red, blue = torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)[:, 0]
-    return torch.stack([red, seen_srgb[..., 1], blue], -1)
-
-
 def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
     """A shipped printer by name, `identity`, or a NAME.npz or NAME.json file, relative to `base`."""
     if name_or_file == "identity":

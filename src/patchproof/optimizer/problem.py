@@ -29,7 +29,7 @@ from patchproof.optimizer.subject import Subject, subject_of
 from patchproof.render.pixels import PHOTOGRAPHED, Look, Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.surfaces import piece_surface
-from patchproof.render.views import Views, see
+from patchproof.render.views import Views, see, seen_again
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -83,6 +83,10 @@ class Problem:
         """Square views of these conditions, for what is shown now and any other design in its place."""
         look = TRAINED if side_px < self.figure_px else FIGURED if side_px == self.figure_px else PHOTOGRAPHED
         return see(self.stage, shown, conditions, (side_px, side_px), look)
+
+    def see_again(self, views: Views, conditions: Conditions) -> Views:
+        """Views that were seen, under conditions of the same poses."""
+        return seen_again(views, conditions)
 
     @cached_property
     def laid_out(self) -> Shown:

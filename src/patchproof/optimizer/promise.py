@@ -233,7 +233,7 @@ def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.n
 
 def _contrasts(problem: Problem, scene: PieceScene, conditions: Conditions) -> np.ndarray:
     """Paper white minus printed black in the photograph's linear light."""
-    exposed = scene.white_light(conditions) * conditions.print.paper[:, 1] * 2**conditions.sensor.exposure_ev
+    exposed = scene.white_light(conditions) * 2**conditions.sensor.exposure_ev
     black = float(linear_from_srgb(problem.printer.apply(torch.zeros(1, 3, 1, 1))).mean())
     return np.minimum(exposed, 1) - np.minimum(exposed * black, 1)
 

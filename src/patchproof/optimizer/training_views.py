@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.optimizer.problem import Problem
-from patchproof.render.views import Views, apart, seen_again
+from patchproof.render.views import Views, apart
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene
 
@@ -80,7 +80,7 @@ class ViewCache:
         views = self._kept.get(pose) or self._ahead.pop(pose)
         if len(self._kept) < self._capacity:
             self._kept[pose] = views
-        return seen_again(views, conditions)
+        return self._problem.see_again(views, conditions)
 
     def _render_ahead(self, pose: int, count: int) -> None:
         step = self._problem.scene.settings.optimize.views

@@ -17,19 +17,17 @@ from patchproof.channel.camera import (
     SMALLEST_NOISE,
     blurred,
     develop,
-    diagonal_share_of,
     encoded,
     is_pointwise,
     noisy,
     reach_px,
 )
 from patchproof.channel.lens import distorted
-from patchproof.channel.light import PAPER_REFLECTANCE
-from patchproof.channel.printer import misregistered, vary
+from patchproof.channel.printer import vary
 from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
 from patchproof.render.stage import Stage
 from patchproof.render.surfaces import light_texels
-from patchproof.render.texture import Footprint, look_up, on_copies
+from patchproof.render.texture import look_up
 from patchproof.render.views import Views, see
 from patchproof.scene.conditions import Conditions
 
@@ -81,15 +79,14 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
         light = shade(views, shown)
         if camera is not None:
             light = distorted(light, camera, views.size_px)
-        share = diagonal_share_of(views.size_px, views.stage.scene.settings.camera.photo_px)
-        return develop(light, sensor, scale, jpeg, share, camera)
+        return develop(light, sensor, scale, jpeg, camera)
     image = views.bare_exposed
     if shown is not None:
         # where each pixel is developed alone, only the piece's own pixels differ from the bare object's photograph
         piece, pixels = views.on_piece, views.frame_px[0] * views.frame_px[1]
-        back = encoded(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel, piece.back_pixel // pixels), camera)
+        back = encoded(PAPER_BACK_LINEAR * views.exposure(piece.back_pixel // pixels), camera)
         image = _blend(image, piece.back_pixel, piece.back_share, back, False)
-        light = _piece_light(views, shown) * views.exposure(piece.pixel, piece.view)
+        light = _piece_light(views, shown) * views.exposure(piece.view)
         image = _blend(image, piece.pixel, piece.share, encoded(light, camera), False)
     return _smooth(views, image, by_code=False)
 
@@ -125,29 +122,11 @@ def _blend(image: Tensor, pixel: Tensor, share: Tensor, value: Tensor, by_code: 
 def _piece_light(views: Views, picture: PiecePicture) -> Tensor:
     """The light P×3 that the piece's pixels send to the camera."""
     drawn, piece = views.conditions.print, views.on_piece
-    footprints, prints = piece.texels, [picture]
-    if drawn.misregistration_mm.any():
-        footprints, prints = _misregistered(views, picture)
-    reflectance = look_up(footprints, torch.cat([p.codes if views.reduced else p.light for p in prints]))
+    reflectance = look_up(piece.texels, picture.codes if views.reduced else picture.light)
     if views.reduced:
         reflectance = linear_from_srgb(reflectance)
     change = torch.as_tensor(np.stack([drawn.dot_gain, drawn.density, drawn.black], 1)).to(reflectance)
-    paper = torch.as_tensor(drawn.paper).to(reflectance)
-    light = vary(reflectance, change.index_select(0, piece.view))
-    light = light * paper.index_select(0, piece.view) * views.piece_white
-    if views.piece_gloss is None:
-        return light
-    mirrored = torch.as_tensor(PAPER_REFLECTANCE * views.conditions.light.gloss).to(light)
-    return light * (1 - mirrored.index_select(0, piece.view))[:, None] + views.piece_gloss
-
-
-def _misregistered(views: Views, picture: PiecePicture) -> tuple[Footprint, list[PiecePicture]]:
-    """Each view's own print of the picture, and footprints on all of them."""
-    (width, height), (width_mm, height_mm) = picture.size_px, views.stage.piece_surface.size_mm
-    shifts = torch.as_tensor(views.conditions.print.misregistration_mm).to(picture.codes)
-    shifts = shifts * shifts.new_tensor([width / width_mm, height / height_mm])
-    prints = [PiecePicture.of(misregistered(picture.srgb, shift)) for shift in shifts]
-    return on_copies(views.on_piece.texels, views.on_piece.view * len(picture.codes)), prints
+    return vary(reflectance, change.index_select(0, piece.view)) * views.piece_white
 
 
 def _pasted(views: Views, image: Tensor, light: Tensor, blur_px: np.ndarray, noise: np.ndarray) -> Tensor:

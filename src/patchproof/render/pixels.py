@@ -86,7 +86,6 @@ class ObjectPixels:
     texels: Footprint | None  # None where textures are fixed, and in `color`
     color: Tensor  # P×3: what the texture is multiplied by
     normal: Tensor
-    position_mm: Tensor | None  # where light needs it
 
     def part(self, views: range, pixels: int) -> ObjectPixels:
         """Those of some views, of so many pixels each, as if no others had been seen."""
@@ -97,7 +96,6 @@ class ObjectPixels:
             None if self.texels is None else self.texels.part(rows.start, rows.stop),
             self.color[rows],
             self.normal[rows],
-            None if self.position_mm is None else self.position_mm[rows],
         )
 
 
@@ -112,7 +110,6 @@ class PiecePixels:
     share: Tensor
     texels: Footprint
     normal: Tensor
-    position_mm: Tensor | None
     white: Tensor | None
     back_pixel: Tensor  # where its back is seen
     back_share: Tensor
@@ -127,7 +124,6 @@ class PiecePixels:
             self.share[rows],
             self.texels.part(rows.start, rows.stop),
             self.normal[rows],
-            None if self.position_mm is None else self.position_mm[rows],
             None if self.white is None else self.white[rows],
             self.back_pixel[back] - views.start * pixels,
             self.back_share[back],
@@ -146,7 +142,6 @@ def piece_pixels(
     fragments: Fragments,
     hidden: Tensor | None,
     look: Look = PHOTOGRAPHED,
-    needs_position: bool = False,
     white_coefficients: Tensor | None = None,
 ) -> PiecePixels:
     """What the piece's own fragments look at, and their share of each pixel."""
@@ -163,14 +158,12 @@ def piece_pixels(
     front, back = ((shown & side).nonzero()[:, 0] for side in (fragments.front, ~fragments.front))
     mm, mm_dx, mm_dy = (values.index_select(0, front) for values in (mm, mm_dx, mm_dy))
     back_pixel = fragments.pixel.index_select(0, back)
-    position = _weighted(surface.vertices.float()[surface.faces], kept) if needs_position else None
     return PiecePixels(
         kept.pixel,
         kept.view,
         share.index_select(0, front)[:, None],
         _piece_footprint(piece, mm / size, mm_dx * look.side / size, mm_dy * look.side / size, look.piece_taps),
         torch.nn.functional.normalize(_weighted(surface.corner_normal, kept), dim=-1),
-        position,
         None if white_coefficients is None else _white(white_coefficients[kept.view], 2 * mm / size - 1),
         back_pixel,
         share.index_select(0, back)[:, None],
@@ -195,9 +188,7 @@ def _piece_footprint(piece: PiecePicture, at: Tensor, at_dx: Tensor, at_dy: Tens
     return footprint(where, texture, at, at_dx, at_dy, taps=taps, blocks=True)
 
 
-def object_pixels(
-    surface: ObjectSurface, fragments: Fragments, needs_position: bool, look: Look, fixed: Tensor | None
-) -> ObjectPixels:
+def object_pixels(surface: ObjectSurface, fragments: Fragments, look: Look, fixed: Tensor | None) -> ObjectPixels:
     """The object's fragments, with its textures in their color where they are `fixed` (`ObjectSurface.texels`); faces
     seen from behind turn their normal round.
     """
@@ -215,7 +206,6 @@ def object_pixels(
         texels,
         color,
         turned,
-        _weighted(surface.vertices.float()[surface.faces], fragments) if needs_position else None,
     )
 
 

@@ -14,7 +14,7 @@ out on purpose: weights other than the pixel's own square.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 
@@ -186,15 +186,6 @@ def in_order(across: Tensor, down: Tensor) -> tuple[Tensor, list[tuple[int, int,
         grids.append((*divmod(key, many), first, first + size))
         first += size
     return order, grids
-
-
-def on_copies(footprint: Footprint, offset: Tensor) -> Footprint:
-    """The same footprints on copies of their textures that begin `offset` texels on, P of them."""
-    groups = []
-    for group in footprint.groups:
-        own = offset if group.fragment is None else offset.index_select(0, group.fragment)
-        groups.append(replace(group, texel=group.texel + own[:, None]))
-    return Footprint(tuple(groups), footprint.fragments)
 
 
 def _length(vectors: Tensor) -> Tensor:

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import LIGHT_OF_CODE
-from patchproof.channel.camera import diagonal_share_of, encoded, encoded_by_table, falloff, gains
+from patchproof.channel.camera import encoded, encoded_by_table, gains
 from patchproof.channel.lens import Frame, pinhole_frame
-from patchproof.channel.light import Lighting, highlight, irradiance, lighting_of
+from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines
 from patchproof.render.pixels import (
@@ -57,8 +57,7 @@ class Views:
     conditions: Conditions
     size_px: tuple[int, int]
     frame_px: tuple[int, int]
-    light: Lighting | None  # None, like the eyes, where pictures bring their own
-    eye_mm: Tensor | None  # N×3
+    light: Lighting | None  # None where pictures bring their own
     background: np.ndarray  # uint8 N×H×W×3 sRGB
     object: ObjectPixels | None
     piece: PiecePixels | None
@@ -111,7 +110,7 @@ class Views:
         """The light P×1 that falls on pixels."""
         if self.light is None:
             raise ValueError("pictures bring their own light")
-        return irradiance(pixels.normal, pixels.view, self.light, pixels.position_mm)[:, None]
+        return irradiance(pixels.normal, pixels.view, self.light)[:, None]
 
     @cached_property
     def _behind(self) -> Tensor:
@@ -123,50 +122,27 @@ class Views:
     def bare_exposed(self) -> Tensor:
         """The bare object, its outlines jagged, as a camera without blur and noise shows it, N·H·W × 3 sRGB."""
         camera = self.stage.camera
-        if self._falloff is None:
-            # the background has 256 codes per view and channel, which are exposed as a table
-            light = torch.tensor(LIGHT_OF_CODE)[:, None] * self._gains[:, None].cpu().double()
-            image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
-        else:
-            each = self._behind.view(len(self._gains), -1, 3)
-            light = each * self._gains[:, None] * self._falloff.view(len(each), -1, 1)
-            image = encoded_by_table(light, camera).view(-1, 3)
+        # the background has 256 codes per view and channel, which are exposed as a table
+        light = torch.tensor(LIGHT_OF_CODE)[:, None] * self._gains[:, None].cpu().double()
+        image = _looked_up(self.background, encoded(light, camera).numpy(), self.stage.device)
         if self.object is None:
             return image
-        color = self._object_color() * self.exposure(self.object.pixel, self.object.view)
+        color = self._object_color() * self.exposure(self.object.view)
         return image.index_copy_(0, self.object.pixel, encoded_by_table(color, camera))
 
-    def exposure(self, pixel: Tensor, view: Tensor) -> Tensor:
-        """The camera's factors of the light at pixels P of views P, P×3."""
-        factors = self._gains.index_select(0, view)
-        return factors if self._falloff is None else factors * self._falloff.index_select(0, pixel)
+    def exposure(self, view: Tensor) -> Tensor:
+        """The camera's factors of the light in views P, P×3."""
+        return self._gains.index_select(0, view)
 
     @cached_property
     def _gains(self) -> Tensor:
         return gains(self.conditions.sensor, torch.zeros(0, device=self.stage.device))
 
     @cached_property
-    def _falloff(self) -> Tensor | None:
-        """What vignetting leaves of the light, N·H·W × 1; None where it takes none."""
-        lost = torch.as_tensor(self.conditions.sensor.vignetting, dtype=torch.float32, device=self.stage.device)
-        share = diagonal_share_of(self.size_px, self.stage.scene.settings.camera.photo_px)
-        left = falloff(self.size_px[::-1], lost, share)
-        return None if left is None else left.view(-1, 1)
-
-    @cached_property
     def piece_white(self) -> Tensor:
         """The light on white paper at the piece's pixels, P×3 or P×1."""
         white = self.on_piece.white
         return self._irradiance(self.on_piece) if white is None else white
-
-    @cached_property
-    def piece_gloss(self) -> Tensor | None:
-        """What glossy paper reflects on top, P×1; None where it is matte."""
-        if self.light is None or self.eye_mm is None:
-            return None
-        pixels = self.on_piece
-        shine = highlight(pixels.normal, pixels.position_mm, self.eye_mm, pixels.view, self.light)
-        return None if shine is None else shine[:, None]
 
 
 def see(
@@ -193,8 +169,7 @@ def see(
         printed = cameras(poses @ scene.printed_from_sheet(conditions), matrices, frame.size_px, stage)
         own = rasterize(stage.piece_surface.vertices, stage.piece_surface.faces, printed, near)
         hidden = nearest.index_select(0, own.pixel) < own.depth
-        needs_position = light.lamp is not None or light.gloss is not None
-        parts = piece_pixels(stage.piece_surface, piece, own, hidden, look, needs_position)
+        parts = piece_pixels(stage.piece_surface, piece, own, hidden, look)
     if not scene.LEARNED and not isinstance(shown, ObjectTextures):
         fixed = surface.texels(_reduced(stage, size_px), fixed=True)
     return Views(
@@ -203,9 +178,8 @@ def see(
         size_px,
         frame.size_px,
         light,
-        eye.float(),
         backgrounds(scene, conditions, size_px, frame),
-        object_pixels(surface, fragments, light.lamp is not None, look, fixed),
+        object_pixels(surface, fragments, look, fixed),
         parts,
         outlines(surface.edges, surface.vertices, placed, eye, nearest, _covered(parts, nearest), near),
     )
@@ -257,7 +231,7 @@ def apart(views: Views, sizes: Sequence[int]) -> list[Views]:
                 for name, part in (("object", views.object), ("piece", views.piece), ("outlines", views.outlines))
             },
         )
-        parts.append(relit(replace(own, eye_mm=None if views.eye_mm is None else views.eye_mm[some]), own.conditions))
+        parts.append(relit(own, own.conditions))
     return parts
 
 
@@ -273,7 +247,7 @@ def near_mm(scene: MeshScene) -> float:
 
 
 def _light(scene: MeshScene, device: torch.device, conditions: Conditions) -> Lighting:
-    return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, scene.middle_mm, device)
+    return lighting_of(conditions.light, scene.frame.normal, scene.frame.up, device)
 
 
 def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditions, size_px: tuple[int, int]) -> Views:
@@ -286,7 +260,7 @@ def _see_pictures(stage: Stage, piece: PiecePicture | None, conditions: Conditio
         fragments = rasterize(surface.vertices, surface.faces, flat, 1e-9)
         coefficients = torch.as_tensor(scene.piece_light(conditions), dtype=torch.float32, device=stage.device)
         parts = piece_pixels(surface, piece, fragments, None, white_coefficients=coefficients)
-    return Views(stage, conditions, size_px, size_px, None, None, pictures, None, parts, None)
+    return Views(stage, conditions, size_px, size_px, None, pictures, None, parts, None)
 
 
 def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Frame:

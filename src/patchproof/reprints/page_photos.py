@@ -2,8 +2,8 @@
 
 In: a page as pixels, or a number of swatches; a printer as a function from sRGB to light; a seed. Out: a chart's
 manifest, pages as light, photographs as JPEG files. Charts are drawn here, too, not only written as PDFs, so that those
-of any size can be tried; light (ambient, sun and a lamp near the page), blur, noise, vignetting and clipping are those
-of `channel`.
+of any size can be tried. Their light is less even than that of scenes, so that readers of charts have to even it out: a
+lamp stands near the page, and the picture's corners are darker. Blur, noise and clipping are those of `channel`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from patchproof.base.output import image_bytes, image_pixels, new_folder
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
-from patchproof.channel.light import Lamp, Lighting, irradiance
 from patchproof.channel.printer import load_printer
 from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
@@ -43,6 +42,16 @@ PHOTO_PX = (1600, 1200)
 MARKER_MM, _MARKERS_MM = 14.0, ((8.0, 8.0), (188.0, 8.0), (188.0, 126.0), (8.0, 126.0))
 _CHART_MM = (30.0, 34.0, 150.0, 84.0)
 _GAP_MM = 0.4
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """What lights a page: ambient light, the sun's on the page, and a lamp's on what faces it in the page's middle."""
+
+    ambient: float
+    sun: float
+    lamp: float
+    lamp_mm: np.ndarray  # (3,) from the page's middle; z runs away from the camera
 
 
 @dataclass(frozen=True)
@@ -147,9 +156,8 @@ def photograph_page(page: np.ndarray, seed: int, camera: Camera | None = None) -
     at_middle, brightest = (_falling(at - page_mm / 2, sources) for at in (corners.mean(0)[None], corners))
     exposure = rng.uniform(0.5, 0.85) / (brightest.max() * white_balance.max())
     light = _light_in_picture(px_from_mm, page_mm / 2, sources)
-    raw = _warped(page, px_from_mm) * light[..., None]
+    raw = _warped(page, px_from_mm) * (light * _left_by_vignetting(rng.uniform(0, 0.2)))[..., None]
     sensor = Sensor(
-        vignetting=np.array([rng.uniform(0, 0.2)]),
         blur_px=np.array([rng.uniform(0, 1)]),
         exposure_ev=np.array([np.log2(exposure)]),
         white_balance=white_balance[None],
@@ -168,29 +176,32 @@ def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
     page[y : y + h, x : x + w] = value[..., None] if value.ndim == 2 else value
 
 
-def _light(rng: np.random.Generator) -> Lighting:
-    """Ambient light, sun, and a lamp 300 to 600 mm away, so that one side of the page is up to twice as light."""
-
-    def on(*values) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float32)
-
+def _light(rng: np.random.Generator) -> _Sources:
+    """The lamp is 300 to 600 mm away, so that one side of the page is up to twice as light."""
     lamp = geometry.orbit(rng.uniform(-60, 60), rng.uniform(-60, 60), (0, 0, -1.0), (0, -1.0, 0)) * rng.uniform(
         300, 600
     )
     toward = geometry.orbit(rng.uniform(-50, 50), rng.uniform(-50, 50), (0, 0, -1.0), (0, -1.0, 0))
-    near = Lamp(on(rng.uniform(0.2, 0.8)), on(np.linalg.norm(lamp)), torch.tensor(lamp[None], dtype=torch.float32))
-    direction = torch.tensor(toward[None], dtype=torch.float32)
-    return Lighting(on(rng.uniform(0.3, 0.7)), on(rng.uniform(0, 0.5)), direction, lamp=near)
+    near = rng.uniform(0.2, 0.8)
+    return _Sources(rng.uniform(0.3, 0.7), rng.uniform(0, 0.5) * -toward[2], near, lamp)
 
 
-def _falling(from_middle_mm: np.ndarray, sources: Lighting) -> np.ndarray:
-    """Light N on points N×2 of the page's plane."""
-    position = torch.tensor(np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))]), dtype=torch.float32)
-    normal, view = torch.tensor([[0.0, 0.0, -1.0]]).expand_as(position), torch.zeros(len(position), dtype=torch.long)
-    return irradiance(normal, view, sources, position).numpy().astype(float)
+def _falling(from_middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
+    """Light N on points N×2 of the page's plane; the lamp's falls with the square of its distance."""
+    away = sources.lamp_mm - np.column_stack([from_middle_mm, np.zeros(len(from_middle_mm))])
+    distance = np.linalg.norm(away, axis=1)
+    lamp = sources.lamp * (np.linalg.norm(sources.lamp_mm) / distance) ** 2 * -away[:, 2] / distance
+    return sources.ambient + sources.sun + lamp
 
 
-def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: Lighting) -> np.ndarray:
+def _left_by_vignetting(lost: float) -> np.ndarray:
+    """H×W: what is left of a picture's light that falls as cos⁴ of an angle does, down to 1 - `lost` in the corners."""
+    x, y = (np.arange(side) + 0.5 - side / 2 for side in PHOTO_PX)
+    square = (y[:, None] ** 2 + x**2) * 4 / (PHOTO_PX[0] ** 2 + PHOTO_PX[1] ** 2)
+    return (1 + ((1 - lost) ** -0.5 - 1) * square) ** -2
+
+
+def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: _Sources) -> np.ndarray:
     """Light H×W on the page's plane as the photograph sees it; computed at every 8th pixel, since it is smooth."""
     width, height = PHOTO_PX
     x, y = np.meshgrid(np.arange(4.0, width, 8), np.arange(4.0, height, 8))

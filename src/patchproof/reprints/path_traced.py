@@ -26,10 +26,9 @@ from patchproof.base import geometry
 from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
 from patchproof.base.strict import Refused
 from patchproof.channel.camera import develop
-from patchproof.channel.effects import Light, Print
+from patchproof.channel.effects import Print
 from patchproof.channel.lens import Frame, distorted
-from patchproof.channel.light import PAPER_REFLECTANCE
-from patchproof.channel.printer import misregistered, vary
+from patchproof.channel.printer import vary
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
@@ -41,6 +40,7 @@ from patchproof.scene.interface import needs_piece
 from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 from patchproof.scene.patch_scene import needs_patch
 
+PAPER_REFLECTANCE = 0.85  # of white paper, whose light is 1
 LIGHT_RADIUS_DEG = (0.5, 8.0)  # of the directional light as the piece sees it: from about the sun to a window
 APERTURE_MM = (1.0, 6.0)  # from a phone's lens to a small camera's
 PASSES, PASS_SAMPLES = 2, 16  # paths per pixel; a pass at a time bounds memory: 2 GB at 2 megapixels
@@ -183,32 +183,18 @@ def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: 
     placement = needs_patch(scene).placement
     scale = geometry.scaled_about(scene.middle_mm, conditions.pose.printed_scale[0])
     vertices = placement.vertices_mm @ scale[:3, :3].T + scale[:3, 3]
-    printed = _printed(picture, placement.size_mm, conditions.print)
-    front = _glossy(_diffuse(_texture(mi, printed, "clamp")), conditions.light)
+    printed = _printed(picture, conditions.print)
+    front = _diffuse(_texture(mi, printed, "clamp"))
     back = _diffuse({"type": "rgb", "value": PAPER_BACK_LINEAR * PAPER_REFLECTANCE})
     uv = placement.piece_mm / np.array(placement.size_mm)
     bsdf = {"type": "twosided", "front": front, "back": back}
     return _mesh(mi, "piece", vertices, placement.faces, placement.normals, uv, bsdf)
 
 
-def _printed(picture: PiecePicture, size_mm, drawn: Print) -> np.ndarray:
+def _printed(picture: PiecePicture, drawn: Print) -> np.ndarray:
     """H×W×3 light of this print under white light, beside the sheet that light is measured by."""
-    srgb = picture.srgb
-    if drawn.misregistration_mm.any():
-        height, width = srgb.shape[:2]
-        shift = drawn.misregistration_mm[0] * [width / size_mm[0], height / size_mm[1]]
-        srgb = misregistered(srgb, torch.tensor(shift).to(srgb))
-    change = torch.tensor([drawn.dot_gain[0], drawn.density[0], drawn.black[0]]).to(srgb)
-    return vary(linear_from_srgb(srgb), change).numpy() * drawn.paper[0]
-
-
-def _glossy(diffuse: dict, light: Light) -> dict:
-    """A surface that mirrors the drawn share of the light, roughly; Beckmann's slopes match Blinn's exponent."""
-    if not light.gloss[0]:
-        return diffuse
-    rough = float(np.sqrt(2 / (light.shininess[0] + 2)))
-    mirror = {"type": "roughconductor", "material": "none", "distribution": "beckmann", "alpha": rough}
-    return {"type": "blendbsdf", "weight": float(light.gloss[0] * PAPER_REFLECTANCE), "a": diffuse, "b": mirror}
+    change = torch.tensor([drawn.dot_gain[0], drawn.density[0], drawn.black[0]]).to(picture.srgb)
+    return vary(linear_from_srgb(picture.srgb), change).numpy()
 
 
 def _object(mi: ModuleType, mesh: Mesh) -> list:

@@ -119,10 +119,9 @@ def _conditions(scene: PatchScene, shot: Shot, white: float, tint: np.ndarray) -
         drawn,
         ambient=drawn.light.ambient * factor,
         directional=drawn.light.directional * factor,
-        point=0.0,
         exposure_ev=0.0,
         white_balance=tint,
         blur_px=shot.blur_px / len(shot.square) * min(scene.photo_px),
         printed_scale=1.0,
-        **dict.fromkeys(("vignetting", "motion_px", "noise", "jpeg"), 0),
+        **dict.fromkeys(("motion_px", "noise", "jpeg"), 0),
     )

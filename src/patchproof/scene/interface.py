@@ -153,8 +153,7 @@ class Scene(ABC):
 
     def models(self, effect: Effect) -> bool:
         """Whether an effect shows in the scene's photographs where its settings turn it on."""
-        table = effect.keys[0].partition(".")[0]
-        return table in self.EFFECT_TABLES and (self.HAS_PIECE or not effect.only_paper)
+        return effect.keys[0].partition(".")[0] in self.EFFECT_TABLES
 
     def without(self, part: Part) -> Self | None:
         """The scene without one of its `PARTS`; None where it has nothing of it."""
@@ -210,7 +209,7 @@ class PieceScene(Scene):
 
     @abstractmethod
     def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle, mean of the channels, without lamps."""
+        """N: the light on white paper at the piece's middle, mean of the channels."""
 
     def piece_px(self, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
         """Pixels M×2 of points M×2 of the piece in the whole photograph of the first condition, through bent paper and

@@ -111,7 +111,7 @@ class PatchScene(PieceScene, MeshScene):
         return ()
 
     def white_light(self, conditions: Conditions) -> np.ndarray:
-        """N: the light on white paper at the piece's middle, without lamps."""
+        """N: the light on white paper at the piece's middle."""
         light = conditions.light
         return light.ambient + light.directional * self.cosines(light.light_azimuth_deg, light.light_elevation_deg)
 

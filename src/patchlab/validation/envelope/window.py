@@ -31,7 +31,7 @@ def window(stage: Stage, conditions: Conditions) -> Frame:
     """The part of the photograph that shows the piece; all of it where the lens bends or a part would not do."""
     whole_px = stage.scene.photo_px
     everything = Frame(stage, whole_px)
-    if not stage.scene.HAS_OBJECT or stage.camera is not None or conditions.sensor.vignetting.any():
+    if not stage.scene.HAS_OBJECT or stage.camera is not None:
         return everything
     scene = needs_patch(stage.scene)
     edge = np.linspace(0, 1, 9)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -61,17 +61,6 @@ def measure_cost(
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
     threads = torch.get_num_threads()
     return Cost(views=settings.views, side_px=problem.training_px, threads=threads, ms=total, parts=parts)
-
-
-def relative_costs(problem: Problem, others: Mapping[str, Problem], design: Tensor) -> dict[str, float]:
-    """What a step of each other problem takes, as a multiple of the problem's own just before: medians of ratios."""
-    views, ratios = problem.scene.settings.optimize.views, {name: [] for name in others}
-    for number in range(REPEATS + 1):
-        conditions = problem.scene.draw("train", views, start=number * views)
-        for name, other in others.items():
-            own_ms, other_ms = (sum(_step_ms(p, design, conditions).values()) for p in (problem, other))
-            ratios[name].append(other_ms / own_ms)
-    return {name: statistics.median(values[1:]) for name, values in ratios.items()}
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:
