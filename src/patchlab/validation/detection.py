@@ -26,6 +26,7 @@ from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
+from patchproof.base.resample import sixteenths
 from patchproof.base.strict import Refused, Share, Strict
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
@@ -154,8 +155,7 @@ def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
 def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
     mask = np.zeros((size_px[1], size_px[0]), np.uint8)
-    points = np.clip((quad - 0.5) * 16, -1e6, 1e6).round().astype(np.int32)
-    cv2.fillConvexPoly(mask, points, 255, cv2.LINE_AA, 4)
+    cv2.fillConvexPoly(mask, sixteenths(quad), 255, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / 255
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
+from patchproof.base.resample import between_indices, sixteenths
 from patchproof.base.strict import NotNegative, Strict
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import cells_of, find_markers
@@ -100,7 +101,7 @@ class Pose:
         filled = np.zeros(shape[:2], np.uint8)
         for printed in self.prints:
             for quad in printed.area_px:
-                cv2.fillConvexPoly(filled, ((quad - 0.5) * 16).round().astype(np.int32), 1, cv2.LINE_8, 4)
+                cv2.fillConvexPoly(filled, sixteenths(quad), 1, cv2.LINE_8, 4)
         return filled > 0
 
 
@@ -201,8 +202,7 @@ def paper_share(prints: Sequence[Printed], shape: tuple[int, ...]) -> np.ndarray
         top, left, n = box[0].start, box[1].start, len(printed.cells)
         size = box[1].stop - left, box[0].stop - top
         to_fine = np.array([[_FINE, 0, -_FINE * left], [0, _FINE, -_FINE * top], [0, 0, 1.0]])
-        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centers
-        matrix = np.linalg.inv(half) @ to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]) @ half
+        matrix = between_indices(to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]))
         ink = (1 - printed.cells).astype(np.float32)
         fine = cv2.warpPerspective(ink, matrix, (size[0] * _FINE, size[1] * _FINE), flags=cv2.INTER_NEAREST)
         share[box] -= cv2.resize(fine, size, interpolation=cv2.INTER_AREA)

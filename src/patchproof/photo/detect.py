@@ -20,10 +20,11 @@ import numpy as np
 
 from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE
 from patchproof.base.input import seconds_left
+from patchproof.base.resample import reduced
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import squares_in
-from patchproof.photo.rectify import part_around, reduced
+from patchproof.photo.rectify import part_around
 
 DICTIONARY = "DICT_5X5_1000"
 LIGHT = LIGHT_OF_CODE.astype(np.float32)

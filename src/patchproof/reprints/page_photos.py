@@ -22,6 +22,7 @@ from patchproof.base import geometry
 from patchproof.base.color import codes_of, linear_from_srgb, photo_codes_of
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes, image_pixels, new_folder
+from patchproof.base.resample import between_indices
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
@@ -193,9 +194,7 @@ def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: Li
 
 def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
     """The page in the picture's pixels before a gray table, averaged over pixels."""
-    mm_from_index = np.array([[1 / PX_PER_MM, 0, 0.5 / PX_PER_MM], [0, 1 / PX_PER_MM, 0.5 / PX_PER_MM], [0, 0, 1]])
-    index_from_px = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
     finer = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
     soft = cv2.GaussianBlur(page, (0, 0), 0.35 * float(finer))  # a pixel's own width, before it is sampled once
-    matrix = index_from_px @ px_from_mm @ mm_from_index
+    matrix = between_indices(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
     return cv2.warpPerspective(soft, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))

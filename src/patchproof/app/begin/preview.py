@@ -30,6 +30,7 @@ from patchproof.app.begin.uv_layout import uv_layouts
 from patchproof.app.begin.views import Look, looks
 from patchproof.base.color import codes_of
 from patchproof.base.output import image_bytes, new_folder, write_whole
+from patchproof.base.resample import reduced
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.classifier.labels import find_labels
@@ -234,7 +235,7 @@ def _write_layouts(scene: Scene, folder: Path) -> list[tuple[str, str]]:
             f'{name} is the layout of "{layout.material}", {width} × {height} texels; {len(layout.numbered)} of its '
             f"{layout.faces} faces have room for their numbers"
         )
-        shown.append((text, data_uri(jpeg(_reduced(layout.picture)))))
+        shown.append((text, data_uri(jpeg(reduced(layout.picture, _TEXTURE_PX)))))
     return shown
 
 
@@ -253,7 +254,7 @@ def _write_object(stage: Stage, path: Path) -> None:
     if not isinstance(scene, MeshScene):
         raise ValueError("a scene of pictures has no object to turn")
     mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
-    textures = [_reduced(m.texture_srgb) for m in mesh.materials if m.texture_srgb is not None]
+    textures = [reduced(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
     piece = _gray_piece(stage, scene) if isinstance(scene, PatchScene) else None
     write_whole(path, lambda part: write_glb(mesh, textures, part, piece))
 
@@ -265,13 +266,3 @@ def _gray_piece(stage: Stage, scene: PatchScene) -> Part:
     shown = stage.look.shown(torch.full((3, height, width), 0.5))
     material = Material("piece", (1.0, 1.0, 1.0), codes_of(shown.srgb).cpu().numpy())
     return Part(laid.vertices_mm, laid.faces, material, laid.piece_mm / laid.size_mm, laid.normals)
-
-
-def _reduced(texture: np.ndarray) -> np.ndarray:
-    """A texture of at most `_TEXTURE_PX` a side."""
-    import cv2
-
-    height, width = texture.shape[:2]
-    scale = min(1.0, _TEXTURE_PX / max(width, height))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return texture if scale == 1 else cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
