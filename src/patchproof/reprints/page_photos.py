@@ -28,12 +28,12 @@ from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.light import Lamp, Lighting, irradiance
 from patchproof.channel.printer import load_printer
-from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
 from patchproof.reprints.hung_sheet import Hanging
 from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.piece import hash_order
+from patchproof.sheets.markers import DICTIONARY, cells_of
+from patchproof.sheets.piece import hash_order, marker_at, printed
 from patchproof.sheets.raster import page_count, page_pixels
 
 Shows = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
@@ -70,8 +70,7 @@ def chart_manifest(count: int) -> Manifest:
         {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
         for cell, index in zip(cells, order, strict=True)
     ]
-    corners = [geometry.rect_corners((*at, MARKER_MM, MARKER_MM)).tolist() for at in _MARKERS_MM]
-    markers = [{"dictionary": DICTIONARY, "id": 7 + i, "corners_mm": c, "page": 1} for i, c in enumerate(corners)]
+    markers = [printed(marker_at(7 + i, at, MARKER_MM)) for i, at in enumerate(_MARKERS_MM)]
     head = {"sheet_id": "CHART00000", "kind": "blank", "page_mm": PAGE_MM, "design": None, "promise": None}
     where = {"cut_mm": (100.0, 6.0, 1.0, 1.0), "ruler_mm": (100.0, 100.0), "settings": {}}
     return Manifest.model_validate(head | where | {"markers": markers, "chart": swatches})
