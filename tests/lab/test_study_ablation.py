@@ -9,7 +9,6 @@ import torch
 from patchlab.study.study import Cell, Result
 from patchlab.validation import ablation
 from patchlab.validation.ablation import ALL, PRINTER, AblationSettings, without
-from patchproof.app.plan import cost as plan_cost
 from patchproof.base.strict import Refused
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer.problem import set_problem
@@ -49,7 +48,7 @@ def test_without_the_printer_colors_are_shown_as_they_are_sent(problem):
 def test_an_effect_that_takes_time_costs_a_share_of_a_step(problem, monkeypatch):
     slow = ablation.Without.see
     monkeypatch.setattr(ablation.Without, "see", lambda *a: (time.sleep(0.3), slow(*a))[1])
-    monkeypatch.setattr(plan_cost, "REPEATS", 1)
+    monkeypatch.setattr(ablation, "ROUNDS", 1)
     costs = ablation._costs(problem, ["noise"])
     assert list(costs) == ["noise"] and costs["noise"] < -0.5  # without it, a step takes far longer
 

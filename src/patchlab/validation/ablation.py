@@ -21,11 +21,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from patchlab.bench.measure import ratio
 from patchlab.study.claims import mean
 from patchlab.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
 from patchlab.study.record import Record, recorded
 from patchlab.study.study import Cell, Result, Study
-from patchproof.app.plan.cost import relative_costs
+from patchproof.app.plan.cost import in_turn, steps_ms
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.claims import Estimate
 from patchproof.base.strict import Refused
@@ -42,6 +43,7 @@ from patchproof.reprints.path_traced import photograph_traced
 from patchproof.scene.conditions import Conditions
 
 ALL = "all"
+ROUNDS = 5  # of steps in turn, to know what they take
 # What goes together, because alone it is too little to tell.
 _TOGETHER = ("dot gain + ink density + printed black + paper white", "blur + motion blur")
 _UNSEEN = "JPEG"  # training's views are too small to show it
@@ -127,9 +129,11 @@ def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:
 
 
 def _costs(problem: Problem, effects: Sequence[str]) -> dict[str, float]:
-    """The share of a step's time that goes where each effect is left out."""
-    less = {effect: without(problem, effect) for effect in effects}
-    return {name: 1 - ratio for name, ratio in relative_costs(problem, less, problem.subject.start()).items()}
+    """The share of a step's time that goes where each effect is left out: medians over rounds."""
+    tried = {ALL: problem} | {effect: without(problem, effect) for effect in effects}
+    calls = {name: steps_ms(some, problem.subject.start()) for name, some in tried.items()}
+    times = {name: np.array([sum(row.values()) for row in rows]) for name, rows in in_turn(calls, ROUNDS).items()}
+    return {name: 1 - ratio(times, name, ALL).value for name in effects}
 
 
 def tables(settings: AblationSettings, results: Sequence[Result]) -> tuple[Table, ...]:
