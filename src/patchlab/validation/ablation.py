@@ -23,7 +23,7 @@ from pydantic import Field
 
 from patchlab.bench.measure import ratio
 from patchlab.study.claims import mean
-from patchlab.study.grid import GridSettings, Names, cell_of, grouped, pairs, problem_of, who
+from patchlab.study.grid import GridSettings, Names, grid_cells, grouped, problem_of, who
 from patchlab.study.record import Record, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.cost import in_turn, steps_ms
@@ -103,12 +103,8 @@ def without(problem: Problem, effect: str) -> Problem:
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed: a design trained with all effects, and one without each."""
-    return [
-        cell_of(values | {"effect": effect}, seed, values["network"], effect[:40])
-        for values in pairs(settings, base)
-        for seed in settings.seeds
-        for effect in (ALL, *settings.effects)
-    ]
+    effects = (ALL, *settings.effects)
+    return grid_cells(settings, base, lambda values: ((values | {"effect": each}, (each[:40],)) for each in effects))
 
 
 def run(settings: AblationSettings, base: Path, cell: Cell) -> dict[str, Any]:

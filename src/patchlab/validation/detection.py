@@ -22,6 +22,7 @@ import torch
 from pydantic import Field
 
 from patchlab.study.claims import clustered_median
+from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
@@ -110,10 +111,8 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
         return answers
     homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(surface.rect_mm)
     true_px = apply_homography(truth, corners)
-    off_px = apply_homography(homography, corners) - true_px
-    off_mm = apply_homography(np.linalg.inv(homography), true_px) - corners
-    errors_px = np.linalg.norm(off_px, axis=1).tolist()
-    return answers | {"error_mm": float(np.linalg.norm(off_mm, axis=1).max()), "error_px": errors_px}
+    errors_px = np.linalg.norm(apply_homography(homography, corners) - true_px, axis=1).tolist()
+    return answers | {"error_mm": corner_error_mm(geometry, corners, true_px), "error_px": errors_px}
 
 
 def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
