@@ -21,7 +21,6 @@ from patchproof.app.begin.sides import (
     SIDE_NAMES,
     extent_mm,
     gap_colors,
-    gap_top_mm,
     side_of,
     side_views,
     stretch_colors,
@@ -45,6 +44,7 @@ from patchproof.scene.interface import Scene
 from patchproof.scene.mesh_scene import MeshScene
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
 from patchproof.scene.texture import whole_colors
 from patchproof.scene.texture_scene import TextureScene
@@ -208,7 +208,7 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
             "shape": shape,
             "picture": data_uri(png(gap_colors(laid))),
             "low": "0 mm",
-            "high": f"{gap_top_mm(laid):.2g} mm: too much",
+            "high": f"{gap_limit_mm(laid.size_mm):.2g} mm: too much",
         }
     ]
     if not laid.is_flat:
