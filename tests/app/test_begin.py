@@ -20,7 +20,6 @@ from patchproof.app.begin.sides import (
     PICTURE_PX,
     RAMP,
     gap_colors,
-    gap_top_mm,
     ramp,
     round_length,
     side_of,
@@ -31,6 +30,7 @@ from patchproof.base.settings import load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.render.stage import set_stage
 from patchproof.scene.fitting import largest
+from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import load_scene, make_scene
 from patchproof.sheets.blank import blank_page
 from test_report import seen_in_browser
@@ -86,7 +86,7 @@ def test_gaps_are_drawn_where_they_are():
     nothing = (colors == NO_SURFACE).all(-1)
     assert nothing.mean() == pytest.approx(over.overhang_share) == pytest.approx(1 / 6, abs=0.02)
     assert nothing[:, -5:].all() and not nothing[:, :50].any()  # on the right as one faces it
-    assert gap_top_mm(over) == pytest.approx(0.15 * 90)
+    assert gap_limit_mm(over.size_mm) == pytest.approx(0.15 * 90)
     assert (ramp(np.array([-1.0, 0, 1, 7])) == np.array([RAMP[0], RAMP[0], RAMP[-1], RAMP[-1]])).all()
 
 

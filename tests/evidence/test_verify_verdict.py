@@ -80,7 +80,7 @@ def test_photographs_in_one_place_prove_less():
     promise = promise_of(0.85, 0.3, correlation=0.2)
     chances = [kept_chance(promise, photos) for photos in ((40,), (10,) * 4, (5,) * 8)]
     assert chances == sorted(chances) and chances[0] < 0.4 < chances[2]
-    assert "other places" in judge(33, (40,), promise).reason
+    assert "is asked for" in judge(33, (40,), promise).reason
 
 
 def test_deceive_is_the_mirror_image_of_assist():

@@ -9,7 +9,7 @@ from patchproof.app.cli import app
 from patchproof.base.claims import wilson
 from patchproof.base.settings import SceneSettings, behind
 from patchproof.evidence.results import Control
-from patchproof.evidence.verdict import EACH, judge, next_step, sessions_needed
+from patchproof.evidence.verdict import EACH, judge, next_step, photos_line, sessions_needed
 from patchproof.evidence.worth import worth_of
 from patchproof.report.summary import promise_lines, verdict_lines
 from patchproof.report.words import headline_of
@@ -119,8 +119,9 @@ def test_who_cannot_tell_is_told_how_many_photographs_the_plan_asks_for():
     promise = promise_of(0.85, 0.2, correlation=0.1)
     needed = sessions_needed(promise)
     assert needed and f"{EACH} photographs in each of {needed} places" in next_step(promise, (6,))
-    assert "(6 in 1 place so far)" in next_step(promise, (6,)) and "none so far" in next_step(promise, ())
-    assert "new" in next_step(promise, (EACH,) * needed) and "so far" not in next_step(promise, (EACH,) * needed)
+    assert f"So far: 6 of {EACH * needed}, in 1 place of {needed}." in next_step(promise, (6,))
+    assert next_step(promise, ()) == photos_line(needed) and "So far" not in photos_line(needed)
+    assert "new" in next_step(promise, (EACH,) * needed) and "So far" not in next_step(promise, (EACH,) * needed)
     assert "gains more" in next_step(promise_of(0.3, 0.28, correlation=0.2), (40,))
     assert "markers" in next_step(promise, (20,), 3) and "markers" not in next_step(promise, (20,), 2)
     report = some_report().changed(summary=some_report().summary.changed(next_step="Take 10."))

@@ -21,7 +21,7 @@ from patchlab.validation.board_fit import edge_of, fit_board, white_noise
 from patchlab.validation.known_boards import BoardSettings, find_pose
 from patchproof.base.strict import Refused, validated
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.detect import cells_of
+from patchproof.sheets.markers import cells_of
 
 FINER, SIZE = 8, (320, 240)
 BLUR_PX, BLACK, NOISE = 0.9, (0.05, 0.04, 0.03), 0.008

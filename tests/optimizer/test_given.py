@@ -24,7 +24,8 @@ from patchproof.optimizer.run import load_run
 from patchproof.report.coco import PATCH
 from patchproof.reprints.run_sheet import sheet_of
 from patchproof.sheets.manifest import load_manifest
-from patchproof.sheets.piece import DICTIONARY, marker_image
+from patchproof.sheets.markers import DICTIONARY
+from patchproof.sheets.piece import marker_image
 from patchproof.sheets.raster import attached_manifest
 from test_optimize import scene_with, toml
 

@@ -26,11 +26,11 @@ from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.photo import detect, label, limits, read
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.detect import printed_markers
 from patchproof.photo.label import read_label
 from patchproof.photo.limits import finder_lines_in, limited, limited_memory, squares_in
 from patchproof.photo.read import read_photo
 from patchproof.sheets.board import load_board
+from patchproof.sheets.markers import printed_markers
 
 needs_timer = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no such timers on Windows")
 needs_linux = pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is limited on Linux alone")

@@ -19,12 +19,13 @@ from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo import colorfit, complete, detect, edges
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet
-from patchproof.photo.detect import LIGHT, cells_of, find_markers, luminance, refine
+from patchproof.photo.detect import LIGHT, find_markers, luminance, refine
 from patchproof.photo.edges import fit_borders
 from patchproof.photo.limits import edges_in, squares_in
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
 from patchproof.photo.registration import _vagueness
+from patchproof.sheets.markers import cells_of
 
 IDS = frozenset(PIECE_IDS)
 

@@ -18,7 +18,8 @@ from patchproof.render.stage import set_stage
 from patchproof.render.views import see
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.piece import MODULES, marker_image, with_ids
+from patchproof.sheets.markers import MODULES
+from patchproof.sheets.piece import marker_image, with_ids
 
 QUIET = """
 exposure_ev = [0, 0]

@@ -19,9 +19,10 @@ from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet
-from patchproof.photo.detect import COARSEST_PX, DICTIONARY, levels, look, printed_markers, whole
+from patchproof.photo.detect import COARSEST_PX, levels, look, whole
 from patchproof.photo.rectify import fit_page
 from patchproof.report.tables import Table
+from patchproof.sheets.markers import DICTIONARY, printed_markers
 
 SIZES_PX = ((1600, 1200), (2400, 1800), (4000, 3000))
 COARSEST = (500, COARSEST_PX, 2000)

@@ -16,6 +16,7 @@ from time import perf_counter
 from typing import Any
 
 from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.measure import clocked
 from patchproof.app.demo import SCENE
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.settings import OptimizeSettings, SceneSettings
@@ -92,9 +93,8 @@ def _scene(label: str, steps: int) -> Scene:
 
 def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
     with TemporaryDirectory() as folder, threads(1):
-        begin = perf_counter()
-        run = optimize_scene(scene, Path(folder) / "run", promise_views=views)
-        return run, perf_counter() - begin
+        run, ms = clocked(lambda: optimize_scene(scene, Path(folder) / "run", promise_views=views), perf_counter)
+        return run, ms / 1000
 
 
 def _missed(runs: dict[str, Run], judged: int) -> dict[str, Estimate]:

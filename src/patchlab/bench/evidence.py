@@ -26,10 +26,10 @@ from patchlab.bench.paper import (
 from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, fit_homography
 from patchproof.photo.complete import find_sheet
-from patchproof.photo.detect import DICTIONARY
 from patchproof.photo.rectify import fit_page
 from patchproof.photo.shapes import rolled, through_lens
 from patchproof.photo.unroll import explain
+from patchproof.sheets.markers import DICTIONARY
 
 WRONG_PX = 4.0  # by which a marker is moved that was glued on again
 

@@ -6,17 +6,22 @@ times of the same run.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Hashable, Mapping
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from patchlab.study.claims import median
+from patchproof.app.plan.cost import in_turn
 from patchproof.base.claims import Estimate
 
 Name = TypeVar("Name", bound=Hashable)
@@ -45,25 +50,32 @@ def describe(about: Mapping[str, Any]) -> str:
 
 
 def timed(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:
-    """Wall seconds of each call, `rounds` of them, all calls in turn in each round after one round of warm-up."""
-    seconds: dict[Name, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds + 1):
-        for name, call in calls.items():
-            begin = time.perf_counter()
-            call()
-            seconds[name].append(time.perf_counter() - begin)
-    return {name: np.array(values[1:]) for name, values in seconds.items()}
+    """Wall milliseconds of each call in `rounds` rounds of `in_turn`."""
+    told = in_turn({name: partial(clocked, call, time.perf_counter) for name, call in calls.items()}, rounds)
+    return {name: np.array([ms for _, ms in values]) for name, values in told.items()}
 
 
-def clocked(call: Callable[[], Answer]) -> tuple[Answer, float]:
-    """What a call returns, and its milliseconds of the processor: other work on the machine does not count."""
-    begin = time.process_time()
-    return call(), 1000 * (time.process_time() - begin)
+def clocked(call: Callable[[], Answer], clock: Callable[[], float] = time.process_time) -> tuple[Answer, float]:
+    """What a call returns, and its milliseconds; of the processor, where other work on the machine does not count, if
+    no other clock is given.
+    """
+    begin = clock()
+    return call(), 1000 * (clock() - begin)
 
 
-def ratio(seconds: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
+def ratio(times: Mapping[Name, np.ndarray], a: Name, b: Name) -> Estimate:
     """How many times as long `a` took as `b`: the median over rounds, each with its own ratio."""
-    return median(seconds[a] / seconds[b])
+    return median(times[a] / times[b])
+
+
+def said_by(source: Path, code: str, *arguments: str) -> tuple[str, Any]:
+    """(the short commit, the JSON in the last line that `code` prints) in a process of its own, which imports from the
+    `src` folder of a checkout.
+    """
+    command, environment = [sys.executable, "-c", code, *arguments], {**os.environ, "PYTHONPATH": str(source.resolve())}
+    said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+    commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
+    return commit.stdout.strip(), json.loads(said.splitlines()[-1])
 
 
 def _processor() -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from patchproof.base.color import photo_codes_of, srgb_from_linear
 from patchproof.base.geometry import intrinsics, look_at, rect_corners
-from patchproof.photo.detect import DICTIONARY, printed_markers
+from patchproof.sheets.markers import DICTIONARY, printed_markers
 
 Kind = Literal["flat", "lens", "rolled"]
 PIECE_MM, MARKER_MM = 140.0, 14.0

@@ -56,11 +56,11 @@ def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int,
             photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
             truth.append(confidence(from_pixels(photo)[None])[0])
             on_stage("photographs", i + 1, views)
-    seconds, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
+    times, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
     for side in sides:
         with torch.no_grad():
             off = confidence(pictures(side, shown, conditions)) - truth
-        cost, is_default = ratio(seconds, side, problem.training_px), side == problem.training_px
+        cost, is_default = ratio(times, side, problem.training_px), side == problem.training_px
         points.append(Point(f"{side} px", cost, student_mean(np.abs(off)), is_default))
         rows.append((f"{side} px", student_mean(off)))
     photo_px = problem.scene.settings.camera.photo_px

@@ -20,13 +20,11 @@ from pydantic import Field
 from patchlab.paper.sides import sides
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import grouped, of_values, problem_of, short_name
-from patchlab.study.pictures import contact_sheet, photographs
-from patchlab.study.record import Record, recorded
+from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
-from patchlab.study.trained import TrainedSettings, Way, Word, tested_in, trained_cells, trained_on
+from patchlab.study.trained import TrainedSettings, Way, Word, answers_and_sheet, tested_in, trained_cells, trained_on
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
-from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 
 CONTROLS = ("bare", "gray", "noise", "shuffled")
@@ -55,13 +53,8 @@ def run(settings: DeceiveSettings, base: Path, cell: Cell) -> dict[str, Any]:
     design = best_design(trained_on(problem, cell))
     things = shown_with_controls(problem, design, CONTROLS)
     suffix, content = problem.subject.file(design)
-    views = sides(problem, _SHEET_VIEWS)
-    sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
-    return {
-        **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),
-        f"{cell.name}.sheet.png": sheet,
-        f"{cell.name}.{suffix}": content,
-    }
+    sheet = sides(problem, _SHEET_VIEWS), _SHEET_PX
+    return answers_and_sheet(problem, cell.name, things, settings.n, sheet) | {f"{cell.name}.{suffix}": content}
 
 
 def tables(settings: DeceiveSettings, results: Sequence[Result]) -> list[Table]:

@@ -28,7 +28,7 @@ from pydantic import Field
 from patchlab.paper.image_classes import write_labels, write_renders
 from patchlab.study.claims import clustered
 from patchlab.study.figures import picture_sheet
-from patchlab.study.grid import Count, GridSettings, Seeds, cell_of, grouped, of_values, pairs, problem_of, who
+from patchlab.study.grid import Count, GridSettings, Seeds, by_scene, grid_cells, grouped, of_values, problem_of, who
 from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import Record, hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
@@ -76,12 +76,12 @@ def patch_cells(settings: GridSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed; refused of scenes without a mesh or a printed patch. All objects with the
     first seed come first: an unfinished study says something of each.
     """
-    scenes = list(pairs(settings, base))
-    for values in scenes:
-        if values["scene"]["object"]["mesh"] is None or values["scene"]["patch"]["kind"] != "patch":
-            do = 'give object.mesh and patch.kind = "patch"'
-            raise Refused("a scene with a mesh and a printed patch", values["file"], do)
-    return [cell_of(values, seed, values["network"]) for seed in settings.seeds for values in scenes]
+    cells = grid_cells(settings, base)
+    for cell in cells:
+        scene, do = cell.values["scene"], 'give object.mesh and patch.kind = "patch"'
+        if scene["object"]["mesh"] is None or scene["patch"]["kind"] != "patch":
+            raise Refused("a scene with a mesh and a printed patch", cell.values["file"], do)
+    return sorted(cells, key=lambda cell: settings.seeds.index(cell.values["seed"]))
 
 
 def run(settings: Patch3dSettings, base: Path, cell: Cell) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def _pooled(results: Sequence[Result]) -> Table:
 def _by_object(results: Sequence[Result], pair: tuple[str, str], where: str | None) -> tuple[tuple, ...]:
     """Rows of rates by object, and the difference of a pair."""
     rows = []
-    for (name,), group in grouped(results, of_values("name")).items():
+    for name, group in by_scene(results).items():
         records = {kind: Record(group, kind, where) for kind in KINDS}
         rates = (record.level()[0] for record in records.values())
         rows.append((name, *rates, records[pair[0]].gain(records[pair[1]])[0]))
@@ -227,7 +227,7 @@ def _by_cell(results: Sequence[Result]) -> Table:
 
 def figures(settings: Patch3dSettings, results: Sequence[Result]) -> list[Drawing]:
     """What was optimized."""
-    firsts = [group[0] for group in grouped(results, of_values("name")).values()]
+    firsts = [group[0] for group in by_scene(results).values()]
     return [
         picture_sheet(
             "designs",

@@ -19,13 +19,13 @@ from pydantic import Field
 from patchlab.paper.sides import mean_color, sides
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import grouped, of_values, problem_of, short_name
-from patchlab.study.pictures import contact_sheet, photographs
-from patchlab.study.record import Record, recorded
+from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained import (
     TrainedSettings,
     Way,
     Word,
+    answers_and_sheet,
     tested_in,
     trained_cells,
     trained_on,
@@ -34,7 +34,6 @@ from patchlab.study.trained import (
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.optimizer.responses import responses
 from patchproof.report.tables import Drawing, Table
 
 if TYPE_CHECKING:
@@ -64,16 +63,14 @@ def cells(settings: RobustSettings, base: Path) -> list[Cell]:
 def run(settings: RobustSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Train for one class on one network; rates on all, pictures, mean color."""
     problem = problem_of(base, cell.values)
-    subject, views = problem.subject, sides(problem, _SIDES)
+    subject = problem.subject
     design = best_design(trained_on(problem, cell))
     pixels = (subject.start(), from_pixels(design, problem.device))
     things = {kind: subject.shown(each) for kind, each in zip(_KINDS, pixels, strict=True)}
     suffix, content = subject.file(design)
-    sheet = contact_sheet([photographs(problem, thing, views, _SHEET_PX) for thing in things.values()])
     return {
-        **recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n))),
+        **answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, _SIDES), _SHEET_PX)),
         "color": mean_color(problem, things["design"], _TURN_VIEWS, _SHEET_PX),
-        f"{cell.name}.sheet.png": sheet,
         f"{cell.name}.{suffix}": content,
     }
 

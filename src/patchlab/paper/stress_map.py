@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from patchlab.study.figures import number_grid
-from patchlab.study.grid import Count, GridSettings, cell_of, pairs
+from patchlab.study.grid import Count, GridSettings, grid_cells
 from patchlab.study.study import Cell
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
@@ -70,12 +70,9 @@ Place = tuple[int, int]  # a map's cell: which of the poses, which of the lights
 
 def mesh_cells(settings: GridSettings, base: Path) -> list[Cell]:
     """A cell per scene, network and seed; refused where pose and light cannot be set."""
-    cells = []
-    for values in pairs(settings, base):
-        if values["scene"]["object"]["mesh"] is None:
-            got = values["file"]
-            raise Refused("scenes with a mesh, whose pose and light can be set", got, "name object.mesh in it")
-        cells += [cell_of(values, seed, values["network"]) for seed in settings.seeds]
+    cells = grid_cells(settings, base)
+    if flat := [cell.values["file"] for cell in cells if cell.values["scene"]["object"]["mesh"] is None]:
+        raise Refused("scenes with a mesh, whose pose and light can be set", flat[0], "name object.mesh in it")
     return cells
 
 

@@ -26,7 +26,6 @@ from patchlab.paper.sides import sides, three_views
 from patchlab.study.claims import mean
 from patchlab.study.figures import number_grid, picture_sheet
 from patchlab.study.grid import Count, Names, grouped, of_values, problem_of, short_name
-from patchlab.study.pictures import contact_sheet, photographs
 from patchlab.study.record import Record, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchlab.study.trained import (
@@ -34,6 +33,7 @@ from patchlab.study.trained import (
     TrainedSettings,
     Word,
     alone,
+    answers_and_sheet,
     tested_in,
     trained_cells,
     trained_on,
@@ -100,9 +100,7 @@ def run(settings: TransferSettings, base: Path, cell: Cell) -> dict[str, Any]:
         things = shown_with_controls(problem, design, ())
         suffix, content = problem.subject.file(design)
         answers[f"{cell.name}.{suffix}"] = content
-    answers |= recorded(responses(problem, things, problem.scene.draw("evaluate", settings.n)))
-    views = photographs(problem, things["design"], sides(problem, 3), _SHEET_PX)
-    answers[f"{cell.name}.sheet.png"] = contact_sheet([views])
+    answers |= answers_and_sheet(problem, cell.name, things, settings.n, (sides(problem, 3), _SHEET_PX))
     if problem.scene.HAS_OBJECT:
         fixed = three_views(problem, settings.lights)
         answers["views"] = recorded(responses(problem, things, fixed))

@@ -10,7 +10,7 @@ full and masked textures, bounded or free. Changes are checked like the file.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -79,6 +79,22 @@ def cell_of(values: Values, seed: int, *words: str) -> Cell:
     return Cell(re.sub(r"[^\w=+.,-]+", "-", name), {**values, "seed": seed})
 
 
+def grid_cells(
+    settings: GridSettings,
+    base: Path,
+    vary: Callable[[Values], Iterable[tuple[Values, tuple[str, ...]]]] = lambda values: ((values, ()),),
+) -> list[Cell]:
+    """A cell for every scene before every single network, each of its variants (values, and words for the name), and
+    every seed.
+    """
+    return [
+        cell_of(varied, seed, values["network"], *words)
+        for values in pairs(settings, base)
+        for varied, words in vary(values)
+        for seed in settings.seeds
+    ]
+
+
 def scene_of(base: Path, values: Mapping[str, Any]) -> Scene:
     """The scene that a cell's values hold, its paths relative to the scene file's folder."""
     settings = validated(SceneSettings, values["scene"], values["file"])
@@ -107,6 +123,11 @@ def grouped(results: Iterable[Result], key: Callable[[Result], Key]) -> dict[Key
 def of_values(*names: str) -> Callable[[Result], tuple]:
     """A key to group by: these values of a result's cell."""
     return lambda result: tuple(result.cell.values[name] for name in names)
+
+
+def by_scene(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Results by their scene's name."""
+    return grouped(results, lambda result: result.cell.values["name"])
 
 
 who = of_values("name", "network", "seed")  # scene, network and seed, as tables begin

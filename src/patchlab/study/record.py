@@ -15,7 +15,9 @@ import numpy as np
 from patchlab.study.claims import mean
 from patchlab.study.study import Result
 from patchproof.base.claims import Estimate, difference, rate
+from patchproof.base.geometry import apply_homography
 from patchproof.base.goal import Goal
+from patchproof.evidence.results import Geometry
 from patchproof.optimizer.responses import Answers
 
 
@@ -50,6 +52,16 @@ def gain_of(result: Result, thing: str, other: str) -> float:
 def hardest(result: Result, controls: Sequence[str]) -> str:
     """The control that is hardest to beat."""
     return max(controls, key=lambda name: gain_of(result, name, controls[0]))
+
+
+def corner_error_mm(geometry: Geometry, corners_mm: np.ndarray, true_px: np.ndarray) -> float | None:
+    """How far on paper the corners N×2, which lie at `true_px`, are seen at most from where they are; None where the
+    photograph's homography is not known.
+    """
+    if geometry.homography_px_from_mm is None:
+        return None
+    seen_mm = apply_homography(np.linalg.inv(np.array(geometry.homography_px_from_mm)), true_px)
+    return float(np.linalg.norm(seen_mm - corners_mm, axis=1).max())
 
 
 class Record:

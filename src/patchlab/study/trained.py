@@ -14,9 +14,14 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from patchlab.study.grid import GridSettings, Names, Tables, cell_of, scene_values, short_name, with_tables
+from patchlab.study.pictures import contact_sheet, photographs
+from patchlab.study.record import recorded
 from patchlab.study.study import Cell, Result
 from patchproof.base.claims import Estimate
 from patchproof.optimizer.problem import Problem
+from patchproof.optimizer.responses import responses
+from patchproof.render.photograph import Shown
+from patchproof.scene.conditions import Conditions
 
 Way = dict[str, dict[str, Any]]  # tables of a scene file with the keys that change
 Word = Annotated[str, Field(pattern=r"^[\w=+,-]{1,24}$")]  # part of a file's name
@@ -59,6 +64,16 @@ def trained_cells(
 def trained_on(problem: Problem, cell: Cell) -> Problem:
     """The same problem before the networks that train."""
     return problem.before([cell.values["networks"].index(name) for name in cell.values["trained"]])
+
+
+def answers_and_sheet(
+    problem: Problem, name: str, things: Mapping[str, Shown], n: int, sheet: tuple[Conditions, int]
+) -> dict[str, Any]:
+    """What all networks say of `things` under n unseen conditions, and a cell's contact sheet: views and their side."""
+    answers = recorded(responses(problem, things, problem.scene.draw("evaluate", n)))
+    return answers | {
+        f"{name}.sheet.png": contact_sheet([photographs(problem, each, *sheet) for each in things.values()])
+    }
 
 
 def tested_in(results: Sequence[Result]) -> list[str]:

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import GridSettings, Names, Values, cell_of, grouped, of_values, pairs, problem_of, who
+from patchlab.study.grid import GridSettings, Names, Values, grid_cells, grouped, of_values, problem_of, who
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
@@ -116,12 +116,12 @@ def without(problem: Problem, effect: str) -> Problem:
 
 def cells(settings: AblationSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed: a design trained with all effects, and one without each that is on."""
-    return [
-        cell_of(values | {"effect": effect}, seed, values["network"], effect[:40])
-        for values in pairs(settings, base)
-        for seed in settings.seeds
-        for effect in (ALL, *(effect for effect in settings.effects if _is_on(values, effect)))
-    ]
+
+    def vary(values: Values) -> list[tuple[Values, tuple[str, ...]]]:
+        on = [effect for effect in settings.effects if _is_on(values, effect)]
+        return [(values | {"effect": effect}, (effect[:40],)) for effect in (ALL, *on)]
+
+    return grid_cells(settings, base, vary)
 
 
 def _is_on(values: Values, effect: str) -> bool:

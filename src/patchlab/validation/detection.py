@@ -22,10 +22,12 @@ import torch
 from pydantic import Field
 
 from patchlab.study.claims import clustered_median
+from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
+from patchproof.base.resample import sixteenths
 from patchproof.base.strict import Refused, Share, Strict
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
@@ -109,10 +111,8 @@ def run(settings: DetectionSettings, base: Path, cell: Cell) -> dict[str, Any]:
         return answers
     homography, corners = np.array(geometry.homography_px_from_mm), rect_corners(surface.rect_mm)
     true_px = apply_homography(truth, corners)
-    off_px = apply_homography(homography, corners) - true_px
-    off_mm = apply_homography(np.linalg.inv(homography), true_px) - corners
-    errors_px = np.linalg.norm(off_px, axis=1).tolist()
-    return answers | {"error_mm": float(np.linalg.norm(off_mm, axis=1).max()), "error_px": errors_px}
+    errors_px = np.linalg.norm(apply_homography(homography, corners) - true_px, axis=1).tolist()
+    return answers | {"error_mm": corner_error_mm(geometry, corners, true_px), "error_px": errors_px}
 
 
 def _photographed(sheet: HungSheet, conditions: Conditions, truth, rng, hide: bool) -> tuple[np.ndarray, float]:
@@ -154,8 +154,7 @@ def _card(rng: np.random.Generator, piece_px: np.ndarray) -> np.ndarray:
 def _filled(quad: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """H×W float32 in [0, 1]: what share of each pixel, about, lies in the quad."""
     mask = np.zeros((size_px[1], size_px[0]), np.uint8)
-    points = np.clip((quad - 0.5) * 16, -1e6, 1e6).round().astype(np.int32)
-    cv2.fillConvexPoly(mask, points, 255, cv2.LINE_AA, 4)
+    cv2.fillConvexPoly(mask, sixteenths(quad), 255, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / 255
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import grouped, networks_at, of_values
+from patchlab.study.grid import by_scene, networks_at
 from patchlab.study.record import hits_of
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.photographed import (
@@ -79,7 +79,7 @@ def _session(report: Any, control: str | None) -> dict[str, Any]:
 
 def tables(settings: ForecastsSettings, results: Sequence[Result]) -> tuple[Table, ...]:
     """Forecasts and effects, by scene and in all; every session."""
-    groups = {name[0]: own for name, own in grouped(results, of_values("name")).items()} | {"all": list(results)}
+    groups = by_scene(results) | {"all": list(results)}
     about = f"{settings.sessions} sessions of {settings.photos} photographs of each run"
     head = ("scene", "photographs", "Brier", "Brier of the promise", "calibration slope", "counts held", "width")
     head = (*head, "the promise's width", "the promise's counts held")

@@ -18,10 +18,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
+from patchproof.base.resample import between_indices, sixteenths
 from patchproof.base.strict import NotNegative, Strict
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.detect import cells_of, find_markers
+from patchproof.photo.detect import find_markers
 from patchproof.photo.rectify import fit_page, part_around
+from patchproof.sheets.markers import board_squares, cells_of, marker_corner
 
 LEAST_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
 # Of a module: how far corners may lie off the plane, root mean square. In 25 photographs of flat boards they were off
@@ -56,8 +58,9 @@ class BoardSettings(Strict):
     @property
     def places(self) -> tuple[tuple[int, int], ...]:
         """(row, column) of every marker of a grid or ChArUco board, in the order of the ids."""
-        every = [(row, column) for row in range(self.rows) for column in range(self.columns)]
-        return tuple(at for at in every if self.kind == "grid" or sum(at) % 2)
+        if self.kind == "grid":
+            return tuple(np.ndindex(self.rows, self.columns))
+        return tuple(board_squares(self.rows, self.columns, white=True))
 
     @property
     def names(self) -> tuple[int, ...]:
@@ -100,7 +103,7 @@ class Pose:
         filled = np.zeros(shape[:2], np.uint8)
         for printed in self.prints:
             for quad in printed.area_px:
-                cv2.fillConvexPoly(filled, ((quad - 0.5) * 16).round().astype(np.int32), 1, cv2.LINE_8, 4)
+                cv2.fillConvexPoly(filled, sixteenths(quad), 1, cv2.LINE_8, 4)
         return filled > 0
 
 
@@ -123,7 +126,10 @@ def find_pose(srgb: np.ndarray, board: BoardSettings) -> Pose:
 
 def _plane(board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px: float) -> tuple[np.ndarray, float]:
     """The homography from the board, in marker sides, and what the corners miss it by."""
-    corners = {i: rect_corners((*_corner(board, at), 1, 1)) for i, at in zip(board.names, board.places, strict=True)}
+    corners = {
+        i: rect_corners((*marker_corner(at, 1 + board.gap, 1), 1, 1))
+        for i, at in zip(board.names, board.places, strict=True)
+    }
     fit = fit_page(corners_px, corners)
     off = [corners_px[i] - apply_homography(fit.px_from_mm, corners[i]) for i in corners_px]
     misfit_px = float(np.sqrt((np.concatenate(off) ** 2).sum(1).mean()))
@@ -131,12 +137,6 @@ def _plane(board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px
         advice = f"no plane fits: corners lie {misfit_px:.2f} px off it, a module is {module_px:.1f} px"
         raise CannotJudge("curled", misfit_px, LARGEST_MISFIT * module_px, advice)
     return fit.px_from_mm, misfit_px
-
-
-def _corner(board: BoardSettings, at: tuple[int, int]) -> tuple[float, float]:
-    """x, y of a marker's corner, in marker sides."""
-    inset = board.gap / 2 if board.kind == "charuco" else 0.0
-    return at[1] * (1 + board.gap) + inset, at[0] * (1 + board.gap) + inset
 
 
 def _on_board(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) -> tuple[Printed, ...]:
@@ -147,15 +147,14 @@ def _on_board(board: BoardSettings, px_from_board: np.ndarray, found: set[int]) 
     clear = {at for number, at in zip(board.names, board.places, strict=True) if number in found}
     prints = []
     for at, modules in zip(board.places, cells_of(board.dictionary, board.names), strict=True):
-        x, y = _corner(board, at)
+        x, y = marker_corner(at, grown, 1)
         area = _area(board, px_from_board, at, (x - half, y - half, grown)) if at in clear else []
         prints.append(_printed(modules, px_from_board, (x, y, 1), area))
-    for at in np.ndindex(board.rows, board.columns) if board.kind == "charuco" else ():
-        if sum(at) % 2 == 0:
-            square = at[1] * grown, at[0] * grown, grown
-            beside = {(at[0] + down, at[1] + right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))}
-            area = _area(board, px_from_board, at, square) if beside & set(board.places) <= clear else []
-            prints.append(replace(_printed(np.zeros((1, 1)), px_from_board, square, area), is_marker=False))
+    for at in board_squares(board.rows, board.columns, white=False) if board.kind == "charuco" else ():
+        square = at[1] * grown, at[0] * grown, grown
+        beside = {(at[0] + down, at[1] + right) for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1))}
+        area = _area(board, px_from_board, at, square) if beside & set(board.places) <= clear else []
+        prints.append(replace(_printed(np.zeros((1, 1)), px_from_board, square, area), is_marker=False))
     return tuple(prints)
 
 
@@ -201,8 +200,7 @@ def paper_share(prints: Sequence[Printed], shape: tuple[int, ...]) -> np.ndarray
         top, left, n = box[0].start, box[1].start, len(printed.cells)
         size = box[1].stop - left, box[0].stop - top
         to_fine = np.array([[_FINE, 0, -_FINE * left], [0, _FINE, -_FINE * top], [0, 0, 1.0]])
-        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centers
-        matrix = np.linalg.inv(half) @ to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]) @ half
+        matrix = between_indices(to_fine @ printed.px_from_unit @ np.diag([1 / n, 1 / n, 1]))
         ink = (1 - printed.cells).astype(np.float32)
         fine = cv2.warpPerspective(ink, matrix, (size[0] * _FINE, size[1] * _FINE), flags=cv2.INTER_NEAREST)
         share[box] -= cv2.resize(fine, size, interpolation=cv2.INTER_AREA)

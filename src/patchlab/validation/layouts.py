@@ -22,15 +22,14 @@ from patchlab.study.claims import clustered_median, mean
 from patchlab.study.grid import (
     Count,
     GridSettings,
-    cell_of,
+    grid_cells,
     grouped,
     networks_at,
-    pairs,
     scene_of,
     who,
     with_tables,
 )
-from patchlab.study.record import Record, gain_of, hardest, recorded
+from patchlab.study.record import Record, corner_error_mm, gain_of, hardest, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, rect_corners
@@ -121,17 +120,12 @@ def laid_out(scene: PatchScene, layout: Layout) -> PatchScene:
 
 def cells(settings: LayoutsSettings, base: Path) -> list[Cell]:
     """For each scene, network and seed a cell per layout."""
-    return [
-        cell_of(
-            with_tables(values, layout.scene) | {"layout": name, "how": layout.model_dump()},
-            seed,
-            values["network"],
-            name,
-        )
-        for values in pairs(settings, base)
-        for seed in settings.seeds
-        for name, layout in settings.layouts.items()
-    ]
+    ways = [(name, layout.scene, layout.model_dump()) for name, layout in settings.layouts.items()]
+    return grid_cells(
+        settings,
+        base,
+        lambda values: ((with_tables(values, scene) | {"layout": a, "how": how}, (a,)) for a, scene, how in ways),
+    )
 
 
 def run(settings: LayoutsSettings, base: Path, cell: Cell) -> dict[str, Any]:
@@ -177,10 +171,9 @@ def _photographed(problem: Problem, scene: PatchScene, design: np.ndarray, count
         photo = Photo(image_pixels(sheet.photograph(conditions)), float(scene.matrix_px(scene.photo_px)[0, 0]))
         entry = measure(view_of(photo, None), "photo.jpg", surface, promised, promised_ranges(())).entry
         geometry, error = entry.geometry, None
-        if geometry is not None and geometry.homography_px_from_mm is not None and scene.is_flat:
+        if geometry is not None and scene.is_flat:
             corners = rect_corners(manifest.cut_mm)
-            seen = np.linalg.inv(np.array(geometry.homography_px_from_mm)) @ sheet.px_from_page(conditions)
-            error = float(np.linalg.norm(apply_homography(seen, corners) - corners, axis=1).max())
+            error = corner_error_mm(geometry, corners, apply_homography(sheet.px_from_page(conditions), corners))
         out["status"].append(entry.status)
         out["error_mm"].append(error)
         out["uncertainty_mm"].append(geometry and geometry.corner_uncertainty_mm)

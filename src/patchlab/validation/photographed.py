@@ -17,9 +17,8 @@ from patchlab.study.grid import (
     Count,
     GridSettings,
     Names,
-    cell_of,
+    grid_cells,
     networks_at,
-    pairs,
     scene_of,
     short_name,
     with_tables,
@@ -44,17 +43,15 @@ class SessionsSettings(GridSettings):
 
 def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
     """One per combination, with the whole scene in it."""
-    return [
-        cell_of(
-            with_tables(values, {"target": {"models": values["networks"]}, "printer": {"profile": printer}}),
-            seed,
-            values["network"],
-            short_name(printer),
-        )
-        for values in pairs(settings, base)
-        for printer in settings.printers
-        for seed in settings.seeds
-    ]
+    profiles = {short_name(name): {"printer": {"profile": name}} for name in settings.printers}
+    return grid_cells(
+        settings,
+        base,
+        lambda values: (
+            (with_tables(values, {"target": {"models": values["networks"]}, **table}), (printer,))
+            for printer, table in profiles.items()
+        ),
+    )
 
 
 def printed_run(base: Path, cell: Cell, folder: Path) -> Run:

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import Names, grouped, networks_at, of_values, short_name
+from patchlab.study.grid import Names, by_scene, networks_at, short_name
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.photographed import (
@@ -167,9 +167,8 @@ def _best_width(sessions: Sequence[Counted]) -> float | None:
 
 def _shares(name: str, title: str, about: str, results: Sequence[Result]) -> Table:
     kind = "rendered" if name == "rendered" else "sessions"
-    scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
     rows = []
-    for scene, group in {**scenes, "all": list(results)}.items():
+    for scene, group in (by_scene(results) | {"all": list(results)}).items():
         by_run = [own for result in group if (own := counted(result, kind))]
         sessions = [session for own in by_run for session in own]
         if not sessions:
@@ -222,12 +221,11 @@ def _elsewhere(settings: PromisesSettings, results: Sequence[Result]) -> Table:
 
 def figures(settings: PromisesSettings, results: Sequence[Result]) -> tuple[Drawing, ...]:
     """The calibration plot."""
-    scenes = {name[0]: own for name, own in grouped(results, of_values("name")).items()}
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
-        for name, group in scenes.items():
+        for name, group in by_scene(results).items():
             sessions = [session for result in group for session in counted(result)]
             if not sessions:
                 continue

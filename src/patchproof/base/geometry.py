@@ -87,6 +87,11 @@ def carried(frame, points_mm) -> np.ndarray:
     return np.asarray(points_mm, float) @ frame[:3, :3].T + frame[:3, 3]
 
 
+def camera_centers(poses) -> np.ndarray:
+    """Where cameras of `camera_from_world` N×4×4 stand in the world, N×3."""
+    return -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+
+
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
     """3×3 from plane millimeters (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin."""
     pose = camera_from_world @ world_from_plane
@@ -178,6 +183,12 @@ def rect_corners(rect) -> np.ndarray:
     """The 4×2 corners of [x, y, width, height]: top-left, top-right, bottom-right, bottom-left."""
     x, y, w, h = rect
     return np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
+
+
+def rect_border(rect, steps: int) -> np.ndarray:
+    """Points N×2 along the border of [x, y, width, height] from its top-left corner, `steps` to a side."""
+    corners, shares = rect_corners(rect), np.linspace(0, 1, steps, endpoint=False)[:, None]
+    return np.concatenate([a + shares * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
 
 
 def _conditioner(points) -> np.ndarray:

@@ -21,11 +21,11 @@ from patchproof.base.color import photo_codes_of
 from patchproof.base.input import readable_formats
 from patchproof.base.strict import Refused
 from patchproof.photo.cannot import CannotJudge
-from patchproof.photo.detect import detected, detector_settings, luminance, printed_markers
+from patchproof.photo.detect import detected, detector_settings, luminance
 from patchproof.photo.limits import limited
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.sheets.board import Board
-from patchproof.sheets.piece import DICTIONARY
+from patchproof.sheets.markers import DICTIONARY, printed_markers
 
 FEWEST_CORNERS = 12  # of one photograph: a pose takes six numbers, twelve corners give twenty-four
 _ORIENTATION, _MAKE, _MODEL = 0x0112, 0x010F, 0x0110

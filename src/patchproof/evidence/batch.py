@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.resample import reduced_size, sixteenths
 from patchproof.base.strict import Finite, Share, Strict
 from patchproof.base.workers import WorkerDied, Workers, result_of
 from patchproof.evidence.boxes import in_square
@@ -190,7 +191,7 @@ def _is_part(photo: Photo, task: Task) -> bool:
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
     """The photograph reduced, with the outline of the design and of the piece's markers where they are known to lie."""
     shrink = min(1.0, _THUMBNAIL_PX / max(srgb.shape[:2]))
-    size = max(1, round(srgb.shape[1] * shrink)), max(1, round(srgb.shape[0] * shrink))
+    size = reduced_size(srgb.shape[1::-1], _THUMBNAIL_PX)
     # four pixels for each of it: all of 12 megapixels took a tenth of the whole measurement's time
     few = cv2.resize(srgb, (2 * size[0], 2 * size[1]), interpolation=cv2.INTER_NEAREST)
     small = cv2.resize(few, size, interpolation=cv2.INTER_AREA)
@@ -199,9 +200,8 @@ def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface)
     small_from_mm = np.diag([shrink, shrink, 1.0]) @ np.asarray(px_from_mm)
     markers = [(surface.corners_mm[marker_id], _MARKER_COLOR, 1) for marker_id in sorted(surface.piece_ids)]
     for corners_mm, color, width in (*markers, (rect_corners(surface.rect_mm), _DESIGN_COLOR, 2)):
-        # OpenCV counts from pixel centers and takes sixteenths of pixels here
-        points = np.clip((apply_homography(small_from_mm, corners_mm) - 0.5) * 16, -1e6, 1e6)
-        cv2.polylines(small, [points.round().astype(np.int32)], True, color, width, cv2.LINE_AA, 4)
+        points = sixteenths(apply_homography(small_from_mm, corners_mm))
+        cv2.polylines(small, [points], True, color, width, cv2.LINE_AA, 4)
     return small
 
 

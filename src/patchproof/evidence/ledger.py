@@ -30,11 +30,11 @@ import numpy as np
 
 from patchproof.base.claims import LEAST_CLUSTERS, resampled_means
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.resample import reduced
 from patchproof.evidence.classify import Box, Judges, boxes_of
 from patchproof.evidence.reproject import Reference, Shot, Switches, print_and_lights, squares_with
 from patchproof.evidence.results import Ledger, LedgerShare
 from patchproof.evidence.surface import DESIGN_PX, Promised, Surface, piece_picture, with_markers
-from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest
 
 Values = Mapping[Switches, float]  # confidence by what is switched on

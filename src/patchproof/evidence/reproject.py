@@ -22,6 +22,7 @@ import numpy as np
 
 from patchproof.base.color import LUMINANCE, srgb_from_linear
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.resample import between_indices
 from patchproof.evidence.appearance import cells_fit
 from patchproof.evidence.classify import Box, square_of
 from patchproof.evidence.print_fit import fit_print
@@ -263,8 +264,7 @@ def _layer(look: np.ndarray, px_from_mm: np.ndarray, rect_mm, box: tuple[slice, 
     look = _no_finer_than(look, px_from_mm, rect_mm)
     mm_from_texel = np.array([[w / look.shape[1], 0, x], [0, h / look.shape[0], y], [0, 0, 1.0]])
     to_fine = np.array([[finer, 0, -finer * left], [0, finer, -finer * top], [0, 0, 1]])
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centers
-    matrix = np.linalg.inv(half) @ to_fine @ px_from_mm @ mm_from_texel @ half
+    matrix = between_indices(to_fine @ px_from_mm @ mm_from_texel)
     # one texel of margin repeats the rim, so that interpolation does not darken it; the share cuts it off again
     size = (width * finer, height * finer)
     color = cv2.warpPerspective(look, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -15,11 +15,12 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.geometry import rect_corners
+from patchproof.base.resample import reduced
 from patchproof.base.strict import Refused
 from patchproof.photo.label import Label, label_of
-from patchproof.photo.rectify import reduced
 from patchproof.sheets.manifest import Manifest, Rect
-from patchproof.sheets.piece import MODULES, Piece, marker_at, marker_image, marker_rect
+from patchproof.sheets.markers import MODULES
+from patchproof.sheets.piece import Piece, marker_at, marker_image, marker_rect
 
 if TYPE_CHECKING:
     from patchproof.channel.printer import Printer

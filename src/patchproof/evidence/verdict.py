@@ -66,9 +66,7 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
     proved, asked = ends(recognized, photos, TAIL), asked_rate(promise)
     side = "at least" if goal.sign > 0 else "at most"
     counts = f"{counts}; {allowed}. They prove a rate of {side} {proved:.0%}, and {side} {asked:.0%} is asked for"
-    if goal.sign * (proved - asked) >= 0:
-        return Verdict("kept", (low, high), f"{counts}.")
-    return Verdict("cannot_tell", (low, high), f"{counts}: take more, in other places and light.")
+    return Verdict("kept" if goal.sign * (proved - asked) >= 0 else "cannot_tell", (low, high), f"{counts}.")
 
 
 def asked_rate(promise: Promise) -> float:
@@ -100,16 +98,21 @@ def next_step(promise: Promise, photos: Sequence[int], without_markers: int = 0)
     """What to do where photographs, so many judged in each session, cannot tell."""
     if _lost(sum(photos), without_markers) > MOST_WITHOUT_MARKERS:
         return "Leave out pictures that do not show the piece, and take again those whose markers cannot be read."
-    needed = sessions_needed(promise)
-    if needed is None:
+    return photos_line(sessions_needed(promise), photos)
+
+
+def photos_line(sessions: int | None, photos: Sequence[int] = ()) -> str:
+    """How many photographs to take: for `sessions_needed`, beside `photos` judged so far in each session."""
+    if sessions is None:
         return f"No {MOST_PHOTOS} photographs are likely to prove this promise: make a design that gains more."
-    if sum(photos) >= EACH * needed and len(photos) >= needed:
-        return f"Take {EACH * needed} more, {EACH} in each of {places(needed)} that are new."
-    so_far = f"{sum(photos)} in {places(len(photos))} so far" if photos else "none so far"
-    return (
-        f"Take {EACH} photographs in each of {places(needed)}, in other light and a folder for each, {EACH * needed} "
-        f"in all ({so_far})."
+    if sum(photos) >= EACH * sessions and len(photos) >= sessions:
+        return f"Take {EACH * sessions} more, {EACH} in each of {places(sessions)} that are new."
+    needed = (
+        f"Take at least {EACH} photographs in each of {places(sessions)}, with other light in each, and keep "
+        "those of each place in a folder of their own."
     )
+    so_far = f" So far: {sum(photos)} of {EACH * sessions}, in {places(len(photos))} of {sessions}."
+    return needed + so_far if photos else needed
 
 
 def places(count: int) -> str:

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from patchproof.base.resample import reduced
 from patchproof.base.strict import Refused
 from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
 
@@ -52,17 +53,14 @@ def load_mesh(path: str | Path, length_mm: float, up: Literal["y", "z"] = "z", g
 
 def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
     """The parts with textures of at most LARGEST_TEXTURE_PX a side, and warnings about those that were larger."""
-    import cv2
-
     kept: dict[Material, Material] = {}
     warnings = []
     for material in dict.fromkeys(part.material for part in parts):
         kept[material], texture = material, material.texture_srgb
         if texture is None or max(texture.shape[:2]) <= LARGEST_TEXTURE_PX:
             continue
-        height, width = texture.shape[:2]
-        scale = LARGEST_TEXTURE_PX / max(width, height)
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        kept[material] = replace(material, texture_srgb=cv2.resize(texture, size, interpolation=cv2.INTER_AREA))
-        warnings.append(f"the texture of {width} × {height} of {material.name} is reduced to {size[0]} × {size[1]}")
+        small = reduced(texture, LARGEST_TEXTURE_PX)
+        kept[material] = replace(material, texture_srgb=small)
+        before, after = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
+        warnings.append(f"the texture of {before} of {material.name} is reduced to {after}")
     return [replace(part, material=kept[part.material]) for part in parts], warnings

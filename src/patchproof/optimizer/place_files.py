@@ -81,8 +81,9 @@ def _picture(place: Place, scene: PatchScene) -> Image.Image:
                     x, y = quad.mean(0)
                     font, white = ImageFont.load_default(18), (255, 255, 255)
                     draw.text((x, y), f"{rank + 1}", (0, 0, 0), font, "mm", stroke_width=2, stroke_fill=white)
-        outline = scene.placement.world(_border(scene.placement.size_mm))
-        if scene.placement.normal @ (_eye(pose) - scene.placement.center_mm) > 0:
+        border = geometry.rect_border((0, 0, *scene.placement.size_mm), 16)  # bent paper has bent edges
+        outline = scene.placement.world(np.concatenate([border, border[:1]]))
+        if scene.placement.normal @ (geometry.camera_centers(pose[None])[0] - scene.placement.center_mm) > 0:
             draw.line([*map(tuple, geometry.project(scene.matrix_px(size), pose, outline))], _CHOSEN, 4, "curve")
         panels.append(np.asarray(panel))
     return Image.fromarray(np.concatenate(panels, 1))
@@ -120,7 +121,7 @@ def _dots(place: Place, scene: PatchScene) -> Iterator[tuple[int, Candidate, np.
 def _seen(scene: PatchScene, pose: np.ndarray, depth: np.ndarray, corners: np.ndarray) -> bool:
     """Whether the middle of a square faces the camera and nothing stands before it."""
     middle, normal = corners.mean(0), np.cross(corners[0] - corners[1], corners[2] - corners[1])
-    if normal @ (_eye(pose) - middle) <= 0:
+    if normal @ (geometry.camera_centers(pose[None])[0] - middle) <= 0:
         return False
     x, y = np.floor(geometry.project(scene.matrix_px(depth.shape[::-1]), pose, middle[None])[0]).astype(int)
     inside = 0 <= x < depth.shape[1] and 0 <= y < depth.shape[0]
@@ -135,17 +136,6 @@ def _depth(stage: Stage, scene: PatchScene, pose: np.ndarray) -> np.ndarray:
     depth = np.full(_SIDE_PX * _SIDE_PX, np.inf)
     depth[fragments.pixel.numpy()] = fragments.depth.numpy()
     return depth.reshape(_SIDE_PX, _SIDE_PX)
-
-
-def _eye(pose: np.ndarray) -> np.ndarray:
-    return -pose[:3, :3].T @ pose[:3, 3]
-
-
-def _border(size_mm: tuple[float, float]) -> np.ndarray:
-    """Points along a piece's border and back to the first: bent paper has bent edges."""
-    corners, steps = geometry.rect_corners((0, 0, *size_mm)), np.linspace(0, 1, 16, endpoint=False)[:, None]
-    border = [a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
-    return np.concatenate([*border, corners[:1]])
 
 
 def _color(share: float) -> tuple[int, int, int]:

@@ -18,21 +18,19 @@ from patchproof.base.geometry import apply_homography
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import (
     COARSEST_PX,
-    DICTIONARY,
     Box,
     MarkersInView,
-    cells_of,
     fitted,
     levels,
     look,
     luminance,
     possible,
-    printed_markers,
     refine,
     whole,
 )
 from patchproof.photo.edges import Borders, sample
 from patchproof.photo.rectify import fit_page, part_around
+from patchproof.sheets.markers import DICTIONARY, cells_of, printed_markers
 
 # of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
 LEAST_CORRELATION = 0.7

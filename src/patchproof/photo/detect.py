@@ -12,7 +12,7 @@ look at. Corners of all levels are then fitted in the full photograph (`edges`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 
 import cv2
@@ -20,12 +20,13 @@ import numpy as np
 
 from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE
 from patchproof.base.input import seconds_left
+from patchproof.base.resample import reduced
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import squares_in
-from patchproof.photo.rectify import part_around, reduced
+from patchproof.photo.rectify import part_around
+from patchproof.sheets.markers import DICTIONARY, cells_of, printed_markers
 
-DICTIONARY = "DICT_5X5_1000"
 LIGHT = LIGHT_OF_CODE.astype(np.float32)
 COARSEST_PX = 1000  # a level's longer side; halves are taken until it is no longer than this
 UPSCALE_BELOW_PX = 4_000_000
@@ -107,11 +108,6 @@ def fitted(
     return MarkersInView(markers, foreign, tuple(i for i in known if len(detections[i]) > 1))
 
 
-def printed_markers(dictionary: str):
-    """OpenCV's dictionary of that name."""
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-
-
 def is_mirrored(srgb: np.ndarray, expected: Set[int], dictionary: str = DICTIONARY) -> bool:
     """Whether the sheet shows up when the picture is flipped: selfie cameras and scans through the back do that."""
     mirrored = np.ascontiguousarray(reduced(srgb, MIRROR_PX)[:, ::-1])
@@ -125,14 +121,6 @@ def possible(corners: np.ndarray) -> bool:
     turns = sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
     lengths = np.linalg.norm(sides, axis=1)
     return bool(np.isfinite(corners).all() and (turns > 0).all() and lengths.max() < 12 * lengths.min())
-
-
-def cells_of(dictionary: str, ids: Iterable[int]) -> np.ndarray:
-    """The printed modules M×n×n of marker ids, rim included: 1 = paper, 0 = ink."""
-    printed = printed_markers(dictionary)
-    side = printed.markerSize + 2
-    cells = [cv2.aruco.generateImageMarker(printed, int(i), side) for i in ids]
-    return np.array(cells).reshape(-1, side, side).astype(float) / 255
 
 
 def whole(srgb: np.ndarray) -> Box:

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from patchproof.base.resample import reduced
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.limits import finder_lines_in, squares_in
-from patchproof.photo.rectify import rectify, reduced
+from patchproof.photo.rectify import rectify
 from patchproof.sheets.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use

@@ -16,9 +16,9 @@ import numpy as np
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.geometry import apply_homography, local_scale
-from patchproof.photo.detect import cells_of
 from patchproof.photo.edges import sample
 from patchproof.photo.quality import CLIPPED_CODE
+from patchproof.sheets.markers import cells_of
 
 _FINE = 8  # samples per module of the blurred pattern
 _LEAST_SAMPLES = 30

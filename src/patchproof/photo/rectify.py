@@ -22,6 +22,7 @@ import numpy as np
 from scipy.special import fdtri, stdtrit
 
 from patchproof.base.geometry import apply_homography, fit_homography, normalized, rect_corners
+from patchproof.base.resample import between_indices
 from patchproof.photo.cannot import CannotJudge
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)
@@ -130,11 +131,9 @@ def flattened(pixels: np.ndarray, px_from_mm: np.ndarray, rect_mm, size: tuple[i
     grid = size[0] * fine, size[1] * fine
     part, px_from_mm = crop(pixels, px_from_mm, rect_corners(rect_mm), 2)
     step_x, step_y = width_mm / grid[0], height_mm / grid[1]
-    mm_from_index = np.array([[step_x, 0, x + step_x / 2], [0, step_y, y + step_y / 2], [0, 0, 1]])
-    index_from_px = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
-    index_from_index = index_from_px @ px_from_mm @ mm_from_index
+    index_from_grid = between_indices(px_from_mm @ np.array([[step_x, 0, x], [0, step_y, y], [0, 0, 1]]))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpPerspective(part, index_from_index, grid, None, flags, cv2.BORDER_REPLICATE)
+    return cv2.warpPerspective(part, index_from_grid, grid, None, flags, cv2.BORDER_REPLICATE)
 
 
 def averaged(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -148,15 +147,6 @@ def averaged(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def least_px_per_mm(px_from_mm: np.ndarray, rect_mm) -> float:
     """How many pixels a millimeter has at the rectangle's corner, and in the direction, where it has fewest."""
     return float(1 / max(np.linalg.norm(j, 2) for j in _mm_from_px(px_from_mm, rect_corners(rect_mm))))
-
-
-def reduced(pixels: np.ndarray, longest_px: int) -> np.ndarray:
-    """A picture averaged down until its longer side has no more pixels than that."""
-    shrink = longest_px / max(pixels.shape[:2])
-    if shrink >= 1:
-        return pixels
-    size = max(1, round(pixels.shape[1] * shrink)), max(1, round(pixels.shape[0] * shrink))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def crop(pixels: np.ndarray, px_from_mm: np.ndarray, points_mm, margin_px: int) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import LIGHT_OF_CODE
+from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encoded, encoded_by_table, gains
 from patchproof.channel.lens import Frame, pinhole_frame
 from patchproof.channel.light import Lighting, irradiance, lighting_of
@@ -158,7 +159,7 @@ def see(
     frame = lens_frame(stage, scene, size_px)
     poses = scene.camera_from_world(conditions)
     light = _light(scene, stage.device, conditions)
-    eye = torch.as_tensor(-(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], device=stage.device)
+    eye = torch.as_tensor(camera_centers(poses), device=stage.device)
     matrices, near = np.broadcast_to(frame.matrix_px, (len(poses), 3, 3)), near_mm(scene)
     placed = cameras(poses, matrices, frame.size_px, stage)
     fragments = rasterize(surface.vertices, surface.faces, placed, near)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from patchproof.base.color import photo_codes_of, srgb_from_linear
-from patchproof.base.geometry import rect_corners
+from patchproof.base.geometry import rect_border, rect_corners
 from patchproof.base.settings import BackgroundSettings
 from patchproof.channel.effects import Light, Pose
 from patchproof.render.photograph import shade
@@ -53,10 +53,7 @@ def hang(scene: PatchScene, template: Template) -> Hung:
         return np.asarray(points) @ axes.T
 
     low, high = flat(scene.mesh.vertices).min(0), flat(scene.mesh.vertices).max(0)
-    corners = rect_corners((0, 0, *placement.size_mm))
-    steps = np.linspace(0, 1, 16, endpoint=False)[:, None]  # bent paper has bent edges
-    border = np.concatenate([a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
-    outline = flat(placement.world(border))
+    outline = flat(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
     for tile in tiles_of(template, scene.piece):

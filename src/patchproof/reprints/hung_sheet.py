@@ -134,7 +134,8 @@ class HungSheet:
             box = geometry.rect_corners((left, top, end[0] - left, end[1] - top))
             outlines[str(scene.settings.target.label)] = box
         if self.piece is not None and scene.facing(conditions)[0]:
-            outlines[PATCH] = scene.piece_px(conditions, _round_about(scene.piece.size_mm))
+            border = geometry.rect_border((0, 0, *scene.piece.size_mm), _SIDE_POINTS)
+            outlines[PATCH] = scene.piece_px(conditions, border)
         return outlines
 
     def px_from_page(self, conditions: Conditions) -> np.ndarray:
@@ -143,14 +144,6 @@ class HungSheet:
         piece_from_page = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
         photo_px = self.scene.settings.camera.photo_px
         return self.scene.piece_homographies(conditions, photo_px)[0] @ piece_from_page
-
-
-def _round_about(size_mm: tuple[float, float]) -> np.ndarray:
-    """Points N×2 along the sides of a piece, so many that bent ones are followed."""
-    corners = geometry.rect_corners((0, 0, *size_mm))
-    steps = np.arange(_SIDE_POINTS)[:, None] / _SIDE_POINTS
-    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    return np.concatenate([start + (end - start) * steps for start, end in sides])
 
 
 def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:

@@ -22,16 +22,17 @@ from patchproof.base import geometry
 from patchproof.base.color import codes_of, linear_from_srgb, photo_codes_of
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes, image_pixels, new_folder
+from patchproof.base.resample import between_indices
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Sensor
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import load_printer
-from patchproof.photo.detect import DICTIONARY, cells_of
 from patchproof.photo.read import Photo
 from patchproof.reprints.hung_sheet import Hanging
 from patchproof.sheets.chart import chart_colors
 from patchproof.sheets.manifest import Manifest
-from patchproof.sheets.piece import hash_order
+from patchproof.sheets.markers import DICTIONARY, cells_of
+from patchproof.sheets.piece import hash_order, marker_at, printed
 from patchproof.sheets.raster import page_count, page_pixels
 
 Shows = Callable[[np.ndarray], np.ndarray]  # N×3 sRGB sent → N×3 light of the print
@@ -78,8 +79,7 @@ def chart_manifest(count: int) -> Manifest:
         {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
         for cell, index in zip(cells, order, strict=True)
     ]
-    corners = [geometry.rect_corners((*at, MARKER_MM, MARKER_MM)).tolist() for at in _MARKERS_MM]
-    markers = [{"dictionary": DICTIONARY, "id": 7 + i, "corners_mm": c, "page": 1} for i, c in enumerate(corners)]
+    markers = [printed(marker_at(7 + i, at, MARKER_MM)) for i, at in enumerate(_MARKERS_MM)]
     head = {
         "version": 2,
         "sheet_id": "CHART00000",
@@ -211,9 +211,7 @@ def _light_in_picture(px_from_mm: np.ndarray, middle_mm: np.ndarray, sources: _S
 
 def _warped(page: np.ndarray, px_from_mm: np.ndarray) -> np.ndarray:
     """The page in the picture's pixels before a gray table, averaged over pixels."""
-    mm_from_index = np.array([[1 / PX_PER_MM, 0, 0.5 / PX_PER_MM], [0, 1 / PX_PER_MM, 0.5 / PX_PER_MM], [0, 0, 1]])
-    index_from_px = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
     finer = PX_PER_MM / np.sqrt(np.linalg.det((px_from_mm / px_from_mm[2, 2])[:2, :2]))
     soft = cv2.GaussianBlur(page, (0, 0), 0.35 * float(finer))  # a pixel's own width, before it is sampled once
-    matrix = index_from_px @ px_from_mm @ mm_from_index
+    matrix = between_indices(px_from_mm @ np.diag([1 / PX_PER_MM, 1 / PX_PER_MM, 1]))
     return cv2.warpPerspective(soft, matrix, PHOTO_PX, flags=cv2.INTER_LINEAR, borderValue=(0.3, 0.28, 0.25))

@@ -12,6 +12,7 @@ from patchproof.base import geometry
 from patchproof.base.color import photo_codes_of
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes, new_folder
+from patchproof.base.resample import between_indices
 from patchproof.channel.printer import Printer
 from patchproof.optimizer.run import Run
 from patchproof.reprints.hung_sheet import AS_MADE, Hanging, sheet_scene
@@ -59,11 +60,10 @@ def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scal
     """A page's pixels, twice as fine as the scan, as the scanner shows their print: H×W×3 in [0, 1]."""
     with torch.no_grad():
         light = printer.apply(torch.tensor(page).permute(2, 0, 1)[None] / 255)[0].permute(1, 2, 0).numpy()
-    # a pixel (x + ½) of the page falls on scale / 2 · (x + ½) of the scan
     (x, y), (width, height) = print_scale, (round(side * dpi / MM_PER_INCH) for side in page_mm)
-    matrix = np.array([[x / 2, 0, x / 4 - 0.5], [0, y / 2, y / 4 - 0.5]])
+    matrix = between_indices(np.diag([x / 2, y / 2, 1.0]))
     blurred = cv2.GaussianBlur(light, (0, 0), SCAN_BLUR_PX)
-    return cv2.warpAffine(blurred, matrix, (width, height), borderValue=(1.0, 1.0, 1.0))
+    return cv2.warpAffine(blurred, matrix[:2], (width, height), borderValue=(1.0, 1.0, 1.0))
 
 
 def _page_from_design(manifest: Manifest, page: int) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 from patchproof.base.claims import CONFIDENCE, independent_difference
 from patchproof.base.sessions import evenly
 from patchproof.base.settings import SceneSettings, behind
-from patchproof.evidence.verdict import EACH, MOST_PHOTOS, asked_rate, kept_chance, places, sessions_needed
+from patchproof.evidence.verdict import MOST_PHOTOS, asked_rate, kept_chance, photos_line, places, sessions_needed
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.sheets.manifest import Promise
 
@@ -63,16 +63,6 @@ def plan_shots(promise: Promise) -> ShotPlan:
         control=best,
         paired=fewest(lambda n: paired_power(better, worse, n) >= POWER),
         unpaired=fewest(lambda n: unpaired_power(better, worse, n) >= POWER),
-    )
-
-
-def sessions_line(sessions: int | None) -> str:
-    """So many sessions, as a sentence."""
-    if sessions is None:
-        return "The promise is too weak to be proved by any reasonable number of photographs."
-    return (
-        f"Take at least {EACH} photographs in each of {places(sessions)}, with other light in each, and keep "
-        "those of each place in a folder of their own."
     )
 
 
@@ -144,7 +134,7 @@ def _how_many(promise: Promise, plan: ShotPlan) -> tuple[str, ...]:
         )
         + "."
     )
-    lines.append(sessions_line(plan.sessions))
+    lines.append(photos_line(plan.sessions))
     if promise.n < PROMISE_VIEWS and not promise.draft:
         lines.append(
             f"A promise of {PROMISE_VIEWS} views (patchproof promise RUN --n {PROMISE_VIEWS}, then this page again) "

@@ -18,10 +18,12 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from patchproof.base.color import codes_of
 from patchproof.base.input import is_file, is_folder, opened_picture
+from patchproof.base.resample import between_indices, halvings
 from patchproof.base.settings import BackgroundSettings
 from patchproof.base.strict import Refused, expand
 from patchproof.scene.rooms import place
@@ -83,15 +85,13 @@ class Backgrounds:
         if isinstance(picture, int):
             return _place_levels(picture)
         if number not in self._reduced:
-            self._reduced[number] = _halvings(picture)
+            self._reduced[number] = halvings(picture)
         return self._reduced[number]
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
         """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is
         square.
         """
-        import cv2
-
         levels = self._levels(int(choice[0] * len(self.pictures)))
         height, width = levels[0].shape[:2]
         x0, y0, crop_w, crop_h = _crop((width, height), choice, photo_px)
@@ -104,27 +104,15 @@ class Backgrounds:
         shrunk = levels[level]
         sx, sy = shrunk.shape[1] / width, shrunk.shape[0] / height
         scale_x, scale_y = crop_w * sx / size_px[0], crop_h * sy / size_px[1]
-        # pixel centers at .5 on both sides
-        matrix = np.array([[scale_x, 0, x0 * sx + scale_x / 2 - 0.5], [0, scale_y, y0 * sy + scale_y / 2 - 0.5]])
+        matrix = between_indices(np.array([[scale_x, 0, x0 * sx], [0, scale_y, y0 * sy], [0, 0, 1.0]]))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        picture = cv2.warpAffine(shrunk, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        picture = cv2.warpAffine(shrunk, matrix[:2], size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return picture[:, ::-1] if choice[4] < 0.5 else picture
 
 
 @lru_cache(maxsize=_KEPT)
 def _place_levels(number: int) -> list[np.ndarray]:
-    return _halvings(place(number))
-
-
-def _halvings(picture: np.ndarray) -> list[np.ndarray]:
-    """The picture, its half, and so on while its shorter side has 256 pixels or more."""
-    import cv2
-
-    levels = [picture]
-    while min(levels[-1].shape[:2]) >= 256:
-        height, width = levels[-1].shape[:2]
-        levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-    return levels
+    return halvings(place(number))
 
 
 def load_backgrounds(settings: BackgroundSettings, base: Path) -> Backgrounds:

@@ -22,8 +22,10 @@ from patchproof.scene.placement import (
     GRID,
     LIFT_MM,
     Frame,
+    Lay,
     Placement,
     lay_card,
+    place_card,
     placement_warnings,
     pose_of,
     refuse_larger_than_side,
@@ -42,6 +44,11 @@ _DO = "make the patch smaller, move it, or leave out bend"
 _FIT_NET = 33  # heights are fitted on this many points along each edge
 _PIECE_NET = 33  # vertices of a bent piece along each edge; odd, so that one is the middle
 _DEGREE = 4
+
+
+def lay_for(bend: bool) -> Lay:
+    """How a piece is laid on a surface: bent along it, or as a flat card."""
+    return place_bent if bend else place_card
 
 
 def place_bent(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float) -> Placement:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from patchproof.base.strict import Refused
-from patchproof.scene.bend import place_bent
+from patchproof.scene.bend import lay_for, place_bent
 from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import load_bare
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
+from patchproof.scene.placement import Lay, Placement, patch_frame
 from patchproof.scene.tape import Tape, tapes
 
 
@@ -39,9 +39,9 @@ def other_surface(scene: Scene) -> tuple[Placement | None, str | None]:
     if not isinstance(scene, PatchScene):
         return None, None
     patch, placement = scene.settings.patch, scene.placement
-    place, flag = (place_card, "false") if patch.bend else (place_bent, "true")
+    lay, flag = lay_for(not patch.bend), str(not patch.bend).lower()
     try:
-        other = place(scene.mesh, patch_frame(scene.mesh, patch), scene.piece.size_mm, patch.spin_deg)
+        other = lay(scene.mesh, patch_frame(scene.mesh, patch), scene.piece.size_mm, patch.spin_deg)
     except Refused as refused:
         return None, f"bend = {flag} is refused. {refused}"
     if other.family == placement.family:

@@ -1,9 +1,9 @@
-"""How large a piece may be where it is to hang.
+"""Whether a piece may lie at a place, and how large it may be there.
 
-In: a mesh, a place and the piece that was asked for. Out: the largest piece of the same shape that lies there, the
-nearest place for the one that was asked for, and whether a piece lies well: within the gap and the overhang that are
-not warned of. What fits is found by halving: a
-smaller piece is taken to fit where a larger one does, which holds but for holes under its middle.
+In: a mesh, a place and the piece that was asked for. Out: the piece as it lies, flat or bent; the largest of the same
+shape that lies well there, and the nearest place for the one that was asked for. A piece lies well within the gap and
+the overhang that are not warned of. What fits is found by halving: a smaller piece is taken to fit where a larger one
+does, which holds but for holes under its middle.
 """
 
 from __future__ import annotations
@@ -17,11 +17,39 @@ import numpy as np
 from patchproof.base.settings import PatchSettings
 from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.placement import WARN_GAP_SHARE, WARN_OVERHANG_SHARE, Frame, Lay, patch_frame, side_frame
+from patchproof.scene.placement import (
+    WARN_OVERHANG_SHARE,
+    Frame,
+    Lay,
+    Placement,
+    gap_limit_mm,
+    patch_frame,
+    side_frame,
+)
 
 _STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
 _TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes some 5 and 200 ms
 _HALVINGS = 5  # to 3 % of the piece that was asked for
+
+
+def laid_well(
+    mesh: Mesh,
+    frame: Frame,
+    size_mm: tuple[float, float],
+    spin_deg: float,
+    lay: Lay,
+    gap_mm: float | None = None,
+    overhang_share: float = WARN_OVERHANG_SHARE,
+) -> Placement | None:
+    """The piece laid down with its middle at the frame's; None where it is refused, stands off farther than `gap_mm`
+    (by default what is not warned of) or overhangs by more than a share.
+    """
+    try:
+        laid = lay(mesh, frame, size_mm, spin_deg)
+    except Refused:
+        return None
+    most_mm = gap_limit_mm(size_mm) if gap_mm is None else gap_mm
+    return laid if laid.gap_mm <= most_mm and laid.overhang_share <= overhang_share else None
 
 
 def advice(mesh: Mesh, patch: PatchSettings, lay: Lay, least_mm: float) -> str:
@@ -31,7 +59,7 @@ def advice(mesh: Mesh, patch: PatchSettings, lay: Lay, least_mm: float) -> str:
     """
     frame, size_mm, how = patch_frame(mesh, patch), patch.size_mm, (patch.spin_deg, lay)
     width, height = np.minimum(size_mm, frame.extent_mm).tolist()
-    smaller = largest((width, height), lambda trial: lies_well(mesh, frame, trial, *how), least_mm)
+    smaller = largest((width, height), lambda trial: laid_well(mesh, frame, trial, *how), least_mm)
     place = _nearest(mesh, patch, lay)
     found = [f"{smaller[0]:g} × {smaller[1]:g} mm lies well there"] if smaller is not None else []
     found += [f"{size_mm[0]:g} × {size_mm[1]:g} mm lies well with {place}"] if place is not None else []
@@ -42,7 +70,7 @@ def _nearest(mesh: Mesh, patch: PatchSettings, lay: Lay) -> str | None:
     """The nearest place where the piece lies well, as a scene file's key says it."""
 
     def fits(frame: Frame) -> bool:
-        return lies_well(mesh, frame, patch.size_mm, patch.spin_deg, lay)
+        return laid_well(mesh, frame, patch.size_mm, patch.spin_deg, lay) is not None
 
     middle = patch_frame(mesh, patch.changed(offset_mm=(0.0, 0.0)))
     step = max(1.0, round(_STEP_SHARE * min(patch.size_mm)))
@@ -57,17 +85,8 @@ def _nearest(mesh: Mesh, patch: PatchSettings, lay: Lay) -> str | None:
     return None if side is None else f'side = "{side}"'
 
 
-def lies_well(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg: float, lay: Lay) -> bool:
-    """Whether a piece lies there without a warning."""
-    try:
-        laid = lay(mesh, frame, size_mm, spin_deg)
-    except Refused:
-        return False
-    return laid.gap_mm <= WARN_GAP_SHARE * min(size_mm) and laid.overhang_share <= WARN_OVERHANG_SHARE
-
-
 def largest(
-    size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], bool], least_mm: float
+    size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], object], least_mm: float
 ) -> tuple[float, float] | None:
     """The largest piece of this shape that fits, in whole millimeters, its shorter side at least `least_mm`; None
     where not even that does.

@@ -14,9 +14,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 
 from patchproof.base.geometry import rect_corners, scaled_about
+from patchproof.base.resample import between_indices, halvings
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused
 from patchproof.scene.conditions import Conditions, Stream
@@ -99,21 +101,13 @@ class Picture:
     @cached_property
     def levels(self) -> tuple[np.ndarray, ...]:
         """The picture and its halvings, so that a small view does not read megapixels."""
-        import cv2
-
-        levels = [self.srgb]
-        while min(levels[-1].shape[:2]) >= 256:
-            height, width = levels[-1].shape[:2]
-            levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-        return tuple(levels)
+        return tuple(halvings(self.srgb))
 
 
 def picture_for(srgb: np.ndarray, photo_px: tuple[int, int]) -> tuple[Picture, np.ndarray]:
     """The picture, reduced where its shorter side is longer than the photograph's, and `photo_from_picture` 3×3 (from
     pixels of `srgb`).
     """
-    import cv2
-
     height, width = srgb.shape[:2]
     scale = min(photo_px) / min(width, height)
     size = (width, height)
@@ -160,8 +154,6 @@ def show(
     """The picture as uint8 H×W×3 in a view: carried by `view_from_photo` (both in the photograph's pixels), reduced
     by area, mirrored at its edge.
     """
-    import cv2
-
     fine = 2 if min(size_px) < min(photo_px) else 1  # two samples per pixel each way keep a reduced picture calm
     size = (fine * size_px[0], fine * size_px[1])
     height, width = picture.srgb.shape[:2]
@@ -173,9 +165,7 @@ def show(
             break
         shrunk = level
     to_level = np.diag([width / shrunk.shape[1], height / shrunk.shape[0], 1.0])
-    # OpenCV counts from pixel centers: its 0 is our .5
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
-    index_from_size = np.linalg.inv(half) @ np.linalg.inv(whole @ to_level) @ half
+    index_from_size = between_indices(np.linalg.inv(whole @ to_level))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     view = cv2.warpAffine(shrunk, index_from_size[:2], size, flags=flags, borderMode=cv2.BORDER_REFLECT)
     return view if fine == 1 else cv2.resize(view, size_px, interpolation=cv2.INTER_AREA)

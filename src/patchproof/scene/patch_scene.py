@@ -20,8 +20,9 @@ from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSour
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.sheets.markers import MODULES
 from patchproof.sheets.pages import refuse_larger_than_page
-from patchproof.sheets.piece import MODULES, Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
+from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import load_template
 
 if TYPE_CHECKING:
@@ -145,11 +146,9 @@ def _hang(scene: MeshScene, lay: Lay) -> tuple[Piece, Placement, float, tuple[st
     """The piece with markers as large as the views need, where it lies, the share of views in which they are too small,
     and what a reader should know.
     """
-    settings, mesh = scene.settings, scene.mesh
-    frame = patch_frame(mesh, settings.patch)
-    patch = settings.patch
+    settings, mesh, patch = scene.settings, scene.mesh, scene.settings.patch
     try:
-        placement = lay(mesh, frame, patch.size_mm, patch.spin_deg)
+        placement = lay(mesh, patch_frame(mesh, patch), patch.size_mm, patch.spin_deg)
     except Refused as refused:
         raise refused.advised(advice(mesh, patch, lay, smallest_piece_mm())) from refused
     scales = _smallest_scales(scene, placement)
@@ -174,8 +173,7 @@ def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     conditions = scene.draw("select", SCALE_VIEWS, 0)
     center_mm, matrix = card.center_mm, scene.matrix_px(scene.photo_px)
     poses = camera_poses(scene, center_mm, conditions.pose)
-    eyes = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
-    poses = poses[(eyes - center_mm) @ card.normal > 0]
+    poses = poses[(geometry.camera_centers(poses) - center_mm) @ card.normal > 0]
     if not len(poses):
         return np.zeros(0)
     planes = np.stack([geometry.plane_homography(matrix, pose, card.world_from_piece) for pose in poses])

@@ -28,7 +28,7 @@ from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, expand
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
-from patchproof.photo.detect import DICTIONARY, find_markers
+from patchproof.photo.detect import find_markers
 from patchproof.photo.limits import limited
 from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
@@ -39,6 +39,7 @@ from patchproof.scene.interface import Part, SceneSource
 from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.markers import DICTIONARY
 from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, with_ids
 from patchproof.sheets.template import load_template

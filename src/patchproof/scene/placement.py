@@ -213,10 +213,15 @@ def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, exten
         raise Refused(expected, got, "make the patch smaller or choose a larger side")
 
 
+def gap_limit_mm(size_mm) -> float:
+    """How far a piece may stand off the surface without a warning."""
+    return WARN_GAP_SHARE * min(size_mm)
+
+
 def placement_warnings(gap: float, overhang: float, size_mm) -> tuple[str, ...]:
     """What a user should hear about a gap in mm and an overhang as a share."""
     notes = []
-    if gap > WARN_GAP_SHARE * min(size_mm):
+    if gap > gap_limit_mm(size_mm):
         share = f"{gap / min(size_mm):.0%} of its shorter edge"
         notes.append(f"the piece stands up to {gap:.0f} mm ({share}) off the surface")
     if overhang > WARN_OVERHANG_SHARE:

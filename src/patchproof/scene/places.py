@@ -16,19 +16,20 @@ from typing import get_args
 
 import numpy as np
 
+from patchproof.base.geometry import camera_centers
 from patchproof.base.strict import Refused, Side
 from patchproof.mesh.surface import Chart, crop, heights, net
-from patchproof.scene.bend import place_bent
+from patchproof.scene.bend import lay_for
+from patchproof.scene.fitting import laid_well
 from patchproof.scene.mesh_scene import camera_poses
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.patch_scene import At
 from patchproof.scene.placement import (
-    WARN_GAP_SHARE,
     WARN_OVERHANG_SHARE,
     Frame,
     Placement,
+    gap_limit_mm,
     patch_frame,
-    place_card,
     spun,
     surface_frame,
 )
@@ -99,12 +100,8 @@ class Ground:
         frame, patch = self._frame_at(side), self.scene.settings.patch
         if self._facing(frame.origin_mm[None], frame.normal[None])[0] < _FACING_SHARE:
             return None
-        try:
-            laid = (place_bent if patch.bend else place_card)(self.scene.mesh, frame, self.size_mm, 0.0)
-        except Refused:
-            return None
-        fits = patch.search.gap_mm is None or laid.gap_mm <= patch.search.gap_mm
-        return Spot(side, 0.0, laid) if fits and not self._touches_forbidden(laid) else None
+        gap_mm = np.inf if patch.search.gap_mm is None else patch.search.gap_mm
+        return self._spot(side, frame, 0.0, gap_mm, 1.0)
 
     def _facing(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """M shares of the views that face the points M×3."""
@@ -122,16 +119,16 @@ class Ground:
         if middle is None:
             return None
         at_mm = _rounded(middle)
-        there, patch = self._frame_at(at_mm), self.scene.settings.patch
+        there = self._frame_at(at_mm)
         if there.normal @ frame.normal < _SAME_SIDE:
             return None
-        place = place_bent if patch.bend else place_card
-        try:
-            laid = place(self.scene.mesh, there, self.size_mm, spin_deg)
-        except Refused:
-            return None
-        fits = laid.gap_mm <= self._gap_mm and laid.overhang_share <= WARN_OVERHANG_SHARE
-        return Spot(at_mm, spin_deg, laid) if fits and not self._touches_forbidden(laid) else None
+        return self._spot(at_mm, there, spin_deg, self._gap_mm, WARN_OVERHANG_SHARE)
+
+    def _spot(self, at: At, frame: Frame, spin_deg: float, gap_mm: float, overhang_share: float) -> Spot | None:
+        """The piece at a frame; None where it does not lie within these bounds, or on what is to be kept free."""
+        lay = lay_for(self.scene.settings.patch.bend)
+        laid = laid_well(self.scene.mesh, frame, self.size_mm, spin_deg, lay, gap_mm, overhang_share)
+        return None if laid is None or self._touches_forbidden(laid) else Spot(at, spin_deg, laid)
 
     def _leveled(self, frame: Frame, spin_deg: float) -> np.ndarray | None:
         """The frame's origin, moved until what lies under the piece is as high as its middle; None where that fails."""
@@ -159,7 +156,7 @@ class Ground:
 
     @property
     def _gap_mm(self) -> float:
-        return self.scene.settings.patch.search.gap_mm or WARN_GAP_SHARE * min(self.size_mm)
+        return self.scene.settings.patch.search.gap_mm or gap_limit_mm(self.size_mm)
 
     @cached_property
     def _triangles(self) -> np.ndarray:
@@ -216,7 +213,7 @@ class Ground:
 def _eyes(scene: OpenScene) -> np.ndarray:
     """N×3: where cameras of the scene stand."""
     poses = camera_poses(scene, scene.middle_mm, scene.draw("train", _VIEWS).pose)
-    return -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    return camera_centers(poses)
 
 
 def _rounded(point_mm: np.ndarray) -> tuple[float, float, float]:

@@ -16,9 +16,9 @@ from patchproof.base.strict import Refused
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.markers import MODULES
 from patchproof.sheets.page import lay_out_parts
 from patchproof.sheets.piece import (
-    MODULES,
     Piece,
     PieceMarker,
     lay_out_piece,

@@ -14,8 +14,9 @@ from pathlib import Path
 from patchproof.base.strict import Refused, validated
 from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
+from patchproof.sheets.markers import DICTIONARY, MODULES, board_squares, marker_corner
 from patchproof.sheets.page import furnished
-from patchproof.sheets.piece import DICTIONARY, MODULES, marker_at, page_id
+from patchproof.sheets.piece import marker_at, page_id
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardGrid, BoardTemplate, template_data, template_names
 from patchproof.sheets.write import write_page
@@ -74,9 +75,10 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
             "make the markers smaller or the squares larger",
         )
     (x, y), side = grid.corner_mm, grid.square_mm
-    corners = [(x + column * side + inset, y + row * side + inset) for row, column in _squares(grid, 1)]
-    if len(corners) > 1000:
-        raise Refused("at most 1000 markers on a board", f"{len(corners)}", "make the board's squares fewer")
+    black, white = (board_squares(grid.rows, grid.columns, white) for white in (False, True))
+    if len(white) > 1000:
+        raise Refused("at most 1000 markers on a board", f"{len(white)}", "make the board's squares fewer")
+    corners = [marker_corner(square, side, grid.marker_mm, grid.corner_mm) for square in white]
     words = {
         "sheet_id": identity,
         "dictionary": DICTIONARY,
@@ -89,14 +91,9 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
         page_mm=template.page_mm,
         markers=tuple(marker_at(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),
         boxes=(Box("board", _rect(grid)),),
-        squares_mm=tuple((x + column * side, y + row * side, side, side) for row, column in _squares(grid, 0)),
+        squares_mm=tuple((x + column * side, y + row * side, side, side) for row, column in black),
     )
     return furnished(template, page, f"patchproof:{identity}:{KIND}", words)
-
-
-def _squares(grid: BoardGrid, odd: int) -> list[tuple[int, int]]:
-    """(row, column) of the black squares, or of the odd ones with markers in the order of their ids."""
-    return [(row, column) for row in range(grid.rows) for column in range(grid.columns) if (row + column) % 2 == odd]
 
 
 def _rect(grid: BoardGrid) -> RectMm:

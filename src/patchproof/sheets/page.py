@@ -15,8 +15,8 @@ from patchproof.base.strict import Refused
 from patchproof.sheets.chart import chart_swatches
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, PageLayout, Parts, prove_apart, quiet_box, ruler_parts, text_box
+from patchproof.sheets.markers import MODULES
 from patchproof.sheets.piece import (
-    MODULES,
     Piece,
     black_runs,
     marker_at,

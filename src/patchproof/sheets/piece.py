@@ -25,11 +25,10 @@ from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.base.settings import identifying
 from patchproof.base.strict import Refused, Strict, nearest
 from patchproof.sheets.manifest import Marker
+from patchproof.sheets.markers import DICTIONARY, MODULES, cells_of
 from patchproof.sheets.rects import PointMm, RectMm, grown
 
-DICTIONARY = "DICT_5X5_1000"
 KINDS = ("design", "mean", "gray", "noise", "shuffled", "blank")
-MODULES = 7  # a 5×5 code and its black border
 SCISSORS_MM = 1.0
 SMALLEST_MARKER_MM = 8.0
 LARGEST_CORNER = 0.29  # of the piece's shorter side, white and all: four leave two thirds of a square to the design
@@ -275,10 +274,7 @@ def _shuffled(design: np.ndarray, free: np.ndarray, sheet_id: str) -> np.ndarray
 @lru_cache(maxsize=256)
 def _marker_modules(id_: int) -> np.ndarray:
     """7×7, True where the marker is black."""
-    import cv2
-
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
-    return cv2.aruco.generateImageMarker(dictionary, id_, MODULES) == 0
+    return cells_of(DICTIONARY, [id_])[0] == 0
 
 
 def _cover(coverage: np.ndarray, box: tuple[float, float, float, float]) -> None:

@@ -19,8 +19,9 @@ from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.fonts import text_width_mm
 from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
+from patchproof.sheets.markers import MODULES
 from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES
-from patchproof.sheets.piece import MODULES, Piece, PieceMarker, marker_at, marker_rect, moved_marker
+from patchproof.sheets.piece import Piece, PieceMarker, marker_at, marker_rect, moved_marker
 from patchproof.sheets.piece_words import piece_words
 from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names

@@ -6,13 +6,13 @@ Run in this folder, with `pip install "patchproof[pathtrace]"`:
 python traced.py suv postbox light carton kaykit pickup mug box
 """
 
-import csv
 import sys
 
 import numpy as np
 import torch
 
 import patchproof as pp
+from patchlab.results.rows import write_rows
 from patchproof.base.claims import student_mean
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
@@ -51,8 +51,4 @@ def measured(name: str) -> list[dict]:
 
 
 if __name__ == "__main__":
-    rows = [row for name in sys.argv[1:] for row in measured(name)]
-    with open("traced.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("traced.csv", (row for name in sys.argv[1:] for row in measured(name)))

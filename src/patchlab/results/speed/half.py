@@ -6,16 +6,18 @@ difference in confidence, views that change sides, and rates; and the share of t
 the median of rounds in turn on one thread. One design each. Run in this folder: python half.py SCENE [SCENE ...]
 """
 
-import csv
 import statistics
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
 import patchproof as pp
+from patchlab.bench.measure import clocked
+from patchlab.results.rows import write_rows
+from patchproof.app.plan.cost import in_turn
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design
@@ -39,19 +41,18 @@ def measured(path: str) -> list[dict]:
     shown = shown_with_controls(problem, best_design(problem), CONTROLS)
     conditions = problem.scene.draw("promise", PROMISE_VIEWS, per_session=PER_SESSION)
     beside = _with_controls(PROMISE_VIEWS, PER_SESSION)
-    told, shares = {}, []
-    for _ in range(ROUNDS + 1):
-        seconds = []
-        for way in (asked, rounded):
-            Classifier._asked, begin = way, time.process_time()
-            told[way] = responses(problem, shown, conditions, beside=beside)
-            seconds.append(time.process_time() - begin)
-        shares.append(seconds[1] / seconds[0])
-    Classifier._asked, rows = asked, []
+
+    def told(way):
+        Classifier._asked = way
+        return clocked(lambda: responses(problem, shown, conditions, beside=beside))
+
+    rounds, rows = in_turn({way: partial(told, way) for way in (asked, rounded)}, ROUNDS), []
+    Classifier._asked, (wholes, halves) = asked, rounds.values()
+    share = statistics.median(half_ms / ms for (_, ms), (_, half_ms) in zip(wholes, halves, strict=True))
     for thing in ("design", "bare"):
-        whole, half = told[asked][thing], told[rounded][thing]
+        whole, half = wholes[-1][0][thing], halves[-1][0][thing]
         off, other = (half.confidence - whole.confidence)[0], (half.recognized != whole.recognized)[0]
-        row = {"scene": Path(path).stem, "thing": thing, "n": len(off), "share": f"{statistics.median(shares[1:]):.3f}"}
+        row = {"scene": Path(path).stem, "thing": thing, "n": len(off), "share": f"{share:.3f}"}
         row |= {"mean": f"{off.mean():.5f}", "rms": f"{np.sqrt((off**2).mean()):.5f}", "other": int(other.sum())}
         rows.append(row | {"rate": f"{whole.recognized.mean():.4f}", "half_rate": f"{half.recognized.mean():.4f}"})
     return rows
@@ -60,8 +61,4 @@ def measured(path: str) -> list[dict]:
 if __name__ == "__main__":
     keep_freed_memory()
     torch.set_num_threads(1)
-    rows = [row for path in sys.argv[1:] for row in measured(path)]
-    with open("half.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("half.csv", (row for path in sys.argv[1:] for row in measured(path)))

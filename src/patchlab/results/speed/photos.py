@@ -6,15 +6,13 @@ the page, and what was found. One process with one thread each; 24 photographs i
 Run in this folder, idle: python photos.py ROUNDS SRC [SRC ...]
 """
 
-import csv
-import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import patchproof as pp
+from patchlab.bench.measure import said_by
+from patchlab.results.rows import write_rows
 
 TIMED = """
 import json, sys, time
@@ -48,10 +46,8 @@ print(json.dumps(rows[len(items):]))  # the first time warms up
 
 def measured(source: Path, number: int, folder: str) -> list[dict]:
     """Lines of the table."""
-    command, environment = [sys.executable, "-c", TIMED, folder], {**os.environ, "PYTHONPATH": str(source.resolve())}
-    said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
-    commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
-    return [{"commit": commit.stdout.strip(), "round": number} | row for row in json.loads(said)]
+    commit, rows = said_by(source, TIMED, folder)
+    return [{"commit": commit, "round": number} | row for row in rows]
 
 
 if __name__ == "__main__":
@@ -60,10 +56,5 @@ if __name__ == "__main__":
         run = pp.optimize("photos.toml", at / "run", promise_views=40)
         pp.sheet(run, at / "sheet.pdf")
         pp.reprint(at / "sheet.pdf", run, 24, at / "photos", sessions=2)
-        rows = [
-            row for n in range(int(sys.argv[1])) for source in sys.argv[2:] for row in measured(Path(source), n, folder)
-        ]
-    with open("photos.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+        turns = [(Path(source), n) for n in range(int(sys.argv[1])) for source in sys.argv[2:]]
+        write_rows("photos.csv", (row for turn in turns for row in measured(*turn, folder)))

@@ -5,7 +5,6 @@ In: three objects of `bench effort`. Out: `poses.csv`: by object and seed the me
 trained on 960 views and kept as it was in the end, in the same 300 fresh views. Run in this folder: python poses.py
 """
 
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ import torch
 
 import patchproof as pp
 from patchlab.bench.effort import _scene
+from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer.loop import start, step_on
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -43,8 +43,4 @@ def measured(label: str, seed: int) -> dict:
 if __name__ == "__main__":
     keep_freed_memory()
     torch.set_num_threads(1)
-    rows = [measured(label, seed) for label in LABELS for seed in SEEDS]
-    with open("poses.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("poses.csv", (measured(label, seed) for label in LABELS for seed in SEEDS))

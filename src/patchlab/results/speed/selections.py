@@ -6,12 +6,11 @@ and of every second one stood, and, where they differ, both designs' mean loss a
 in this folder: python selections.py
 """
 
-import csv
-
 import numpy as np
 
 import patchproof as pp
 from patchlab.bench.effort import _scene
+from patchlab.results.rows import write_rows
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -52,8 +51,4 @@ def measured(goal: str, optimizer: str, label: str, seed: int) -> dict:
 if __name__ == "__main__":
     keep_freed_memory()
     loop.SELECT_AFTER = 120
-    rows = [measured(*run) for run in RUNS]
-    with open("selections.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("selections.csv", (measured(*run) for run in RUNS))

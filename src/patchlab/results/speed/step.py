@@ -8,15 +8,18 @@ views of several steps in one of them; of passes the medians of each round. Free
 keeps it, by the pass, too. Run in this folder, idle: python step.py
 """
 
-import csv
 import statistics
-import time
 from dataclasses import replace
+from functools import partial
+from time import perf_counter
 
 import torch
 from torch import nn
 
 import patchproof as pp
+from patchlab.bench.measure import clocked
+from patchlab.results.rows import write_rows
+from patchproof.app.plan.cost import in_turn
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import loop, training_views
 from patchproof.optimizer.problem import set_problem
@@ -58,10 +61,12 @@ def resnet50() -> pp.Classifier:
 def pass_ms(problem, pictures, indices) -> float:
     """Of one forward and backward pass of the network, each picture's loss to its pixels."""
     leaf, (classifier,) = pictures.clone().requires_grad_(), problem.classifiers
-    start = time.perf_counter()
-    loss = problem.losses(classifier, classifier.logits(leaf), indices).mean()
-    torch.autograd.grad(loss, leaf)
-    return 1000 * (time.perf_counter() - start)
+
+    def work():
+        loss = problem.losses(classifier, classifier.logits(leaf), indices).mean()
+        torch.autograd.grad(loss, leaf)
+
+    return clocked(work, perf_counter)[1]
 
 
 def measured(name: str, scene: str, processes: int) -> dict:
@@ -73,36 +78,28 @@ def measured(name: str, scene: str, processes: int) -> dict:
     training_views.MIN_POSES = 0  # a quarter of the views
     pictures = torch.rand(4, 3, problem.training_px, problem.training_px)
     problem.see(None, scene.draw("train", 256), 16)  # makes the places that training knows, once
-    running, rounds = loop.steps(problem), []
-    for _ in range(ROUNDS):
+    running = loop.steps(problem)
+
+    def passes() -> float:
         torch.set_num_threads(processes)  # which sharing views takes away
-        passes = [pass_ms(problem, pictures, problem.indices[0]) for _ in range(STEPS)]
+        return statistics.median(pass_ms(problem, pictures, problem.indices[0]) for _ in range(STEPS))
+
+    def steps() -> float:
         torch.set_num_threads(1)
-        steps = []
-        for _ in range(STEPS):
-            start = time.perf_counter()
-            step = next(running)
-            if not loop.selects(scene.settings.optimize, step.state.number):
-                steps.append(1000 * (time.perf_counter() - start))
-        rounds.append((statistics.mean(steps), statistics.median(passes)))
+        timed = [clocked(partial(next, running), perf_counter) for _ in range(STEPS)]
+        return statistics.mean(ms for step, ms in timed if not loop.selects(scene.settings.optimize, step.state.number))
+
+    rounds = in_turn({"pass": passes, "step": steps}, ROUNDS - 1)
     running.close()
-    new, again = (
-        [statistics.mean(values) for values in zip(*some, strict=True)] for some in (rounds[1:NEW], rounds[NEW:])
-    )
-    step_ms, own_ms = ((first + 3 * later) / 4 for first, later in zip(new, again, strict=True))
-    times = {"new_ms": new[0], "again_ms": again[0], "step_ms": step_ms, "pass_ms": own_ms}
+    parts = {name: (statistics.mean(ms[: NEW - 1]), statistics.mean(ms[NEW - 1 :])) for name, ms in rounds.items()}
+    own_ms, step_ms = ((new + 3 * again) / 4 for new, again in parts.values())
+    new_ms, again_ms = parts["step"]
+    times = {"new_ms": new_ms, "again_ms": again_ms, "step_ms": step_ms, "pass_ms": own_ms}
     return {name: round(value, 1) for name, value in times.items()} | {"ratio": round(step_ms / own_ms, 3)}
 
 
 if __name__ == "__main__":
     keep_freed_memory()
     kinds = [(n, "suv") for n in ("mobilenet_v2_1.0_224", "squeezenet1.1_224", "resnet50")]
-    with open("step.csv", "w", newline="") as file:
-        times = ("new_ms", "again_ms", "step_ms", "pass_ms", "ratio")
-        writer = csv.DictWriter(file, ("network", "scene", "processes", *times))
-        writer.writeheader()
-        for name, scene in (*kinds, ("mobilenet_v2_1.0_224", "effects")):
-            for processes in (1, 2):
-                about = {"network": name, "scene": scene, "processes": processes}
-                writer.writerow(about | measured(name, scene, processes))
-                file.flush()
+    asked = [(*kind, n) for kind in (*kinds, ("mobilenet_v2_1.0_224", "effects")) for n in (1, 2)]
+    write_rows("step.csv", ({"network": a, "scene": b, "processes": n} | measured(a, b, n) for a, b, n in asked))

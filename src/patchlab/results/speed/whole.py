@@ -5,13 +5,12 @@ checkout and round the seconds of a new process and of its parts, and what it pr
 python whole.py SCENE ROUNDS SRC [SRC ...]
 """
 
-import csv
-import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from patchlab.bench.measure import said_by
+from patchlab.results.rows import write_rows
 
 RUN = """
 import json, sys, time
@@ -34,20 +33,11 @@ print(json.dumps(parts | {"rate": run.promise.rate, "low": low, "high": high, "v
 def measured(source: Path, number: int, scene: str) -> dict:
     """A line of the table."""
     with TemporaryDirectory() as folder:
-        command, environment = (
-            [sys.executable, "-c", RUN, folder, scene],
-            {**os.environ, "PYTHONPATH": str(source.resolve())},
-        )
-        said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
-    commit = subprocess.run(["git", "-C", source, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
-    values = json.loads(said.splitlines()[-1])
-    return {"commit": commit.stdout.strip(), "round": number} | {name: round(v, 4) for name, v in values.items()}
+        commit, values = said_by(source, RUN, folder, scene)
+    return {"commit": commit, "round": number} | {name: round(v, 4) for name, v in values.items()}
 
 
 if __name__ == "__main__":
     scene, rounds, *sources = sys.argv[1:]
-    rows = [measured(Path(source), n, scene) for n in range(int(rounds)) for source in sources]
-    with open(f"{Path(scene).stem}.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = (measured(Path(source), n, scene) for n in range(int(rounds)) for source in sources)
+    write_rows(f"{Path(scene).stem}.csv", rows)

@@ -6,15 +6,18 @@ thread, with freed memory kept; and the largest differences, of gradients in the
 gradient, of logits as they are. Run in this folder, idle: python windows.py
 """
 
-import csv
 import os
 import statistics
-import time
+from functools import partial
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import torch
 
+from patchlab.bench.measure import clocked
+from patchlab.results.rows import write_rows
+from patchproof.app.plan.cost import in_turn
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier import load_classifier
 from patchproof.networks.windows import Windows
@@ -25,12 +28,18 @@ ROUNDS = 30
 
 
 def gradient(network, photos, windows):
-    """Of a weighted sum of the answers, at the pictures; and the milliseconds that it took."""
-    leaf, start = photos.clone().requires_grad_(), time.perf_counter()
+    """Of a weighted sum of the answers, at the pictures."""
+    leaf = photos.clone().requires_grad_()
     answers = network(leaf, windows)
     weights = torch.linspace(-1, 1, answers.numel()).view(answers.shape)
-    (found,) = torch.autograd.grad((answers * weights).sum(), leaf)
-    return found, 1000 * (time.perf_counter() - start)
+    return torch.autograd.grad((answers * weights).sum(), leaf)[0]
+
+
+def in_turn_ms(whole, some):
+    """(what both calls return in each round, their median milliseconds)."""
+    calls = {call: partial(clocked, call, perf_counter) for call in (whole, some)}
+    answers, times = zip(*(zip(*each, strict=True) for each in in_turn(calls, ROUNDS).values()), strict=True)
+    return list(zip(*answers, strict=True)), [statistics.median(ms) for ms in times]
 
 
 def placed(size: int, share: float, count: int) -> np.ndarray:
@@ -49,15 +58,11 @@ def parts(photos, windows):
 def asked_for_gradients(network, size: int, share: float) -> dict:
     """Of two pictures, in the windows only and of all of them."""
     windows, photos = placed(size, share, 2), torch.rand(2, 3, size, size)
-    times = {"whole": [], "windows": []}
-    for _ in range(ROUNDS + 2):
-        (whole, whole_ms), (some, windows_ms) = (gradient(network, photos, w) for w in (None, Windows(windows)))
-        times["whole"].append(whole_ms)
-        times["windows"].append(windows_ms)
+    calls = (partial(gradient, network, photos, w) for w in (None, Windows(windows)))
+    ((whole, some), *_), (whole_ms, windows_ms) = in_turn_ms(*calls)
     largest = float(whole.abs().max())
     pairs = zip(parts(some, windows), parts(whole, windows), strict=True)
     difference = max(float((one - same).abs().max()) for one, same in pairs) / largest
-    whole_ms, windows_ms = (statistics.median(values[2:]) for values in times.values())  # the first are to warm up
     row = {"whole_ms": round(whole_ms, 2), "windows_ms": round(windows_ms, 2)}
     return row | {"ratio": round(windows_ms / whole_ms, 3), "difference": f"{difference:.1e}"}
 
@@ -66,18 +71,13 @@ def asked_for_gradients(network, size: int, share: float) -> dict:
 def asked_beside_others(network, size: int, share: float) -> dict:
     """Four pictures that differ in windows only from four others, whose answers are known."""
     windows, photos = placed(size, share, 4), torch.rand(4, 3, size, size)
-    others, kept, times, difference = photos.clone(), {}, {"whole": [], "beside": []}, 0.0
+    others, kept = photos.clone(), {}
     for part in parts(others, windows):
         part.uniform_()
     network(photos, Windows(windows, kept))
-    for _ in range(ROUNDS + 2):
-        told = {}
-        for name, known in (("whole", None), ("beside", Windows(windows, kept))):
-            start = time.perf_counter()
-            told[name] = network(others, known)
-            times[name].append(1000 * (time.perf_counter() - start))
-        difference = max(difference, float((told["whole"] - told["beside"]).abs().max()))
-    whole_ms, beside_ms = (statistics.median(values[2:]) for values in times.values())
+    calls = (partial(network, others, known) for known in (None, Windows(windows, kept)))
+    told, (whole_ms, beside_ms) = in_turn_ms(*calls)
+    difference = max(float((whole - beside).abs().max()) for whole, beside in told)
     row = {"forward_ms": round(whole_ms, 2), "beside_ms": round(beside_ms, 2)}
     return row | {"beside_ratio": round(beside_ms / whole_ms, 3), "beside_difference": f"{difference:.1e}"}
 
@@ -93,8 +93,4 @@ if __name__ == "__main__":
     keep_freed_memory()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    rows = [measured(name, share) for name in NETWORKS for share in SHARES]
-    with open("windows.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("windows.csv", (measured(name, share) for name in NETWORKS for share in SHARES))

@@ -4,7 +4,6 @@ In: scene files of `../promises`. Out: a line of `edges.csv` per scene: confiden
 the conditions with 95 % intervals (Student's). Run in this folder: python edges.py suv pickup light postbox mug carton
 """
 
-import csv
 import sys
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 import patchproof as pp
+from patchlab.results.rows import write_rows
 from patchproof.base.claims import student_mean
 from patchproof.channel.camera import develop
 from patchproof.optimizer.problem import set_problem
@@ -46,8 +46,4 @@ def measured(name: str) -> dict:
 
 
 if __name__ == "__main__":
-    rows = [measured(name) for name in sys.argv[1:]]
-    with open("edges.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("edges.csv", (measured(name) for name in sys.argv[1:]))

@@ -5,12 +5,11 @@ averaged over, taps and what is shown: means over conditions that `views.py` doe
 (Student's). One design each. Run in this folder: python looks.py suv postbox carton small
 """
 
-import csv
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import patchproof as pp
+from patchlab.results.rows import write_rows
 from patchproof.base.claims import student_mean
 from patchproof.optimizer import problem as problems
 from patchproof.optimizer.loop import best_design
@@ -48,10 +47,4 @@ def measured(name: str) -> list[dict]:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        rows, new = measured(name), not Path("looks.csv").exists()
-        with open("looks.csv", "a", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            if new:
-                writer.writeheader()
-            writer.writerows(rows)
+    write_rows("looks.csv", (row for name in sys.argv[1:] for row in measured(name)), append=True)

@@ -5,13 +5,13 @@ design less those with as many taps as photographs have, as mean and root mean s
 design each. Run in this folder: python taps.py suv postbox carton truck
 """
 
-import csv
 import sys
 from dataclasses import replace
 
 import numpy as np
 
 import patchproof as pp
+from patchlab.results.rows import write_rows
 from patchproof.optimizer import problem as problems
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.promise import shown_with_controls
@@ -39,8 +39,4 @@ def measured(name: str) -> list[dict]:
 
 
 if __name__ == "__main__":
-    rows = [row for name in sys.argv[1:] for row in measured(name)]
-    with open("taps.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows("taps.csv", (row for name in sys.argv[1:] for row in measured(name)))

@@ -5,11 +5,10 @@ and of the bare object, means over the conditions with 95 % intervals (Student's
 Run in this folder: python views.py suv postbox carton truck small
 """
 
-import csv
 import sys
-from pathlib import Path
 
 import patchproof as pp
+from patchlab.results.rows import write_rows
 from patchproof.base.claims import student_mean
 from patchproof.optimizer.loop import best_design
 from patchproof.optimizer.pixels import from_pixels
@@ -42,11 +41,4 @@ def measured(name: str) -> list[dict]:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        rows = measured(name)
-        new = not Path("views.csv").exists()
-        with open("views.csv", "a", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            if new:
-                writer.writeheader()
-            writer.writerows(rows)
+    write_rows("views.csv", (row for name in sys.argv[1:] for row in measured(name)), append=True)

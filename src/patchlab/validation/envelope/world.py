@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchlab.study.record import corner_error_mm
 from patchlab.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
 from patchlab.validation.envelope.gains import CONTROLS
 from patchlab.validation.envelope.window import Frame, on_plain_ground, window
@@ -206,11 +207,10 @@ def _measurement(world: World, scene: Scene, conditions: Conditions, srgb: np.nd
     view = View(srgb, matrix_px, calibrated=False)
     entry = measure(view, "photo", world.surface, None, PromisedRanges({})).entry
     error_mm = None
-    if entry.status == "measured" and entry.geometry and entry.geometry.homography_px_from_mm is not None:
+    if entry.status == "measured" and entry.geometry:
         corners = geometry.rect_corners(world.surface.rect_mm)
         true_px = needs_piece(scene).piece_px(conditions, corners - world.sheet.manifest.cut_mm[:2]) - origin_px
-        back = geometry.apply_homography(np.linalg.inv(np.array(entry.geometry.homography_px_from_mm)), true_px)
-        error_mm = float(np.linalg.norm(back - corners, axis=1).max())
+        error_mm = corner_error_mm(entry.geometry, corners, true_px)
     return Measurement(entry.status, entry.code, error_mm)
 
 

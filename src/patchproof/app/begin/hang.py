@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.bend import place_bent
-from patchproof.scene.fitting import largest, lies_well
-from patchproof.scene.placement import Frame, place_card, side_frame
+from patchproof.scene.bend import lay_for
+from patchproof.scene.fitting import laid_well, largest
+from patchproof.scene.placement import Frame, side_frame
 from patchproof.sheets.piece import smallest_piece_mm
 
 _SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
@@ -70,8 +70,8 @@ def _wanted(frame: Frame) -> tuple[float, float]:
 
 def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> Hang | None:
     """The largest piece of that shape that lies well in the middle of a side."""
-    frame, lay = side_frame(mesh, side), place_bent if bend else place_card
-    found = largest(size_mm, lambda trial: lies_well(mesh, frame, trial, 0.0, lay), smallest_piece_mm())
+    frame, lay = side_frame(mesh, side), lay_for(bend)
+    found = largest(size_mm, lambda trial: laid_well(mesh, frame, trial, 0.0, lay), smallest_piece_mm())
     return None if found is None else Hang(side, found, bend)
 
 

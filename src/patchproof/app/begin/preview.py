@@ -21,7 +21,6 @@ from patchproof.app.begin.sides import (
     SIDE_NAMES,
     extent_mm,
     gap_colors,
-    gap_top_mm,
     side_of,
     side_views,
     stretch_colors,
@@ -30,6 +29,7 @@ from patchproof.app.begin.turntable import turntable
 from patchproof.app.begin.views import Look, looks
 from patchproof.base.color import codes_of
 from patchproof.base.output import image_bytes, new_folder, write_whole
+from patchproof.base.resample import reduced
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.classifier.labels import find_labels
@@ -44,6 +44,7 @@ from patchproof.scene.interface import Scene
 from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.patch_scene import PatchScene
+from patchproof.scene.placement import gap_limit_mm
 from patchproof.scene.scene import build_scene
 from patchproof.scene.texture import whole_colors
 from patchproof.scene.texture_scene import TextureScene
@@ -218,7 +219,7 @@ def _maps(scene: PatchScene) -> list[dict[str, str]]:
             "shape": shape,
             "picture": data_uri(png(gap_colors(laid))),
             "low": "0 mm",
-            "high": f"{gap_top_mm(laid):.2g} mm: too much",
+            "high": f"{gap_limit_mm(laid.size_mm):.2g} mm: too much",
         }
     ]
     if not laid.is_flat:
@@ -238,7 +239,7 @@ def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
     """The object as a GLB file, with the piece that shows `design` where a scene has one."""
     scene = needs_mesh(stage.scene)
     mesh = whole_colors(scene.mesh, np.zeros(len(scene.mesh.faces), bool))
-    textures = [_reduced(m.texture_srgb) for m in mesh.materials if m.texture_srgb is not None]
+    textures = [reduced(m.texture_srgb, _TEXTURE_PX) for m in mesh.materials if m.texture_srgb is not None]
     piece = None
     if isinstance(scene, PatchScene):
         laid, material = scene.placement, Material("piece", (1.0, 1.0, 1.0), design)
@@ -258,13 +259,3 @@ def _gray_design(stage: Stage) -> np.ndarray | None:
 def _webp(picture: np.ndarray) -> str:
     """A picture for the page in 3 to 10 kB: as JPEG it would be twice as large."""
     return base64_uri(image_bytes(picture, "WEBP", {"quality": 80}), "image/webp")
-
-
-def _reduced(texture: np.ndarray) -> np.ndarray:
-    """A texture of at most `_TEXTURE_PX` a side."""
-    import cv2
-
-    height, width = texture.shape[:2]
-    scale = min(1.0, _TEXTURE_PX / max(width, height))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return texture if scale == 1 else cv2.resize(texture, size, interpolation=cv2.INTER_AREA)

@@ -19,7 +19,7 @@ from patchproof.reprints.hung import straight_picture
 from patchproof.scene.bend import STRETCH_LIMIT
 from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.scene.placement import WARN_GAP_SHARE, Placement, side_frame
+from patchproof.scene.placement import Placement, gap_limit_mm, side_frame
 
 SIDE_NAMES: dict[Side, str] = {
     "+z": "front",
@@ -90,15 +90,10 @@ def extent_mm(mesh: Mesh) -> tuple[float, float, float]:
 
 
 def gap_colors(placement: Placement) -> np.ndarray:
-    """uint8 N×N×3 over the piece: 0 to `gap_top_mm` from dark to light, `NO_SURFACE` where nothing is under it."""
-    colors = ramp(placement.gaps_mm / gap_top_mm(placement))
+    """uint8 N×N×3 over the piece: 0 to `gap_limit_mm` from dark to light, `NO_SURFACE` where nothing is under it."""
+    colors = ramp(placement.gaps_mm / gap_limit_mm(placement.size_mm))
     colors[np.isnan(placement.gaps_mm)] = NO_SURFACE
     return colors
-
-
-def gap_top_mm(placement: Placement) -> float:
-    """The gap at the light end: what `plan` and `optimize` warn of."""
-    return WARN_GAP_SHARE * min(placement.size_mm)
 
 
 def stretch_colors(placement: Placement) -> np.ndarray:

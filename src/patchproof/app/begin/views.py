@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from patchproof.base.geometry import rect_corners
+from patchproof.base.geometry import rect_border
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.render.photograph import photograph
@@ -88,8 +88,6 @@ def _outline(stage: Stage, conditions: Conditions, side_px: int) -> np.ndarray |
     scene = stage.scene
     if not isinstance(scene, PieceScene) or not scene.facing(conditions)[0]:
         return None
-    corners, steps = rect_corners((0, 0, *scene.piece.size_mm)), np.linspace(0, 1, _STEPS, endpoint=False)[:, None]
-    border = [a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
-    whole = np.array(scene.photo_px)
-    points = (scene.piece_px(conditions, np.concatenate(border)) - (whole - whole.min()) / 2) * side_px / whole.min()
+    border, whole = rect_border((0, 0, *scene.piece.size_mm), _STEPS), np.array(scene.photo_px)
+    points = (scene.piece_px(conditions, border) - (whole - whole.min()) / 2) * side_px / whole.min()
     return points if np.isfinite(points).all() else None

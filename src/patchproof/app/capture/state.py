@@ -16,10 +16,9 @@ from patchproof.app.capture.gathered import Gathered
 from patchproof.app.capture.views import map_views
 from patchproof.base.output import image_bytes
 from patchproof.evidence.results import PhotoEntry
-from patchproof.evidence.verdict import EACH
+from patchproof.evidence.verdict import EACH, photos_line
 from patchproof.report.images import data_uri
 from patchproof.report.words import VERDICTS, headline_of, worth_sentence
-from patchproof.reprints.shots import sessions_line
 
 _LATEST = 12  # photographs with advice
 _USUAL_SESSIONS = 4  # where no number of them would do
@@ -55,7 +54,7 @@ def state_of(gathered: Gathered, sessions: int | None) -> dict[str, Any]:
         "prediction_interval": summary.prediction_interval,
         "sessions": rows,
         "each": EACH,
-        "plan": summary.next_step or sessions_line(sessions),
+        "plan": summary.next_step or (photos_line(sessions) if promise is not None else ""),
         "controls": [
             {"name": control.name, "photos": control.n, "recognized": control.recognized} for control in report.controls
         ],

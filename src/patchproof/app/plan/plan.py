@@ -32,7 +32,8 @@ from patchproof.scene.interface import PieceScene, needs_piece
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.scene import load_scene
-from patchproof.sheets.piece import MODULES, SMALLEST_MARKER_MM
+from patchproof.sheets.markers import MODULES
+from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
 TERM_VIEWS = 16
 DRAFT_VIEWS = 120  # that the draft is trained on
