@@ -328,14 +328,14 @@ def place_json(rng: Rng, folder: Path) -> Read:
 
 
 def camera_json(rng: Rng, folder: Path) -> Read:
-    from patchproof.channel.lens import load_camera, pinhole_frame, undistort_points
+    from patchproof.channel.lens import load_camera
 
     (folder / "camera.json").write_bytes(broken_json(rng, CAMERA))
 
     def read() -> None:
         camera = load_camera(str(folder / "camera.json"))
-        pinhole_frame(camera, (400, 300))
-        undistort_points(np.array([[10.0, 10.0]]), camera, (400, 300))
+        camera.pinhole_frame((400, 300))
+        camera.undistort_points(np.array([[10.0, 10.0]]), (400, 300))
 
     return read
 

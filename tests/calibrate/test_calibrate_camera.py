@@ -16,7 +16,7 @@ from patchproof.base.strict import Refused
 from patchproof.calibrate.boards import View, corner_places_mm, see_boards
 from patchproof.calibrate.camera import calibrate_camera, solve
 from patchproof.calibrate.ladder import compared, simplest
-from patchproof.channel.lens import distort_points, load_camera
+from patchproof.channel.lens import load_camera
 from patchproof.sheets.board import board_sheet, load_board
 from patchproof.sheets.raster import page_pixels
 
@@ -81,7 +81,7 @@ def test_a_known_lens_comes_back_with_its_rung(bends, rung):
     pixel = np.array([[1400.0, 200.0]])
     flat = np.column_stack([(pixel - [790, 610]) / 1300, [1.0]])
     there = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix(), np.array(bends))[0].reshape(1, 2)
-    assert distort_points(pixel, found.camera, SIZE) == pytest.approx(there, abs=0.5)
+    assert found.camera.distort_points(pixel, SIZE) == pytest.approx(there, abs=0.5)
 
 
 def test_the_lowest_rung_within_one_standard_error_of_the_paired_difference_is_chosen():

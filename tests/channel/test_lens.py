@@ -11,15 +11,7 @@ import torch
 
 from patchproof.base import geometry
 from patchproof.base.strict import Refused, shipped
-from patchproof.channel.lens import (
-    Camera,
-    distort_points,
-    distorted,
-    load_camera,
-    matrix_px,
-    pinhole_frame,
-    undistort_points,
-)
+from patchproof.channel.lens import Camera, load_camera
 
 ORIGIN = {"when": "2020-01-01", "instrument": "a board", "uncertainty": "1 px"}
 BARREL = {"k1": -0.12, "k2": 0.02, "p1": 1e-3, "p2": -2e-3, "k3": -0.003}
@@ -62,50 +54,50 @@ def test_points_are_where_opencv_puts_them(terms):
     straight = points((800, 600))
     rays = np.concatenate([(straight - 0.5 - matrix[:2, 2]) / [640, 655], np.ones((200, 1))], 1)
     theirs = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0] + 0.5
-    ours = distort_points(straight, camera(**terms), (800, 600))
+    ours = camera(**terms).distort_points(straight, (800, 600))
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
     assert np.abs(ours - straight).max() > 5
     # OpenCV stops after 5 iterations, enough in the picture's middle
     near = np.abs(theirs - [400, 300]).max(1) < 200
     back = cv2.undistortPoints(theirs - 0.5, matrix, coefficients, P=matrix)[:, 0] + 0.5
-    np.testing.assert_allclose(undistort_points(ours, camera(**terms), (800, 600))[near], back[near], atol=2e-3)
+    np.testing.assert_allclose(camera(**terms).undistort_points(ours, (800, 600))[near], back[near], atol=2e-3)
 
 
 @pytest.mark.parametrize("size_px", [(800, 600), (1600, 1200), (224, 224), (600, 600)])
 def test_undistorting_is_the_inverse_at_every_size(size_px):
     for terms in (BARREL, CUSHION, {}):
         seen = points(size_px)
-        back = distort_points(undistort_points(seen, camera(**terms), size_px), camera(**terms), size_px)
+        back = camera(**terms).distort_points(camera(**terms).undistort_points(seen, size_px), size_px)
         np.testing.assert_allclose(back, seen, atol=1e-7)
 
 
 def test_matrices_of_smaller_pictures_and_of_the_centered_square_look_the_same_way():
     one, ray = camera(), np.array([0.2, -0.1, 1.0])
-    x, y = (matrix_px(one, (800, 600)) @ ray)[:2]
-    np.testing.assert_allclose((matrix_px(one, (1600, 1200)) @ ray)[:2], [2 * x, 2 * y])
-    np.testing.assert_allclose((matrix_px(one, (600, 600)) @ ray)[:2], [x - 100, y])
-    np.testing.assert_allclose((matrix_px(one, (300, 300)) @ ray)[:2], [(x - 100) / 2, y / 2])
+    x, y = (one.matrix_px((800, 600)) @ ray)[:2]
+    np.testing.assert_allclose((one.matrix_px((1600, 1200)) @ ray)[:2], [2 * x, 2 * y])
+    np.testing.assert_allclose((one.matrix_px((600, 600)) @ ray)[:2], [x - 100, y])
+    np.testing.assert_allclose((one.matrix_px((300, 300)) @ ray)[:2], [(x - 100) / 2, y / 2])
 
 
 def test_a_camera_with_the_field_of_view_of_a_scene_has_its_matrix():
     focal = geometry.intrinsics(50, (800, 600))[0, 0]
     one = camera(fx=focal, fy=focal, cx=400.0, cy=300.0)
     for size_px in ((800, 600), (400, 300), (224, 224)):
-        np.testing.assert_allclose(matrix_px(one, size_px), geometry.intrinsics(50, size_px))
+        np.testing.assert_allclose(one.matrix_px(size_px), geometry.intrinsics(50, size_px))
 
 
 def test_points_of_the_square_are_those_of_the_whole_picture():
     one, square = camera(**BARREL), points((600, 600))
-    whole = distort_points(square + np.array([100, 0]), one, (800, 600))
-    np.testing.assert_allclose(distort_points(square, one, (600, 600)) + np.array([100, 0]), whole)
+    whole = one.distort_points(square + np.array([100, 0]), (800, 600))
+    np.testing.assert_allclose(one.distort_points(square, (600, 600)) + np.array([100, 0]), whole)
 
 
 def test_no_distortion_changes_nothing():
     one, pictures = camera(), torch.rand(2, 3, 30, 40)
-    frame = pinhole_frame(one, (40, 30))
+    frame = one.pinhole_frame((40, 30))
     assert frame.size_px == (40, 30) and not one.bends
-    np.testing.assert_array_equal(frame.matrix_px, matrix_px(one, (40, 30)))
-    assert distorted(pictures, one, (40, 30)) is pictures
+    np.testing.assert_array_equal(frame.matrix_px, one.matrix_px((40, 30)))
+    assert one.distorted(pictures, (40, 30)) is pictures
 
 
 @pytest.mark.parametrize("terms", [BARREL, CUSHION])
@@ -113,14 +105,14 @@ def test_no_distortion_changes_nothing():
 def test_a_picture_is_bent_as_its_points_are(terms, size_px):
     """A smooth picture of direction: after the lens every pixel holds the direction that its own point comes from."""
     one = camera(**terms)
-    frame = pinhole_frame(one, size_px)
+    frame = one.pinhole_frame(size_px)
     width, height = frame.size_px
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     ramp = torch.tensor(np.stack([x - frame.left, y - frame.top])[None])
-    seen = distorted(ramp, one, size_px)[0].permute(1, 2, 0).reshape(-1, 2).numpy()
+    seen = one.distorted(ramp, size_px)[0].permute(1, 2, 0).reshape(-1, 2).numpy()
     assert len(seen) == size_px[0] * size_px[1]
     x, y = np.meshgrid(np.arange(size_px[0]) + 0.5, np.arange(size_px[1]) + 0.5)
-    came_from = undistort_points(np.stack([x.ravel(), y.ravel()], 1), one, size_px)
+    came_from = one.undistort_points(np.stack([x.ravel(), y.ravel()], 1), size_px)
     # bilinear is exact on a ramp
     np.testing.assert_allclose(seen, came_from, atol=1e-9)
 
@@ -130,29 +122,29 @@ def test_a_picture_is_bent_as_its_points_are(terms, size_px):
 def test_the_frame_holds_all_that_the_lens_reads(terms, size_px):
     """What a bilinear sample reads lies inside, so that the border's padding is never seen."""
     one = camera(**terms)
-    frame = pinhole_frame(one, size_px)
+    frame = one.pinhole_frame(size_px)
     x, y = np.meshgrid(np.arange(size_px[0]) + 0.5, np.arange(size_px[1]) + 0.5)
-    source = undistort_points(np.stack([x.ravel(), y.ravel()], 1), one, size_px) + np.array([frame.left, frame.top])
+    source = one.undistort_points(np.stack([x.ravel(), y.ravel()], 1), size_px) + np.array([frame.left, frame.top])
     assert source.min() >= 0.5 and (source <= np.array(frame.size_px) - 0.5).all()
-    bare = matrix_px(one, size_px)
+    bare = one.matrix_px(size_px)
     np.testing.assert_allclose(frame.matrix_px[:2, 2] - bare[:2, 2], [frame.left, frame.top])
     assert frame.size_px == (size_px[0] + frame.left + frame.right, size_px[1] + frame.top + frame.bottom)
 
 
 def test_gradients_reach_what_was_rendered():
     one = camera(**BARREL)
-    width, height = pinhole_frame(one, (8, 6)).size_px
+    width, height = one.pinhole_frame((8, 6)).size_px
     pictures = torch.rand(1, 2, height, width, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: distorted(p, one, (8, 6)), pictures)
+    assert torch.autograd.gradcheck(lambda p: one.distorted(p, (8, 6)), pictures)
 
 
 def test_batches_equal_single_pictures():
     one = camera(**BARREL)
-    width, height = pinhole_frame(one, (40, 30)).size_px
+    width, height = one.pinhole_frame((40, 30)).size_px
     pictures = torch.rand(3, 3, height, width)
-    together = distorted(pictures, one, (40, 30))
+    together = one.distorted(pictures, (40, 30))
     for i in range(3):
-        assert torch.equal(distorted(pictures[i : i + 1], one, (40, 30))[0], together[i])
+        assert torch.equal(one.distorted(pictures[i : i + 1], (40, 30))[0], together[i])
 
 
 @pytest.mark.parametrize("path", sorted(shipped("calibration", "cameras").glob("*.json")), ids=lambda p: p.stem)

@@ -54,9 +54,9 @@ def test_a_lens_is_taken_out_and_the_homography_is_the_pinhole_s():
     size_px, dots = (800, 600), np.array([[60.0, 60], [400, 60], [740, 60], [60, 540], [740, 540]])
     picture = np.full((600, 800, 3), 230, np.uint8)
     y, x = np.mgrid[0:600, 0:800] + 0.5
-    for px, py in lens.distort_points(dots, camera, size_px):
+    for px, py in camera.distort_points(dots, size_px):
         picture[(x - px) ** 2 + (y - py) ** 2 < 64] = 10
-    assert np.abs(lens.distort_points(dots, camera, size_px) - dots).max() > 3
+    assert np.abs(camera.distort_points(dots, size_px) - dots).max() > 3
     view = view_of(Photo(picture, None), camera)
     dark = 255.0 - view.srgb[..., 0]
     dark[dark < 60] = 0
@@ -64,15 +64,15 @@ def test_a_lens_is_taken_out_and_the_homography_is_the_pinhole_s():
         near = dark * ((np.abs(x - px) < 15) & (np.abs(y - py) < 15))
         assert (near * x).sum() / near.sum() == pytest.approx(px, abs=0.25)
         assert (near * y).sum() / near.sum() == pytest.approx(py, abs=0.25)
-    assert view.calibrated and view.matrix_px == pytest.approx(lens.matrix_px(camera, size_px))
+    assert view.calibrated and view.matrix_px == pytest.approx(camera.matrix_px(size_px))
 
 
 def test_a_turned_camera_bends_turned_points():
     camera = PHONE.model_copy(update={"cx": 1980.0, "cy": 1530.0, "p1": 2e-3, "p2": -1e-3})
     points = np.array([[100.0, 200], [3900, 250], [2500, 2800]])
     turn = lambda p: np.column_stack([3000 - p[:, 1], p[:, 0]])  # noqa: E731
-    bent = lens.distort_points(turn(points), _turned(camera), (3000, 4000))
-    assert bent == pytest.approx(turn(lens.distort_points(points, camera, (4000, 3000))), abs=1e-6)
+    bent = _turned(camera).distort_points(turn(points), (3000, 4000))
+    assert bent == pytest.approx(turn(camera.distort_points(points, (4000, 3000))), abs=1e-6)
 
 
 def test_a_picture_of_another_shape_is_another_camera_s():

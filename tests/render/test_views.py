@@ -17,7 +17,6 @@ from torch.nn.functional import avg_pool2d
 
 from patchproof.base import geometry
 from patchproof.base.strict import Refused
-from patchproof.channel.lens import distort_points
 from patchproof.optimizer.problem import FIGURED, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module
@@ -307,7 +306,7 @@ def test_a_lens_puts_the_markers_where_opencv_says(tmp_path, k1):
         straight = geometry.apply_homography(homography, np.array(marker.corners_mm))
         unit = np.linalg.solve(matrix, np.concatenate([straight, np.ones((4, 1))], 1).T).T
         expected = cv2.projectPoints(unit, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
-        np.testing.assert_allclose(distort_points(straight, camera, (1600, 1200)), expected, atol=1e-3)
+        np.testing.assert_allclose(camera.distort_points(straight, (1600, 1200)), expected, atol=1e-3)
         np.testing.assert_allclose(found[marker.id], expected, atol=0.35)
         moved = max(moved, np.abs(expected - straight).max())
     assert moved > (1 if k1 is None else 8)

@@ -20,7 +20,7 @@ from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
 from patchproof.base.output import check_folder, write_whole
 from patchproof.base.strict import Refused
-from patchproof.channel.lens import Camera, load_camera
+from patchproof.channel.cameras import camera_of
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
@@ -39,6 +39,7 @@ from patchproof.report.write import write_report
 from patchproof.sheets.manifest import Manifest, load_manifest
 
 if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
     from patchproof.optimizer.run import Run
 
 _JOURNAL = "photos.jsonl"
@@ -160,7 +161,7 @@ def options_of(
     return Options(
         models=[load_classifier(network, base).at_score(least_score) for network in _networks(manifest, models)],
         printer=load_printer((manifest.settings.get("printer") or {}).get("profile", "coated"), base),
-        camera=None if camera is None else load_camera(camera),
+        camera=camera_of(camera),
     )
 
 

@@ -7,10 +7,14 @@ Left out on purpose: what stands in front of the object.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from patchproof.base.geometry import project
-from patchproof.channel.lens import Camera, distort_points
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
 
 MOST_POINTS = 500  # of a ball: their box lacks 0.3 % of its size
 
@@ -48,7 +52,7 @@ def box_of(
     points_px = points_px[np.isfinite(points_px[:, 0])]
     if camera is not None and camera.bends:
         middle = np.array(size_px) / 2  # far outside the picture a lens's polynomial means nothing
-        points_px = distort_points(np.clip(points_px, -middle, 3 * middle), camera, size_px)
+        points_px = camera.distort_points(np.clip(points_px, -middle, 3 * middle), size_px)
     if not len(points_px):
         return np.zeros(4)
     low, high = points_px.min(0), points_px.max(0)

@@ -13,14 +13,17 @@ by whoever writes it.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from patchproof.base.color import clamped
 from patchproof.channel.effects import Sensor
-from patchproof.channel.lens import Camera
 from patchproof.channel.tone import codes_of_light
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
 
 # A blur below this sigma (pixels) is lost in a pixel's own averaging and in what resampling adds.
 SMALLEST_BLUR_PX = 0.4

@@ -15,7 +15,6 @@ Source: Brown, Close-Range Camera Calibration, 1971; OpenCV's documentation of c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -25,6 +24,7 @@ from pydantic import Field
 
 from patchproof.base.input import is_file, read_json
 from patchproof.base.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
+from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,19 +59,59 @@ class Camera(Strict):
         """Whether there is any distortion."""
         return any((self.k1, self.k2, self.p1, self.p2, self.k3))
 
+    def fits(self, photo_px: tuple[int, int]) -> bool:
+        """Whether photographs of this size can be the camera's, held as it was when it was measured."""
+        (width, height), (across, down) = self.image_px, photo_px
+        return abs(across * height / (down * width) - 1) <= ASPECT_TOLERANCE
 
-@dataclass(frozen=True)
-class Frame:
-    """The pinhole picture to render before the lens bends it: its size and matrix, and how far it reaches out of the
-    picture on each side.
-    """
+    def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
+        """3×3 pinhole matrix for a picture of this size: the whole photograph or, where square, its centered square."""
+        width, height = self.image_px
+        shown = (min(width, height),) * 2 if size_px[0] == size_px[1] else (width, height)
+        sx, sy = size_px[0] / shown[0], size_px[1] / shown[1]
+        cx, cy = self.cx - (width - shown[0]) / 2, self.cy - (height - shown[1]) / 2
+        return np.array([[self.fx * sx, 0, cx * sx], [0, self.fy * sy, cy * sy], [0, 0, 1.0]])
 
-    size_px: tuple[int, int]
-    matrix_px: np.ndarray
-    left: int
-    top: int
-    right: int
-    bottom: int
+    def distort_points(self, points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+        """Where the lens puts pixels N×2 of the pinhole picture of this size."""
+        matrix = self.matrix_px(size_px)
+        return _from_unit(matrix, _bent(self, _to_unit(matrix, points_px)))
+
+    def undistort_points(self, points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+        """The pinhole picture's pixels N×2 that the lens puts at these of the photograph."""
+        matrix = self.matrix_px(size_px)
+        return _from_unit(matrix, _straight(self, _to_unit(matrix, points_px)))
+
+    def pinhole_frame(self, size_px: tuple[int, int]) -> Frame:
+        """What to render so that `distorted` reads nothing from outside; with no distortion, the picture itself."""
+        matrix = self.matrix_px(size_px)
+        if not self.bends:
+            return Frame(size_px, matrix, 0, 0, 0, 0)
+        edge = self.undistort_points(_edge_px(size_px), size_px)
+        # a bilinear sample reads no padding where it lies between the centers of the outermost pixels
+        left, top = (max(0, math.ceil(0.5 - low)) for low in edge.min(0))
+        right, bottom = (max(0, math.ceil(high + 0.5 - size)) for high, size in zip(edge.max(0), size_px, strict=True))
+        matrix = matrix + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
+        return Frame((size_px[0] + left + right, size_px[1] + top + bottom), matrix, left, top, right, bottom)
+
+    def distorted(self, pictures: Tensor, size_px: tuple[int, int]) -> Tensor:
+        """N×C×H×W pictures of `size_px` as the lens makes them, from pinhole pictures of `pinhole_frame(...).size_px`.
+
+        Differentiable; linear light should come in, as it does through a lens.
+        """
+        import torch
+
+        if not self.bends:
+            return pictures
+        # pyright cannot know that frozen models have a hash
+        grid = torch.as_tensor(_sampling_grid(self, size_px)).to(pictures)  # pyright: ignore[reportArgumentType]
+        return torch.nn.functional.grid_sample(
+            pictures,
+            grid.expand(len(pictures), -1, -1, -1),
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=False,
+        )
 
 
 def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
@@ -80,7 +120,7 @@ def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int
     camera = validated(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
     check_camera(camera, str(path))
     width, height = camera.image_px
-    if photo_px is not None and abs(photo_px[0] * height / (photo_px[1] * width) - 1) > ASPECT_TOLERANCE:
+    if photo_px is not None and not camera.fits(photo_px):
         raise Refused(
             f"photographs with the aspect of {path} ({width} × {height} px)",
             f"photo_px = [{photo_px[0]}, {photo_px[1]}]",
@@ -109,64 +149,14 @@ def check_camera(camera: Camera, where: str) -> None:
     _refuse_folded(camera, where)
 
 
-def matrix_px(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
-    """3×3 pinhole matrix for a picture of this size: the whole photograph or, where square, its centered square."""
-    width, height = camera.image_px
-    shown = (min(width, height),) * 2 if size_px[0] == size_px[1] else (width, height)
-    sx, sy = size_px[0] / shown[0], size_px[1] / shown[1]
-    cx, cy = camera.cx - (width - shown[0]) / 2, camera.cy - (height - shown[1]) / 2
-    return np.array([[camera.fx * sx, 0, cx * sx], [0, camera.fy * sy, cy * sy], [0, 0, 1.0]])
-
-
-def distort_points(points_px: np.ndarray, camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
-    """Where the lens puts pixels N×2 of the pinhole picture of this size."""
-    matrix = matrix_px(camera, size_px)
-    return _from_unit(matrix, _bent(camera, _to_unit(matrix, points_px)))
-
-
-def undistort_points(points_px: np.ndarray, camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
-    """The pinhole picture's pixels N×2 that the lens puts at these of the photograph."""
-    matrix = matrix_px(camera, size_px)
-    return _from_unit(matrix, _straight(camera, _to_unit(matrix, points_px)))
-
-
-def pinhole_frame(camera: Camera, size_px: tuple[int, int]) -> Frame:
-    """What to render so that `distorted` reads nothing from outside; with no distortion, the picture itself."""
-    matrix = matrix_px(camera, size_px)
-    if not camera.bends:
-        return Frame(size_px, matrix, 0, 0, 0, 0)
-    edge = undistort_points(_edge_px(size_px), camera, size_px)
-    # a bilinear sample reads no padding where it lies between the centers of the outermost pixels
-    left, top = (max(0, math.ceil(0.5 - low)) for low in edge.min(0))
-    right, bottom = (max(0, math.ceil(high + 0.5 - size)) for high, size in zip(edge.max(0), size_px, strict=True))
-    matrix = matrix + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
-    return Frame((size_px[0] + left + right, size_px[1] + top + bottom), matrix, left, top, right, bottom)
-
-
-def distorted(pictures: Tensor, camera: Camera, size_px: tuple[int, int]) -> Tensor:
-    """N×C×H×W pictures of `size_px` as the lens makes them, from pinhole pictures of `pinhole_frame(...).size_px`.
-
-    Differentiable; linear light should come in, as it does through a lens.
-    """
-    import torch
-
-    if not camera.bends:
-        return pictures
-    # pyright cannot know that frozen models have a hash
-    grid = torch.as_tensor(_sampling_grid(camera, size_px)).to(pictures)  # pyright: ignore[reportArgumentType]
-    return torch.nn.functional.grid_sample(
-        pictures, grid.expand(len(pictures), -1, -1, -1), mode="bilinear", padding_mode="border", align_corners=False
-    )
-
-
 @lru_cache(maxsize=4)
 def _sampling_grid(camera: Camera, size_px: tuple[int, int]) -> np.ndarray:
     """1×H×W×2 in [-1, 1] across the pinhole picture, whose borders are at ±1."""
     width, height = size_px
-    frame = pinhole_frame(camera, size_px)
+    frame = camera.pinhole_frame(size_px)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x.ravel(), y.ravel()], 1)
-    source = undistort_points(pixels, camera, size_px) + np.array([frame.left, frame.top])
+    source = camera.undistort_points(pixels, size_px) + np.array([frame.left, frame.top])
     return (2 * source / frame.size_px - 1).reshape(1, height, width, 2)
 
 
@@ -227,7 +217,7 @@ def _refuse_folded(camera: Camera, where: str) -> None:
     twice.
     """
     x, y = np.meshgrid(*(np.linspace(0.5, side - 0.5, 65) for side in camera.image_px))
-    points = _to_unit(matrix_px(camera, camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
+    points = _to_unit(camera.matrix_px(camera.image_px), np.stack([x.ravel(), y.ravel()], 1))
     with np.errstate(over="ignore", invalid="ignore"):
         missed_px = np.abs((_bent(camera, _straight(camera, points)) - points) * [camera.fx, camera.fy]).max()
     if not missed_px < _CLOSED_PX:  # nor where it is not a number

@@ -7,12 +7,16 @@ differ between channels, and pictures that a phone tone-maps from place to place
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
-from patchproof.channel.lens import Camera
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
 
 
 def light_of_codes(codes: np.ndarray, camera: Camera | None) -> np.ndarray:

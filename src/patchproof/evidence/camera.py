@@ -9,14 +9,17 @@ upright by turning the camera fits the file turned by 90° clockwise, as most ph
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from patchproof.channel import lens
 from patchproof.photo.detect import strips
 from patchproof.photo.exif import EXIF_SPREAD
 from patchproof.photo.read import Photo
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
 
 FOCAL_ERROR = 0.005  # relative, 95 %, of a camera file
 
@@ -34,27 +37,27 @@ class View:
     cropped: bool = False
 
 
-def view_of(photo: Photo, camera: lens.Camera | None) -> View:
+def view_of(photo: Photo, camera: Camera | None) -> View:
     """The photograph as the camera file has it; as EXIF has it where there is none, or it is another camera's."""
     height, width = photo.srgb.shape[:2]
     if camera is not None and width != height:
         for held in (camera, _turned(camera)):
-            if abs(width * held.image_px[1] / (height * held.image_px[0]) - 1) <= lens.ASPECT_TOLERANCE:
-                matrix = lens.matrix_px(held, (width, height))
+            if held.fits((width, height)):
+                matrix = held.matrix_px((width, height))
                 return View(_straightened(photo.srgb, held, matrix), matrix, True, FOCAL_ERROR / 1.96)
     focal = photo.focal_px
     matrix = None if focal is None else np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return View(photo.srgb, matrix, False, photo.focal_spread, photo.cropped)
 
 
-def _turned(camera: lens.Camera) -> lens.Camera:
+def _turned(camera: Camera) -> Camera:
     """The same camera whose pictures are turned by 90° clockwise: (x, y) becomes (height - y, x)."""
     (width, height), cx, cy = camera.image_px, camera.cx, camera.cy
     turned = camera.changed(image_px=(height, width), fx=camera.fy, fy=camera.fx, cx=height - cy, cy=cx)
     return turned.changed(p1=camera.p2, p2=-camera.p1)
 
 
-def _straightened(srgb: np.ndarray, camera: lens.Camera, matrix: np.ndarray) -> np.ndarray:
+def _straightened(srgb: np.ndarray, camera: Camera, matrix: np.ndarray) -> np.ndarray:
     """The picture through a pinhole of the same matrix."""
     if not camera.bends:
         return srgb

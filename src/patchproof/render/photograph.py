@@ -22,7 +22,6 @@ from patchproof.channel.camera import (
     noisy,
     reach_px,
 )
-from patchproof.channel.lens import distorted
 from patchproof.channel.printer import vary
 from patchproof.render.pixels import ObjectTextures, PiecePicture, Shown
 from patchproof.render.stage import Stage
@@ -78,7 +77,7 @@ def expose(views: Views, shown: Shown, jpeg: bool = True) -> Tensor:
     if bends or own or isinstance(shown, ObjectTextures) or not alone:
         light = shade(views, shown)
         if camera is not None:
-            light = distorted(light, camera, views.size_px)
+            light = camera.distorted(light, views.size_px)
         return develop(light, sensor, scale, jpeg, camera)
     image = views.bare_exposed
     if shown is not None:

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 
-from patchproof.channel.lens import Camera
 from patchproof.channel.printer import load_printer
 from patchproof.render.designs import LearnedTextures, PrintedPiece
 from patchproof.render.surfaces import ObjectSurface, PieceSurface, object_surface, piece_surface
 from patchproof.scene.interface import Scene, needs_piece
 from patchproof.scene.mesh_scene import needs_mesh
+
+if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
 
 
 @dataclass(frozen=True)

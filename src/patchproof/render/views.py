@@ -24,7 +24,7 @@ from torch import Tensor
 from patchproof.base.color import LIGHT_OF_CODE
 from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encoded, encoded_by_table, gains
-from patchproof.channel.lens import Frame, pinhole_frame
+from patchproof.channel.cameras import Frame
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines
@@ -268,7 +268,7 @@ def lens_frame(stage: Stage, scene: MeshScene, size_px: tuple[int, int]) -> Fram
     """The frame to render for pictures of `size_px`, with what a calibrated lens will bring into them."""
     if stage.camera is None:
         return Frame(size_px, scene.matrix_px(size_px), 0, 0, 0, 0)
-    return pinhole_frame(stage.camera, size_px)
+    return stage.camera.pinhole_frame(size_px)
 
 
 def backgrounds(scene: MeshScene, conditions: Conditions, size_px: tuple[int, int], frame: Frame) -> np.ndarray:

@@ -27,7 +27,7 @@ from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
 from patchproof.base.strict import Refused
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Print
-from patchproof.channel.lens import Frame, distorted
+from patchproof.channel.cameras import Frame
 from patchproof.channel.printer import vary
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
@@ -71,7 +71,7 @@ def photograph_traced(
     """1×3×H×W sRGB: the photograph of one view, without JPEG; `piece=None` is the bare object."""
     light = traced_light(stage, piece, conditions, draw_optics(conditions) if optics is None else optics)
     if stage.camera is not None:
-        light = distorted(light, stage.camera, stage.scene.settings.camera.photo_px)
+        light = stage.camera.distorted(light, stage.scene.settings.camera.photo_px)
     return develop(light, conditions.sensor, 1.0, jpeg=False, camera=stage.camera)
 
 

@@ -20,12 +20,12 @@ from patchproof.base.geometry import apply_homography, local_scales
 from patchproof.base.settings import SceneSettings, identifying
 from patchproof.base.strict import Refused
 from patchproof.channel.effects import Effect
-from patchproof.channel.lens import Camera
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.scene.resolution import design_grid
 from patchproof.sheets.piece import Piece, sheet_id
 
 if TYPE_CHECKING:
+    from patchproof.channel.lens import Camera
     from patchproof.scene.texture import Canvas
 
 SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at

@@ -17,8 +17,8 @@ import numpy as np
 from patchproof.base import geometry
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, expand
-from patchproof.channel import lens
 from patchproof.channel.boxes import box_of, outermost
+from patchproof.channel.cameras import camera_of
 from patchproof.channel.effects import Pose
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh
@@ -113,7 +113,7 @@ class MeshScene(Scene):
     def matrix_px(self, size_px: tuple[int, int]) -> np.ndarray:
         """3×3 pinhole matrix of the scene's camera for a picture of this size."""
         if self.camera is not None:
-            return lens.matrix_px(self.camera, size_px)
+            return self.camera.matrix_px(size_px)
         return geometry.intrinsics(self.settings.view.fov_deg, size_px)
 
     def pictures(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
@@ -175,7 +175,7 @@ def load_bare(source: SceneSource) -> MeshScene:
         backgrounds,
         notes=(*mesh.warnings, *backgrounds.notes),
         known=known,
-        camera=None if camera.file is None else lens.load_camera(camera.file, base, camera.photo_px),
+        camera=camera_of(camera.file, base, camera.photo_px),
         given_glb=given_glb,
     )
 

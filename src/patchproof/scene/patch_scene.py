@@ -13,7 +13,6 @@ import numpy as np
 
 from patchproof.base import geometry
 from patchproof.base.strict import Refused, Side
-from patchproof.channel import lens
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.fitting import advice
 from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSource, refuse_without_place
@@ -91,7 +90,7 @@ class PatchScene(PieceScene, MeshScene):
         """As in `PieceScene.piece_px`."""
         pose, world = self.camera_from_print(conditions)[0], self.placement.world(piece_mm)
         points = geometry.project(self.matrix_px(self.photo_px), pose, world)
-        return points if self.camera is None else lens.distort_points(points, self.camera, self.photo_px)
+        return points if self.camera is None else self.camera.distort_points(points, self.photo_px)
 
     def paper(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As in `PieceScene.paper`."""
