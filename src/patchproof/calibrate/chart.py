@@ -26,8 +26,9 @@ from patchproof.base.input import is_file, is_folder
 from patchproof.base.strict import Refused
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
+from patchproof.calibrate.printer_files import printer_from_table
 from patchproof.channel.lens import Camera
-from patchproof.channel.printer import Printer, load_printer, node_colors, printer_from_table, vary
+from patchproof.channel.printer import Printer, load_printer, node_colors, vary
 from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.limits import limited
 from patchproof.photo.read import pictures_in, read_photo

@@ -22,7 +22,8 @@ import torch
 from patchproof.base.color import ciede2000, codes_of, lab_from_srgb
 from patchproof.base.input import is_file
 from patchproof.base.strict import Refused
-from patchproof.channel.printer import NODES_8BIT, Printer, node_colors, printer_from_table
+from patchproof.calibrate.printer_files import printer_from_table
+from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
 
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
 _D50 = np.array([0.9642, 1.0, 0.8249])  # the profile connection space's white, ICC.1

@@ -13,8 +13,9 @@ from patchproof.base.output import check_file, write_together
 from patchproof.base.strict import Refused
 from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
+from patchproof.calibrate.printer_files import save_printer
 from patchproof.channel.lens import load_camera
-from patchproof.channel.printer import Printer, save_printer
+from patchproof.channel.printer import Printer
 from patchproof.sheets.manifest import load_manifest
 
 

@@ -10,7 +10,6 @@ Left out on purpose: halftone dots (below what a camera resolves beyond 0.2 mm p
 
 from __future__ import annotations
 
-import json
 import math
 import zipfile
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from patchproof.base.color import clamped, lab_from_srgb
+from patchproof.base.color import clamped
 from patchproof.base.input import is_file, read_json
 from patchproof.base.strict import Finite, Refused, Strict, nearest, shipped, validated
 
@@ -41,7 +40,9 @@ class Paper(Strict):
     black_L: Finite | None = None  # L* of printed sRGB black, paper white at 100
 
 
-class _Head(Strict):
+class PrinterHead(Strict):
+    """NAME.json of a printer, without its tables."""
+
     name: str
     method: Method
     paper: Paper = Paper()
@@ -89,16 +90,6 @@ def identity_printer() -> Printer:
     return Printer("identity", "assumed", lut, torch.zeros(lut.shape[:3]), Paper(black_L=0.0), note)
 
 
-def printer_from_table(
-    name: str, method: Method, lut: np.ndarray, gamut: np.ndarray, white_lab, provenance: dict[str, Any]
-) -> Printer:
-    """A printer from arrays 33×33×33×3 (clipped to [0, 1], see the module's head) and 33×33×33; black is read off."""
-    lut = np.clip(np.asarray(lut, np.float64), 0, 1)
-    paper = Paper(white_lab=white_lab, black_L=round(float(lab_from_srgb(lut[0, 0, 0])[0]), 2))
-    distances = torch.tensor(np.asarray(gamut, np.float64), dtype=torch.float32)
-    return Printer(name, method, torch.tensor(lut, dtype=torch.float32), distances, paper, provenance)
-
-
 def vary(seen_linear: Tensor, change: Tensor) -> Tensor:
     """Light `... × 3` of colors as seen, as of another print of the same file; channels last, unlike an image.
 
@@ -128,25 +119,12 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
     return _read(shipped("calibration", "printers", f"{name_or_file}.npz"))
 
 
-def save_printer(printer: Printer, folder: Path) -> Path:
-    """Write NAME.npz and NAME.json into `folder`; the same printer gives the same bytes. Returns the .npz path."""
-    lut = printer.lut.double().numpy()
-    in_8_bits = np.abs(lut * 255 - np.round(lut * 255)).max() < 1e-4  # tables from an 8-bit engine lose nothing
-    levels, kind = (255, np.uint8) if in_8_bits else (65535, np.uint16)
-    gamut = np.round(printer.gamut.double().numpy() * GAMUT_STEPS).clip(0, 255).astype(np.uint8)
-    path = folder / f"{printer.name}.npz"
-    np.savez_compressed(path, lut=np.round(lut * levels).astype(kind), gamut=gamut)
-    head = _Head(name=printer.name, method=printer.method, paper=printer.paper, provenance=printer.provenance)
-    path.with_suffix(".json").write_text(json.dumps(head.model_dump(), indent=1, ensure_ascii=False) + "\n", "utf-8")
-    return path
-
-
 def _read(path: Path) -> Printer:
     tables, text, expected = path.with_suffix(".npz"), path.with_suffix(".json"), "a printer as NAME.npz with NAME.json"
     for file in (tables, text):
         if not is_file(file):
             raise Refused(f"{expected} beside it", f"no file at {file}", "check the path")
-    head = validated(_Head, read_json(text, expected, "calibrate again"), str(text))
+    head = validated(PrinterHead, read_json(text, expected, "calibrate again"), str(text))
     try:
         with zipfile.ZipFile(tables) as archive:
             lut = _array(archive, "lut", (SIZE, SIZE, SIZE, 3), (np.uint8, np.uint16))
