@@ -1,6 +1,4 @@
-"""The whole journey on the built-in classifier, small: optimize → sheet → reprint → verify, by the commands a user
-types.
-"""
+"""The whole journey on the built-in classifier, small: the demo, and what its commands say and load."""
 
 from __future__ import annotations
 
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import SCENE
 from console import command
+from loaded import loaded_by
 
 from patchproof.base import geometry
 from patchproof.base.strict import shipped
@@ -23,20 +22,23 @@ PHOTOS = 8
 
 
 @pytest.fixture(scope="module")
-def journey(tmp_path_factory):
-    """A folder with scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
-    folder = tmp_path_factory.mktemp("journey")
-    scene = SCENE.replace("[800, 600]", "[1200, 900]").replace("steps = 3", "steps = 10")
-    (folder / "scene.toml").write_text(scene, encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:  # a tenth of the promise's views: what they cost is time
-        patch.setattr(run_module, "PROMISE_VIEWS", 40)
-        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
-        assert command("optimize", folder / "scene.toml", "--out", folder / "run") == 0
-    assert command("sheet", folder / "run", "--out", folder / "sheet.pdf", "--check") == 0
-    pdf, run, photos = folder / "sheet.pdf", folder / "run", folder / "photos"
-    assert command("reprint", pdf, "--run", run, "--n", PHOTOS, "--out", photos, "--jobs", 1) == 0
-    assert command("verify", photos, "--sheet", folder / "sheet.json", "--out", folder / "report") == 0
-    return folder
+def demo(tmp_path_factory):
+    """A folder as the demo leaves it, of a smaller scene, and what was loaded to make it."""
+    folder = tmp_path_factory.mktemp("journey") / "demo"
+    constants = {
+        "patchproof.app.demo.SCENE": SCENE.replace("[800, 600]", "[1200, 900]").replace("steps = 3", "steps = 10"),
+        "patchproof.app.demo.PHOTOS": PHOTOS,
+        "patchproof.app.demo.SESSIONS": 1,
+        "patchproof.optimizer.run.PROMISE_VIEWS": 40,  # a tenth: what they cost is time
+        "patchproof.optimizer.loop.SELECT_VIEWS": 8,
+    }
+    return folder, loaded_by(("demo", "--out", folder, "--jobs", 1), constants=constants)
+
+
+@pytest.fixture(scope="module")
+def journey(demo):
+    """That folder: scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
+    return demo[0]
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,32 @@ def test_every_file_of_the_contract_is_there(journey):
     assert attached_manifest(journey / "sheet.pdf") == manifest
     assert str(journey) not in (journey / "sheet.json").read_text()
     assert str(journey).encode() not in (journey / "sheet.pdf").read_bytes()
+
+
+def test_a_flat_card_on_a_mesh_loads_no_other_kind_of_scene(demo):
+    _, loaded = demo
+    others = {"bend", "bent_scene", "texture", "texture_scene", "open_scene", "places", "photo_scene", "image_scene"}
+    assert not {f"patchproof.scene.{name}" for name in others} & loaded.names and "trimesh" not in loaded.names
+    assert loaded.lines <= 20_500
+
+
+def test_verify_without_a_run_loads_nothing_of_optimizer_scene_and_mesh(journey, tmp_path):
+    photo, sheet = journey / "photos" / "photo_0001.jpg", journey / "sheet.json"
+    loaded = loaded_by(("verify", photo, "--sheet", sheet, "--out", tmp_path / "report"))
+    assert not loaded.rooms & {"optimizer", "scene", "mesh", "render", "reprints", "calibrate"}
+    assert loaded.lines <= 15_000
+
+
+def test_a_page_without_a_design_needs_no_run(tmp_path):
+    loaded = loaded_by(("sheet", "--template", "chart_a4", "--out", tmp_path / "chart.pdf"))
+    assert not loaded.names & {"torch", "trimesh", "scipy.stats"} and loaded.rooms == {"app", "base", "sheets"}
+    assert loaded.lines <= 7_000
+
+
+def test_a_page_says_what_a_print_shop_needs_to_know(journey, tmp_path, capsys):
+    assert command("sheet", journey / "run", "--out", tmp_path / "again.pdf", "--check") == 0
+    assert "Cut the piece of" in capsys.readouterr().out
+    assert (tmp_path / "again.pdf").read_bytes() == (journey / "sheet.pdf").read_bytes()
 
 
 def test_photographs_are_judged_and_measured(report):

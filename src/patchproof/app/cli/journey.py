@@ -65,8 +65,6 @@ def optimize(
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.base.settings import behind
-    from patchproof.optimizer.place_files import read_place
-    from patchproof.optimizer.places import place_lines
     from patchproof.optimizer.run import DRAFT, THOROUGH, optimize_scene
     from patchproof.report.summary import promise_lines
     from patchproof.scene.scene import load_scene
@@ -91,12 +89,22 @@ def optimize(
             on_step=lambda step, total: bar("optimize", step.state.number, total),
             on_promise=lambda done, total: bar("promise", done, total),
         )
-    place = read_place(out)
     background = behind(run.scene.settings.model_dump())
-    say(*promise_lines(run.promise, background), *([] if place is None else place_lines(place)), f"run: {out}")
+    say(*promise_lines(run.promise, background), *_place_lines(out), f"run: {out}")
     if run.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {out} --out sheet.pdf")
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
+
+
+def _place_lines(run: Path) -> list[str]:
+    """The place that a search chose for a run's piece, if one did."""
+    if not (run / "place.json").is_file():
+        return []
+    from patchproof.optimizer.place_files import read_place
+    from patchproof.optimizer.places import place_lines
+
+    place = read_place(run)
+    return [] if place is None else place_lines(place)
 
 
 def promise(
