@@ -2,28 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
-
-
-@dataclass(frozen=True)
-class Frame:
-    """The pinhole picture to render before the lens bends it: its size and matrix, and how far it reaches out of the
-    picture on each side.
-    """
-
-    size_px: tuple[int, int]
-    matrix_px: np.ndarray
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 def camera_of(
