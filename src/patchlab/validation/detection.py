@@ -24,6 +24,7 @@ from pydantic import Field
 from patchlab.study.claims import clustered_median
 from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.hung import hang_piece
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
@@ -37,7 +38,7 @@ from patchproof.photo.read import Photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.report.tables import Table
-from patchproof.reprints.hung_sheet import HungSheet, hang_piece, jpeg_of
+from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.patch_scene import PatchScene, needs_patch
 from patchproof.scene.scene import load_scene

@@ -31,6 +31,7 @@ from patchlab.study.grid import (
 )
 from patchlab.study.record import Record, corner_error_mm, gain_of, hardest, recorded
 from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.hung import hang_piece
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.output import image_pixels
@@ -46,7 +47,6 @@ from patchproof.optimizer.promise import CONTROLS, shown_with_controls
 from patchproof.optimizer.responses import responses
 from patchproof.photo.read import Photo
 from patchproof.report.tables import Drawing, Table, Value
-from patchproof.reprints.hung_sheet import hang_piece
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.patch_scene import PatchScene, needs_patch
 from patchproof.sheets.content import PrintedPiece

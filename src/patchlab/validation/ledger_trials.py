@@ -23,7 +23,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from patchlab.bench.inkjets import draw_inkjet
 from patchlab.study.study import Cell, Result, Study
+from patchlab.validation.hung import hang_own
 from patchproof.base.claims import rate
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.output import image_pixels
@@ -40,8 +42,7 @@ from patchproof.optimizer.run import load_run
 from patchproof.render.photograph import expose
 from patchproof.render.views import Views, see
 from patchproof.report.tables import Table
-from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
-from patchproof.reprints.inkjets import draw_inkjet
+from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import PieceScene
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,15 +30,11 @@ from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.report.coco import PATCH
-from patchproof.reprints.run_sheet import sheet_of
 from patchproof.scene.conditions import Conditions, fields_of
 from patchproof.scene.interface import PieceScene, Scene, needs_piece
 from patchproof.scene.patch_scene import PatchScene
-from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import attached_manifest, piece_pixels
-from patchproof.sheets.template import load_template
-from patchproof.sheets.write import write_sheet
 
 # The print is rasterized this much finer than the closest view can see. Rasterizers of pages average code values: fine
 # patterns of strong colors came out 2 to 5 % too dark at 1.25, within 1 % at 2.5 and at 5.
@@ -151,25 +146,6 @@ def hang(pdf_path: str | Path, run: Run, how: Hanging = AS_MADE) -> HungSheet:
     manifest, scene = sheet_scene(pdf_path, run)
     sent, stage = sent_pixels(pdf_path, manifest, scene), set_stage(needs_piece(scene).printed_at(how.print_scale))
     return HungSheet(stage, manifest, sent, how.printer_for(scene), how)
-
-
-def hang_own(run: Run, control: str | None = None) -> HungSheet:
-    """The sheet that the run makes, or that of a printed control (as `sheet_of` has them)."""
-    return _printed_and_hung(set_stage(run.scene), lambda pdf: sheet_of(run, pdf, control=control))
-
-
-def hang_piece(stage: Stage, content: PrintedPiece) -> HungSheet:
-    """A sheet of the stage's scene with any content in its piece."""
-    template = load_template(stage.scene.settings.sheet.template)
-    return _printed_and_hung(stage, lambda pdf: write_sheet(pdf, template, content))
-
-
-def _printed_and_hung(stage: Stage, write: Callable[[Path], Manifest]) -> HungSheet:
-    with TemporaryDirectory() as folder:
-        pdf = Path(folder) / "sheet.pdf"
-        manifest = write(pdf)
-        sent = sent_pixels(pdf, manifest, stage.scene)
-    return HungSheet(stage, manifest, sent, AS_MADE.printer_for(stage.scene))
 
 
 def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:

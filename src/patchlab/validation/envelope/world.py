@@ -23,6 +23,7 @@ from patchlab.study.record import corner_error_mm
 from patchlab.validation.envelope.axes import GEOMETRY, Point, conditions_at, placed_at
 from patchlab.validation.envelope.gains import CONTROLS
 from patchlab.validation.envelope.window import Frame, on_plain_ground, window
+from patchlab.validation.hung import hang_own
 from patchproof.base import geometry
 from patchproof.base.output import image_pixels
 from patchproof.channel.printer import Printer, load_printer
@@ -38,7 +39,7 @@ from patchproof.render.photograph import expose
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import Views, relit, see
-from patchproof.reprints.hung_sheet import HungSheet, hang_own, jpeg_of
+from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Scene, needs_piece
 from patchproof.scene.mesh_scene import needs_mesh
