@@ -14,6 +14,8 @@ import typer
 from PIL import Image, ImageCms
 
 from patchlab.bench import printer as bench_printer
+from patchlab.bench.chart_page import chart_manifest, printed_page
+from patchlab.bench.inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.strict import Refused
@@ -39,8 +41,7 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import Photo, read_photo
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
-from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
-from patchproof.reprints.page_photos import chart_manifest, photograph_page, printed_page
+from patchproof.reprints.page_photos import photograph_page
 from patchproof.scene.conditions import with_values
 from patchproof.scene.scene import make_scene
 from patchproof.sheets.chart import chart_colors

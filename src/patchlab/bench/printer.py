@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchlab.bench.chart import Chart, Check, OnStage, Point
+from patchlab.bench.chart_page import chart_manifest, printed_page
+from patchlab.bench.inkjets import DRIVERS, draw_inkjet
 from patchlab.study.claims import mean, median
 from patchproof.base.claims import rate, student_mean
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
@@ -23,8 +25,7 @@ from patchproof.calibrate.chart import known_printers
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.color_ladder import Map, choose, difference, distinct, kinds_of_maps
 from patchproof.report.tables import Table
-from patchproof.reprints.inkjets import DRIVERS, draw_inkjet
-from patchproof.reprints.page_photos import Shot, Shows, chart_manifest, photograph_page, printed_page
+from patchproof.reprints.page_photos import Shot, Shows, photograph_page
 
 SWATCHES = (6, 48, 96)
 TARGETS = {48: 2.5, 96: 1.8}

@@ -6,7 +6,8 @@ out, files that are missing or named twice are refused.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import csv
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,14 @@ def labeled_files(folder: Path, table: Path) -> list[tuple[str, str, str]]:
         (file, (stem if stems.count(stem) == 1 else file) + ".png", label)
         for (file, label), stem in zip(rows, stems, strict=True)
     ]
+
+
+def write_labels(rows: Sequence[tuple[str, str | int]], folder: Path) -> Path:
+    """Write `labels.csv` of (file, label) into a folder."""
+    path = folder / "labels.csv"
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([("file", "label"), *rows])
+    return path
 
 
 def in_blocks(folder: Path, rows) -> Iterator[list]:

@@ -8,7 +8,6 @@ white is clipped. Views that anything is measured on in 3D are never among them.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Annotated
 import torch
 from pydantic import Field, model_validator
 
+from patchlab.harden.labeled import write_labels
 from patchlab.study.grid import Values, scene_of
 from patchproof.base.color import srgb_from_linear
 from patchproof.base.settings import (
@@ -149,11 +149,3 @@ def write_renders(stage: Stage, n: int, side_px: int, folder: Path) -> list[str]
             names.append(f"{stage.scene.sheet_id}_{len(names):04d}.png")
             (folder / names[-1]).write_bytes(png(as_pixels(picture)))
     return names
-
-
-def write_labels(rows: list[tuple[str, str | int]], folder: Path) -> Path:
-    """Write `labels.csv` of (file name, label) into `folder`."""
-    path = folder / "labels.csv"
-    with path.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([("file", "label"), *rows])
-    return path

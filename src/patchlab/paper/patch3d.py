@@ -25,7 +25,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from patchlab.paper.image_classes import write_labels, write_renders
+from patchlab.harden.labeled import write_labels
+from patchlab.paper.image_classes import write_renders
 from patchlab.study.claims import clustered
 from patchlab.study.figures import picture_sheet
 from patchlab.study.grid import Count, GridSettings, Seeds, by_scene, grid_cells, grouped, of_values, problem_of, who

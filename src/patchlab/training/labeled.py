@@ -8,7 +8,6 @@ seeds that none of them has seen. Of a scene, the bare object is seen in its vie
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from patchlab.harden.labeled import write_labels
 from patchlab.training.card import class_names
 from patchlab.training.pictures import HELD_OUT, dressed, views_of
 from patchproof.base.color import codes_of
@@ -73,8 +73,7 @@ def write_labeled(out: Path, renders: Iterator[tuple[str, Tensor]]) -> int:
     for number, (label, picture) in enumerate(renders):
         rows.append((f"{number:05d}.png", label))
         Image.fromarray(picture.permute(1, 2, 0).numpy()).save(out / rows[-1][0])
-    with (out / "labels.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([("file", "label"), *rows])
+    write_labels(rows, out)
     return len(rows)
 
 

@@ -26,7 +26,8 @@ from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene import patterns
 from patchproof.scene.backgrounds import Backgrounds
-from patchproof.scene.mesh_scene import bare_scene
+from patchproof.scene.mesh_scene import MeshScene
+from patchproof.scene.placement import view_frame
 
 LENGTH_MM = 300.0
 VIEWS_PER_SHAPE = 10
@@ -85,7 +86,9 @@ def views_of(mesh: Mesh, count: int, rng: np.random.Generator, size_px: int) -> 
     scale = LENGTH_MM / np.ptp(mesh.vertices, axis=0).max()
     mesh = dataclasses.replace(mesh, vertices=mesh.vertices * scale)
     behind = Backgrounds(tuple(patterns.background(rng) for _ in range(count)))
-    scene = bare_scene(_settings(rng, 2 * size_px), mesh, behind)
+    settings = _settings(rng, 2 * size_px)
+    frame, seed = view_frame(mesh, settings), settings.optimize.seed
+    scene = MeshScene(settings, Path(), seed, "", mesh, frame, behind, notes=mesh.warnings)
     stage, conditions = set_stage(scene), scene.draw("evaluate", count, int(rng.integers(1 << 30)))
     half = count // 2
     seen = [center_square(photograph(stage, None, conditions[half:], (2 * size_px, 2 * size_px)), size_px)]

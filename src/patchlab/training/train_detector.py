@@ -11,7 +11,7 @@ one (Li et al., Generalized focal loss, NeurIPS 2020), their boxes follow the ge
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -26,7 +26,7 @@ from patchlab.training.pictures import Pictures, augmented
 from patchproof.classifier.builtin import folded
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
 from patchproof.classifier.detector import iou
-from patchproof.classifier.precision import Finding, average_precision, best_score, findings
+from patchproof.classifier.precision import Finding, average_precision, findings
 from patchproof.mesh import primitives
 
 
@@ -148,6 +148,17 @@ def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Picture
     }
     write_card(out / "builtin_detector.json", figures, "train_detector", recipe, seconds)
     print(f"held-out AP50 {figures['held_out_ap50']:.3f}: {figures['held_out_ap50_by_class']}")
+
+
+def best_score(found: Iterable[Finding], objects: int) -> float:
+    """The score, in twentieths, from which on findings have the highest F1, of so many objects."""
+
+    def f1(score: float) -> float:
+        right = [finding.right for finding in known if 1 / (1 + np.exp(-finding.logit)) >= score]
+        return 2 * sum(right) / (len(right) + objects)
+
+    known = list(found)
+    return max((i / 20 for i in range(1, 20)), key=f1)
 
 
 def main() -> None:

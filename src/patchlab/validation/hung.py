@@ -1,4 +1,4 @@
-"""Sheets printed and hung up at once, without a file that anybody keeps."""
+"""Sheets that are made only to be hung up and photographed: their PDF is thrown away."""
 
 from __future__ import annotations
 

@@ -23,6 +23,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from patchlab.bench.inkjets import draw_inkjet
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.hung import hang_own
 from patchproof.base.claims import rate
@@ -42,7 +43,6 @@ from patchproof.render.photograph import expose
 from patchproof.render.views import Views, see
 from patchproof.report.tables import Table
 from patchproof.reprints.hung_sheet import HungSheet, jpeg_of
-from patchproof.reprints.inkjets import draw_inkjet
 from patchproof.scene.conditions import Conditions, with_values
 from patchproof.scene.interface import PieceScene
 

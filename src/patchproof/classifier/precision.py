@@ -50,17 +50,6 @@ def average_precision(found: Iterable[Finding], objects: int) -> float:
     return float((best * hits).sum() / objects)
 
 
-def best_score(found: Iterable[Finding], objects: int) -> float:
-    """The score, in twentieths, from which on findings have the highest F1, of so many objects."""
-
-    def f1(score: float) -> float:
-        right = [finding.right for finding in known if 1 / (1 + np.exp(-finding.logit)) >= score]
-        return 2 * sum(right) / (len(right) + objects)
-
-    known = list(found)
-    return max((i / 20 for i in range(1, 20)), key=f1)
-
-
 def unsuppressed(boxes: Tensor, logits: Tensor) -> Tensor:
     """Indices of the candidates A×4 of one label that remain, the surest first."""
     left = torch.nonzero(logits > LEAST_LOGIT)[:, 0]

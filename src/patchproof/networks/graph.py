@@ -9,14 +9,15 @@ input are refused.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from patchproof.networks.bounds import MAX_DIMENSIONS, quoted
+from patchproof.networks.made import MadeTensors
 from patchproof.networks.rewritten import rewritten
 from patchproof.networks.steps import Here, Step, Value
 
@@ -62,7 +63,7 @@ class Program(torch.nn.Module):
         with torch.inference_mode(False), torch.no_grad():
             weights = [weight.to("meta") for weight in self.buffers()]
             photos = torch.empty(shape, device="meta")
-            with _Watched(MAX_VALUE * len(photos)):
+            with MadeTensors(partial(_refuse_absurd, MAX_VALUE * len(photos)), _WEIGHED):
                 compute(self.steps[:count], dict(enumerate([*weights, photos])), photos)
         self.weighed.add((shape, count))
 
@@ -131,25 +132,10 @@ def _filled(argument: Any, values: dict[int, Any], photos: Tensor) -> Any:
     return photos.device if argument is Here else argument
 
 
-class _Watched(TorchDispatchMode):
-    """Refuses tensors of absurd sizes, also those that an operator makes on its way (einsum, paddings)."""
-
-    def __init__(self, limit: int):
-        super().__init__()
-        self.limit = limit
-
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        """Nothing here is compiled; to be told so, torch would import its compiler."""
-        return False
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        compute: Any = _WEIGHED.get(func, func)
-        results = compute(*args, **(kwargs or {}))
-        for value in results if isinstance(results, (list, tuple)) else [results]:
-            if isinstance(value, Tensor) and (value.numel() > self.limit or value.dim() > MAX_DIMENSIONS):
-                raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(value.shape))}")
-        return results
+def _refuse_absurd(limit: int, tensor: Tensor) -> None:
+    """Also what an operator makes on its way (einsum, paddings)."""
+    if tensor.numel() > limit or tensor.dim() > MAX_DIMENSIONS:
+        raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(tensor.shape))}")
 
 
 def _check_split(arguments: list[Any]) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+
+from patchproof.networks.made import MadeTensors
 
 # What rectangles save, in numbers that are made, is about LARGEST less their share of the picture, times all those of
 # the first steps, less FIXED: with windows of 0.2 to 0.6 of the side, MobileNetV2 saves nothing any more from a share
@@ -39,23 +40,7 @@ def numbers_saved(made: float, share: float, answers_alone: bool = False) -> flo
 
 def worth_cutting(network: Callable[[Tensor], Tensor], pictures: Tensor) -> bool:
     """Whether windows could save anything of a network, by all that it makes of such pictures N×3×S×S."""
-    with torch.no_grad(), _Counted() as counted:
+    numbers: list[int] = []
+    with torch.no_grad(), MadeTensors(lambda tensor: numbers.append(tensor.numel())):
         network(pictures)
-    return numbers_saved(counted.made / len(pictures), 0.0) > 0
-
-
-class _Counted(TorchDispatchMode):
-    """Counts the numbers that are made."""
-
-    made = 0
-
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        """Nothing here is compiled; to be told so, torch would import its compiler."""
-        return False
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        results = func(*args, **(kwargs or {}))
-        for value in results if isinstance(results, (list, tuple)) else [results]:
-            self.made += value.numel() if isinstance(value, Tensor) else 0
-        return results
+    return numbers_saved(sum(numbers) / len(pictures), 0.0) > 0

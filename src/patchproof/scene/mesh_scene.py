@@ -9,13 +9,11 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from patchproof.base import geometry
-from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, expand
 from patchproof.channel.boxes import box_of, outermost
 from patchproof.channel.cameras import camera_of
@@ -178,12 +176,6 @@ def load_bare(source: SceneSource) -> MeshScene:
         camera=camera_of(camera.file, base, camera.photo_px),
         given_glb=given_glb,
     )
-
-
-def bare_scene(settings: SceneSettings, mesh: Mesh, backgrounds: Backgrounds) -> MeshScene:
-    """An object with no piece on it, to be photographed as it is."""
-    frame, seed = view_frame(mesh, settings), settings.optimize.seed
-    return MeshScene(settings, Path(), seed, "", mesh, frame, backgrounds, notes=mesh.warnings)
 
 
 def camera_poses(scene: MeshScene, patch_mm: np.ndarray, pose: Pose) -> np.ndarray:

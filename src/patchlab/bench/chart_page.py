@@ -1,0 +1,69 @@
+"""A small page with a color chart, to be photographed without a template or a PDF: many printers have theirs.
+
+In: how many swatches, and what a printer shows of colors. Out: the page's manifest, and the page as light.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from patchproof.base.color import codes_of
+from patchproof.reprints.page_photos import PX_PER_MM, Shows, page_light
+from patchproof.sheets.chart import chart_colors
+from patchproof.sheets.manifest import Manifest
+from patchproof.sheets.markers import DICTIONARY, cells_of
+from patchproof.sheets.piece import hash_order, marker_at, printed
+
+PAGE_MM = (210.0, 148.0)
+MARKER_MM, _MARKERS_MM = 14.0, ((8.0, 8.0), (188.0, 8.0), (188.0, 126.0), (8.0, 126.0))
+_CHART_MM = (30.0, 34.0, 150.0, 84.0)
+_GAP_MM = 0.4
+
+
+def chart_manifest(count: int) -> Manifest:
+    """A small page with `count` swatches in the middle, its colors and their order as those of the printed sheets."""
+    x, y, width, height = _CHART_MM
+    columns = math.ceil(math.sqrt(count * width / height))
+    side = min(width / columns, height / math.ceil(count / columns))
+    cells = [(x + side * (i % columns), y + side * (i // columns)) for i in range(count)]
+    colors, order = chart_colors(count), hash_order(f"photographed {count}", count)
+    swatches = [
+        {"rect_mm": (*cell, side - _GAP_MM, side - _GAP_MM), "srgb": colors[index], "page": 1}
+        for cell, index in zip(cells, order, strict=True)
+    ]
+    markers = [printed(marker_at(7 + i, at, MARKER_MM)) for i, at in enumerate(_MARKERS_MM)]
+    head = {
+        "version": 2,
+        "sheet_id": "CHART00000",
+        "kind": "blank",
+        "page_mm": PAGE_MM,
+        "design": None,
+        "promise": None,
+    }
+    where = {"cut_mm": (100.0, 6.0, 1.0, 1.0), "ruler_mm": (100.0, 100.0), "settings": {}}
+    return Manifest.model_validate(head | where | {"markers": markers, "chart": swatches})
+
+
+def printed_page(manifest: Manifest, shows: Shows) -> np.ndarray:
+    """The page as light H×W×3 at `PX_PER_MM`, with some writing beside the chart, as sheets have."""
+    width, height = (round(side * PX_PER_MM) for side in manifest.page_mm)
+    page = np.full((height, width, 3), 255, np.uint8)
+    for marker, code in zip(manifest.markers, cells_of(DICTIONARY, [m.id for m in manifest.markers]), strict=True):
+        side = round(MARKER_MM * PX_PER_MM)
+        _fill(
+            page, (*marker.corners_mm[0], MARKER_MM, MARKER_MM), 255 * cv2.resize(code, (side, side), interpolation=0)
+        )
+    for line, at in enumerate((14, 20, 26, 124, 131, 138)):
+        where = (30 * PX_PER_MM, at * PX_PER_MM)
+        cv2.putText(page, f"{line} what stands beside a chart is not white paper", where, 0, 0.9, (0, 0, 0), 2)
+    for swatch in manifest.chart:
+        _fill(page, swatch.rect_mm, codes_of(np.array(swatch.srgb)))
+    return page_light(page, shows)
+
+
+def _fill(page: np.ndarray, rect_mm, value: np.ndarray) -> None:
+    x, y, w, h = (round(v * PX_PER_MM) for v in rect_mm)
+    page[y : y + h, x : x + w] = value[..., None] if value.ndim == 2 else value
