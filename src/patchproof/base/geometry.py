@@ -185,6 +185,12 @@ def rect_corners(rect) -> np.ndarray:
     return np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], float)
 
 
+def turned_extent(size, degrees: float) -> np.ndarray:
+    """Width and height of what encloses a turned rectangle."""
+    c, s = abs(np.cos(np.radians(degrees))), abs(np.sin(np.radians(degrees)))
+    return np.array([c * size[0] + s * size[1], s * size[0] + c * size[1]])
+
+
 def rect_border(rect, steps: int) -> np.ndarray:
     """Points N×2 along the border of [x, y, width, height] from its top-left corner, `steps` to a side."""
     corners, shares = rect_corners(rect), np.linspace(0, 1, steps, endpoint=False)[:, None]

@@ -89,9 +89,7 @@ def surface_of(manifest: Manifest) -> Surface:
 
 def _assembled(manifest: Manifest) -> Surface:
     """The piece glued together, in the millimeters of the design's page (the first tile's without a design)."""
-    page = manifest.design.page if manifest.design else manifest.tiles[0].page
-    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
-    to_page = {number: (square[page] @ np.linalg.inv(matrix))[:2] for number, matrix in square.items()}
+    to_page = {tile.page: np.linalg.inv(manifest.page_from_home(tile.page))[:2] for tile in manifest.tiles}
     cuts, corners = {tile.page: tile.cut_mm for tile in manifest.tiles}, _corners_by_page(manifest)
     piece, pages = {}, []
     for number, cut in cuts.items():

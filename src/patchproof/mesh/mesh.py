@@ -149,7 +149,7 @@ def topology_warnings(parts: Sequence[Part]) -> list[str]:
     """Loose triangles, and edges of more than two faces, with vertices at equal places taken as one."""
     loose = crowded = edges = 0
     for part in parts:
-        corners = _places(part.vertices)[part.faces]
+        corners = places_of(part.vertices)[part.faces]
         pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
         count = np.unique(pairs[:, 0] * (len(part.vertices) + 1) + pairs[:, 1], return_counts=True)[1]
         loose += np.count_nonzero(count == 1)
@@ -163,11 +163,10 @@ def topology_warnings(parts: Sequence[Part]) -> list[str]:
     return warnings
 
 
-def _places(vertices: np.ndarray) -> np.ndarray:
-    """A number per vertex, equal for equal positions; hashed, since sorting rows would take longer than loading."""
-    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)
-    with np.errstate(over="ignore"):
-        key = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
-        key = (key ^ (key >> np.uint64(29)) ^ bits[:, 1]) * np.uint64(0xBF58476D1CE4E5B9)
-        key = (key ^ (key >> np.uint64(32)) ^ bits[:, 2]) * np.uint64(0x94D049BB133111EB)
-    return np.unique(key, return_inverse=True)[1]
+def places_of(vertices: np.ndarray) -> np.ndarray:
+    """V: one number for all vertices V×3 at the same place."""
+    order = np.lexsort(vertices.T)
+    new = np.r_[False, (np.diff(vertices[order], axis=0) != 0).any(1)]
+    places = np.empty(len(vertices), np.int64)
+    places[order] = new.cumsum()
+    return places

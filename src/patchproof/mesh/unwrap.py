@@ -17,7 +17,7 @@ import numpy as np
 
 from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
 from patchproof.base.strict import Refused
-from patchproof.mesh.mesh import Material, Mesh
+from patchproof.mesh.mesh import Material, Mesh, places_of
 from patchproof.mesh.texels import coverage, face_counts, spans
 
 PADDING_TEXELS = 2  # between charts; measured, 3 stay free: rims of 1.5 texels on either side do not meet
@@ -117,7 +117,7 @@ def _directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     normal = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    place = np.unique(points.astype(np.float32), axis=0, return_inverse=True)[1].reshape(-1)[faces]
+    place = places_of(points.astype(np.float32))[faces]
     edge = np.sort(np.concatenate([place[:, [0, 1]], place[:, [1, 2]], place[:, [2, 0]]]), axis=1)
     order = np.lexsort(edge.T)
     same = (np.diff(edge[order], axis=0) == 0).all(1)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.mesh.mesh import Mesh
+from patchproof.mesh.mesh import Mesh, places_of
 
 CREASE_DEG = 10.0  # of normals: light changes by a sixth at most below it
 _COLOR_STEP = 0.02  # of linear light
@@ -36,7 +36,7 @@ class Edges:
 
 def edges_of(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
     """The edges of a mesh on a device."""
-    place = _places(mesh.vertices)[mesh.faces]
+    place = places_of(mesh.vertices)[mesh.faces]
     first, second = place.ravel(), place[:, [1, 2, 0]].ravel()
     key = np.minimum(first, second) * (len(mesh.vertices) + 1) + np.maximum(first, second)
     order = np.argsort(key, kind="stable")
@@ -54,15 +54,6 @@ def edges_of(mesh: Mesh, device: torch.device | str = "cpu") -> Edges:
     planes = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
     arrays = (ends, np.stack([one, other], 1) // 3, always, np.r_[same_way, np.zeros(len(rim), bool)], planes)
     return Edges(*(torch.as_tensor(array, device=device) for array in arrays))
-
-
-def _places(vertices: np.ndarray) -> np.ndarray:
-    """V: one number for all vertices at the same place."""
-    order = np.lexsort(vertices.T)
-    new = np.r_[False, (np.diff(vertices[order], axis=0) != 0).any(1)]
-    places = np.empty(len(vertices), np.int64)
-    places[order] = new.cumsum()
-    return places
 
 
 def _next(corner: np.ndarray) -> np.ndarray:

@@ -17,7 +17,6 @@ from patchproof.channel.printer import Printer
 from patchproof.optimizer.run import Run
 from patchproof.reprints.hung_sheet import AS_MADE, Hanging, sheet_scene
 from patchproof.reprints.reprint import OWN, write_truth
-from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.raster import page_pixels
 
 SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
@@ -49,7 +48,7 @@ def scan(
                 name = f"scan_{len(truth) + 1:04d}.jpg"
                 (folder / name).write_bytes(content)
                 truth[name] = {
-                    "homography_px_from_mm": (px_from_mm @ _page_from_design(manifest, page)).tolist(),
+                    "homography_px_from_mm": (px_from_mm @ manifest.page_from_home(page)).tolist(),
                     "marker_corners_px": corners,
                     "conditions": {"scan_dpi": dpi, "print_scale": list(how.print_scale)},
                 }
@@ -64,12 +63,3 @@ def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scal
     matrix = between_indices(np.diag([x / 2, y / 2, 1.0]))
     blurred = cv2.GaussianBlur(light, (0, 0), SCAN_BLUR_PX)
     return cv2.warpAffine(blurred, matrix[:2], (width, height), borderValue=(1.0, 1.0, 1.0))
-
-
-def _page_from_design(manifest: Manifest, page: int) -> np.ndarray:
-    """3×3 from the millimeters of the design's page to a tile's; pages without a tile keep their own."""
-    square = {t.page: np.vstack([np.array(t.page_from_design_mm), [0, 0, 1]]) for t in manifest.tiles}
-    if page not in square:
-        return np.eye(3)
-    own = square[manifest.design.page if manifest.design else manifest.tiles[0].page]
-    return square[page] @ np.linalg.inv(own)

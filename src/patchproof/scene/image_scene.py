@@ -22,6 +22,7 @@ from typing import Self
 
 import numpy as np
 
+from patchproof.base.geometry import turned_extent
 from patchproof.base.input import is_file
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, expand
@@ -82,7 +83,7 @@ class ImageScene(flat.FlatScene):
             conditions.pose.background[:, 2:4],
             strict=True,
         ):
-            room = side - _extent(piece_mm * scale, roll)
+            room = side - turned_extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * room
             matrices.append(to_size @ flat.turned(roll, scale, middle - piece_mm / 2, piece_mm / 2))
         return np.stack(matrices) @ flat.prints(self.piece, conditions)
@@ -242,15 +243,9 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
 
 def _widest(roll_deg: tuple[float, float]) -> float:
     """How wide a square of side 1 gets when it is turned."""
-    return max(_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))
+    return max(turned_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))
 
 
 def _shares(settings: SceneSettings, conditions: Conditions) -> np.ndarray:
     low, high = settings.view.patch_share
     return low * (high / low) ** conditions.pose.background[:, 1]
-
-
-def _extent(size: np.ndarray, roll_deg: float) -> np.ndarray:
-    """Width and height of what encloses a turned rectangle."""
-    c, s = abs(np.cos(np.radians(roll_deg))), abs(np.sin(np.radians(roll_deg)))
-    return np.array([c * size[0] + s * size[1], s * size[0] + c * size[1]])

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from patchproof.base.geometry import turned_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
 from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
@@ -204,9 +205,7 @@ def _cells(knots: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, extent_mm) -> None:
     """A card may not reach beyond the object's outline; 0.5 % of slack for rounded figures."""
-    c, s = abs(np.cos(np.radians(spin_deg))), abs(np.sin(np.radians(spin_deg)))
-    width, height = size_mm
-    across, along = c * width + s * height, s * width + c * height
+    across, along = turned_extent(size_mm, spin_deg)
     if across > 1.005 * extent_mm[0] or along > 1.005 * extent_mm[1]:
         expected = f"a piece no larger than the object's side ({extent_mm[0]:.0f} × {extent_mm[1]:.0f} mm)"
         got = f"{across:.0f} × {along:.0f} mm"

@@ -19,7 +19,7 @@ from patchproof.base.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
 from patchproof.base.input import is_file, opened_picture
 from patchproof.base.settings import PatchSettings
 from patchproof.base.strict import Refused, expand, nearest
-from patchproof.mesh.mesh import Material, Mesh
+from patchproof.mesh.mesh import Material, Mesh, places_of
 from patchproof.mesh.texels import coverage, face_counts
 from patchproof.mesh.unwrap import has_place, unwrap
 
@@ -251,8 +251,7 @@ def _in_palette(texel: np.ndarray, size: tuple[int, int], area: np.ndarray, smal
 
 def _first_of_its_place(mesh: Mesh) -> np.ndarray:
     """Whether no face before this one has the same three corners in space."""
-    place = np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)
-    first = np.unique(np.sort(place[mesh.faces], axis=1), axis=0, return_index=True)[1]
+    first = np.unique(np.sort(places_of(mesh.vertices)[mesh.faces], axis=1), axis=0, return_index=True)[1]
     return np.isin(np.arange(len(mesh.faces)), first)
 
 

@@ -283,6 +283,15 @@ class Manifest(Strict):
             raise ValueError("make the sheet again: design.rect_mm is not cut_mm, and a design fills its piece")
         return self
 
+    def page_from_home(self, page: int) -> np.ndarray:
+        """3×3 from the millimeters that a piece of tiles has, those of the design's page (the first tile's without a
+        design), to another tile's; pages without a tile keep their own.
+        """
+        square = {tile.page: np.vstack([np.array(tile.page_from_design_mm), [0, 0, 1]]) for tile in self.tiles}
+        if page not in square:
+            return np.eye(3)
+        return square[page] @ np.linalg.inv(square[self.design.page if self.design else self.tiles[0].page])
+
 
 def design_sha256(pixels: np.ndarray) -> str:
     """SHA-256 of uint8 H×W×3 pixels, row by row."""
