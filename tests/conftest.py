@@ -6,6 +6,7 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 
@@ -13,6 +14,7 @@ from patchproof.base.workers import keep_freed_memory
 
 # the tests run side by side, a process per core, and so do the programs that they start
 torch.set_num_threads(1)
+cv2.setNumThreads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
 keep_freed_memory()
 
@@ -27,6 +29,14 @@ def pytest_collection_modifyitems(items):
     of the most tests, and end with a single test of half a minute.
     """
     items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_core():
+    """What takes all free cores where nothing is said takes one: the others have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("patchproof.base.workers.free_cores", lambda: 1)
+        yield
 
 
 @pytest.fixture(scope="session")
