@@ -46,12 +46,12 @@ def guess_up(path: Path) -> Up:
     """The axis by the format's standard or habit; one that the object hardly stands on is odd, and of a mere habit the
     other one is taken then.
     """
-    kind = path.suffix.lower()
+    kind, name = path.suffix.lower(), path.suffix[1:].upper()
     axis: Axis = "y" if kind in _GLTF else _HABIT.get(kind, "z")
     odd = lies_oddly(load_mesh(path, 100.0, axis).vertices, axis)
     if odd is not None and kind not in _GLTF:
-        return Up(other_axis(axis), f"as it stands: {kind[1:].upper()} files say nothing")
-    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {kind[1:].upper()} files", odd)
+        return Up(other_axis(axis), f"as it stands: {name} files say nothing")
+    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", odd)
 
 
 def lies_oddly(vertices: np.ndarray, up: Axis) -> str | None:

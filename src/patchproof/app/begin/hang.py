@@ -7,6 +7,7 @@ Left out on purpose: other places than middles, which the search for a place kno
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.strict import Refused, Side
@@ -37,7 +38,7 @@ class Hang:
     def worth(self) -> float:
         """Its area, that of a flat card on the front counting more, and on the top less."""
         sides: dict[Side | None, float] = {"+z": _FRONT, "+y": _TOP}
-        return _area(self.size_mm) * (1 if self.bend else _FRONT) * sides.get(self.side, 1)
+        return prod(self.size_mm) * (1 if self.bend else _FRONT) * sides.get(self.side, 1)
 
     @property
     def words(self) -> str:
@@ -50,7 +51,7 @@ def place_for(mesh: Mesh, length_mm: float) -> Hang:
     """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
     sides: dict[Side, tuple[float, float]] = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
     flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
-    if any(_area(hang.size_mm) >= _ENOUGH * max(map(_area, sides.values())) for hang in flat):
+    if any(prod(hang.size_mm) >= _ENOUGH * max(map(prod, sides.values())) for hang in flat):
         return max(flat, key=lambda hang: hang.worth)  # bending takes seconds to try
     hangs = flat + [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, True))]
     if hangs:
@@ -73,7 +74,3 @@ def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -
     frame, lay = side_frame(mesh, side), lay_for(bend)
     found = largest(size_mm, lambda trial: laid_well(mesh, frame, trial, 0.0, lay), smallest_piece_mm())
     return None if found is None else Hang(side, found, bend)
-
-
-def _area(size_mm: tuple[float, float]) -> float:
-    return size_mm[0] * size_mm[1]

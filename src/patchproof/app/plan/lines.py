@@ -5,7 +5,6 @@ from __future__ import annotations
 from patchproof.app.plan.cost import Cost
 from patchproof.app.plan.errors import TermError
 from patchproof.app.plan.plan import Geometry, Markers, Plan, Resolution, Surface
-from patchproof.app.plan.samples import sample_lines
 from patchproof.optimizer.places import place_lines
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 
@@ -25,7 +24,11 @@ def geometry_lines(plan: Geometry) -> list[str]:
 def measured_lines(plan: Plan) -> list[str]:
     """What a plan measured."""
     lines = _term_lines(plan)
-    lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)", *sample_lines(plan.samples)]
+    lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)"]
+    lines += [
+        f"  {s.name:27} {s.n:4d} samples leave ±{s.half_width:.3f}, {s.next_n} would ±{s.next_half_width:.3f}"
+        for s in plan.samples
+    ]
     lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
     return lines if plan.cost is None else [*lines, *_cost_lines(plan.cost)]
 
