@@ -20,7 +20,7 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, Strict, nearest, ordered
+from patchproof.base.strict import Refused, Strict, models_in, nearest, ordered
 from patchproof.sheets.board import BoardTemplate
 from patchproof.sheets.template import Template
 
@@ -91,17 +91,10 @@ def tables(model: type[Strict], path: str = "") -> Iterator[tuple[str, type[Stri
     """The settings and the tables in them, each with its place as TOML writes it."""
     yield path, model
     for key, hint in get_type_hints(model).items():
-        for inner, many in models_in(hint):
+        many = tuple in map(get_origin, (hint, *get_args(hint)))
+        for inner in models_in(hint):
             place = f"{path.strip('[]')}.{key}".strip(".")
             yield from tables(inner, f"[[{place}]]" if many else f"[{place}]")
-
-
-def models_in(hint: Any, many: bool = False) -> Iterator[tuple[type[Strict], bool]]:
-    """The settings classes in a type, and whether it holds many of each."""
-    if isinstance(hint, type) and issubclass(hint, Strict):
-        yield hint, many
-    for inner in get_args(hint):
-        yield from models_in(inner, many or get_origin(hint) is tuple)
 
 
 def _row(model: type[Strict], key: str, field: FieldInfo) -> str:

@@ -116,13 +116,9 @@ def label_of(labels: Sequence[str], said: str | None, path: str) -> str | int:
             return _written(labels, find_words(labels, text, whole=True))
         except Refused:
             continue
-    few = f": {', '.join(map(_in_quotes, labels))}" if len(labels) <= _FEW_LABELS else ""
+    few = ": " + ", ".join(f'"{label}"' for label in labels) if len(labels) <= _FEW_LABELS else ""
     do = f"add --label with what it is to be recognized as{few}"
     raise Refused("a file that is called what it shows", f'"{" ".join(words)}", which no label of the network is', do)
-
-
-def _in_quotes(label: str) -> str:
-    return f'"{label}"'
 
 
 def _written(labels: Sequence[str], index: int) -> str | int:

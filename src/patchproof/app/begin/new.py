@@ -58,9 +58,11 @@ def new_scene(
         raise Refused("a mesh with --length-mm or --up", f"the folder {thing}", do)
     else:
         text, lines = _of_folder(Path(thing), base, label, models)
-    warnings = _checked(text, base)
+    scene = build_scene(validated(SceneSettings, tomllib.loads(text), "the new scene"), base)
+    if isinstance(scene, OpenScene):
+        Ground(scene).spots(1)  # refused where it has no place
     write_whole(out, text)
-    return [*lines, *(f"warning: {warning}" for warning in warnings)]
+    return [*lines, *(f"warning: {warning}" for warning in scene.warnings)]
 
 
 def _of_mesh(
@@ -209,12 +211,3 @@ def _path(path: Path, base: Path) -> str:
 def _quoted(text: str) -> str:
     """A TOML string; JSON's escapes are TOML's."""
     return json.dumps(text, ensure_ascii=False)
-
-
-def _checked(text: str, base: Path) -> tuple[str, ...]:
-    """The warnings of the scene that the text describes; refused where it cannot be loaded or has no place."""
-    settings = validated(SceneSettings, tomllib.loads(text), "the new scene")
-    scene = build_scene(settings, base)
-    if isinstance(scene, OpenScene):
-        Ground(scene).spots(1)
-    return scene.warnings

@@ -58,8 +58,7 @@ def measure_cost(
     median = {name: statistics.median(row[name] for row in rows) for name in rows[0]}
     total = sum(median.values())
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
-    threads = torch.get_num_threads()
-    views = problem.scene.settings.optimize.views
+    views, threads = problem.scene.settings.optimize.views, torch.get_num_threads()
     return Cost(views=views, side_px=problem.training_px, threads=threads, ms=total, parts=parts)
 
 

@@ -209,7 +209,8 @@ def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
     promise = [np.ptp(wilson(round(rate * n), n)) / 2 for n in (PROMISE_VIEWS, _NEXT * PROMISE_VIEWS)]
     rows = (("selection: mean confidence", SELECT_VIEWS, selection), ("promise: rate", PROMISE_VIEWS, promise))
     return tuple(
-        Sample(name=name, n=n, half_width=now, next_n=_NEXT * n, next_half_width=after) for name, n, (now, after) in rows
+        Sample(name=name, n=n, half_width=now, next_n=_NEXT * n, next_half_width=after)
+        for name, n, (now, after) in rows
     )
 
 
