@@ -14,8 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis
-from patchproof.app.begin.hang import place_for
+from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis, place_for
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import check_file, write_whole

@@ -11,7 +11,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -95,19 +95,16 @@ def carried_out(verb: Callable[..., None]) -> Callable[..., None]:
     return carry_out
 
 
-@contextmanager
-def _on_free_cores(given: dict[str, Any]) -> Iterator[None]:
+def _on_free_cores(given: dict[str, Any]) -> AbstractContextManager[None]:
     """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and processes that
     would import everything anew have the number that is asked for, one by default, and the threads of this one.
     """
     if "jobs" not in given:
-        yield
-        return
+        return nullcontext()
     by_processes = can_fork() and given.get("device", "cpu") == "cpu"
     if given["jobs"] is None:
         given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
-    with threads(1) if by_processes else nullcontext():
-        yield
+    return threads(1) if by_processes else nullcontext()
 
 
 def _stopped(given: dict[str, Any]) -> str:

@@ -159,7 +159,7 @@ def _squares(
             seen = relit(views, conditions) if same else see(setup.stage, setup.shown, conditions, size_px)
             parts.append(_pictures(problem, seen, setup.shown))
         stack.append(torch.stack(parts))
-        on_view(len(base.conditions))
+        on_view(len(known))
     return torch.cat(stack, 1)
 
 
