@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import get_type_hints
 
 from patchlab.study.study import STUDIES, load_study
-from patchproof.app.keys import Documents, default_text, meanings, models_in, tables, toml_text
+from patchproof.app.keys import Documents, default_text, meanings, tables, toml_text
+from patchproof.base.strict import models_in
 
 HEAD = """# Keys of studies
 

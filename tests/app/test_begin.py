@@ -24,8 +24,8 @@ from patchproof.app.begin.sides import (
     round_length,
     side_of,
     side_views,
+    turntable,
 )
-from patchproof.app.begin.turntable import turntable
 from patchproof.base.settings import load_scene_settings
 from patchproof.base.strict import Refused
 from patchproof.render.stage import set_stage
@@ -398,7 +398,7 @@ def test_a_slider_its_keys_and_a_drag_turn_the_object_and_without_scripts_it_is_
 @pytest.mark.parametrize("side", ["+z", "-x", "+y"])
 def test_the_ring_shows_the_piece_most_from_where_it_faces(side):
     red = np.full((8, 8, 3), (255, 0, 0), np.uint8)
-    turns = {turn.azimuth_deg: turn.picture.astype(int) for turn in turntable(set_stage(box(side=side)), red)}
+    turns = {at: picture.astype(int) for at, picture in turntable(set_stage(box(side=side)), red).items()}
     share = {at: ((picture[..., 0] - picture[..., 1]) > 200).mean() for at, picture in turns.items()}
     assert len(turns) == 24 and {max(picture.shape) for picture in turns.values()} == {320}
     assert share[0] > 0.03 and share[0] >= max(share.values()) - 0.003

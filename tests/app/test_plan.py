@@ -17,8 +17,7 @@ from patchproof.app.plan import errors
 from patchproof.app.plan.cost import measure_cost
 from patchproof.app.plan.errors import measure_terms
 from patchproof.app.plan.lines import geometry_lines, measured_lines
-from patchproof.app.plan.plan import Plan, marker_plan, measured_plan, plan_geometry, resolution_plan
-from patchproof.app.plan.samples import sample_plan
+from patchproof.app.plan.plan import Plan, marker_plan, measured_plan, plan_geometry, resolution_plan, sample_plan
 from patchproof.app.plan.terms import Setup, scene_terms
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused, validated

@@ -21,7 +21,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from patchlab.study.claims import median
-from patchproof.app.plan.cost import in_turn
 from patchproof.base.claims import Estimate
 
 Name = TypeVar("Name", bound=Hashable)
@@ -47,6 +46,20 @@ def describe(about: Mapping[str, Any]) -> str:
     """The machine in one line, for the corner of a chart."""
     threads = f"{about['threads']} thread{'' if about['threads'] == 1 else 's'} of {about['cores']} cores"
     return f"{about['processor']}, {threads}, torch {about['torch']}, {about['date']}"
+
+
+def in_turn(
+    calls: Mapping[Name, Callable[[], Answer]],
+    rounds: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[Name, list[Answer]]:
+    """What each call returns in each of some rounds, all calls in turn in every round; a round before them warms up."""
+    answers: dict[Name, list[Answer]] = {name: [] for name in calls}
+    for number in range(rounds + 1):
+        for name, call in calls.items():
+            answers[name].append(call())
+        progress(number + 1, rounds + 1)
+    return {name: values[1:] for name, values in answers.items()}
 
 
 def timed(calls: Mapping[Name, Callable[[], object]], rounds: int) -> dict[Name, np.ndarray]:

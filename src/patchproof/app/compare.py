@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from patchproof.base.claims import Estimate, difference, rate
+from patchproof.base.claims import difference, rate
 from patchproof.base.output import new_folder
 from patchproof.base.strict import Refused, listed
 from patchproof.base.workers import open_workers
@@ -56,20 +56,16 @@ def compare_runs(
     networks, loaded = None if models is None else tuple(models), _loaded(runs, models is None)
     refuse_unnamed(networks, jobs, cluster)
     scene, total, before = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
-    names = tuple(
-        each.name if isinstance(each, Classifier) else each for each in networks or scene.settings.target.models
-    )
+    judges = networks or scene.settings.target.models
+    names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
     with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
 
         def ask(name: str, start: int) -> Shown:
             nonlocal before
-            run = loaded[name]
-            views = run.scene.draw("evaluate", n, seed, start)
-            done = before
-            answers, _ = answers_of(
-                run.folder.resolve(), views, workers, networks, device, lambda count: on_view(done + count, total)
-            )
+            run, done = loaded[name], before
+            views, step = run.scene.draw("evaluate", n, seed, start), lambda count: on_view(done + count, total)
+            answers, _ = answers_of(run.folder.resolve(), views, workers, networks, device, step)
             before += n
             return answers
 
@@ -102,9 +98,8 @@ def _loaded(runs: Sequence[str | Path], with_networks: bool) -> dict[str, Run]:
         raise Refused(
             "two runs or more to compare, each once", listed([str(run) for run in runs]) or "none", "name them"
         )
-    names = [path.name for path in paths]
-    names = names if len(set(names)) == len(names) else [str(path) for path in paths]
-    loaded = {name: load_run(path) for name, path in zip(names, paths, strict=True)}
+    alike = len({path.name for path in paths}) < len(paths)
+    loaded = {str(path) if alike else path.name: load_run(path) for path in paths}
     first, *others = loaded
     for name in others:
         if _views_of(loaded[name].scene, with_networks) != _views_of(loaded[first].scene, with_networks):
@@ -135,13 +130,13 @@ def _tables(
     all_views: Mapping[str, Shown],
     fresh: Mapping[str, Shown],
 ) -> list[Table]:
-    best, *_ = order
+    best = order[0]
     n = all_views[best]["design"].recognized.shape[1]
     quoted = Table(
         "fresh",
         "The best two, under conditions that had no say in choosing them",
         _HEAD,
-        tuple(_row(runs, fresh, name, best, network, 0) for name in fresh for network in networks[:1]),
+        tuple(_row(runs, fresh, name, best, networks[0], 0) for name in fresh),
         f"{n} fresh conditions: these are the figures to quote.",
     )
     chosen = Table(
@@ -179,20 +174,17 @@ def _drawing(runs: Mapping[str, Run], answers: Mapping[str, Shown]) -> Drawing:
         for (picture, axes), (name, run) in zip(grid, runs.items(), strict=True):
             picture.imshow(run.design, interpolation="nearest")
             picture.set_axis_off()
-            hits = {kind: answer.recognized[0].tolist() for kind, answer in answers[name].items()}
-            shown = {kind: rate(each) for kind, each in hits.items()}
-            for height, (kind, estimate) in enumerate(reversed(shown.items())):
-                _bar(axes, height, estimate, "#2457c5" if kind == "design" else "#b0713c")
-            axes.set_yticks(range(len(shown)), list(shown)[::-1], fontsize=6)
-            axes.set(xlim=(-0.01, 1.01), ylim=(-0.7, len(shown) - 0.3))
+            kinds = list(answers[name])[::-1]
+            for height, kind in enumerate(kinds):
+                estimate = rate(answers[name][kind].recognized[0].tolist())
+                color = "#2457c5" if kind == "design" else "#b0713c"
+                if estimate is not None:
+                    axes.hlines(height, estimate.low, estimate.high, colors=color, linewidth=3, alpha=0.4)
+                    axes.plot(estimate.value, height, "o", color=color, markersize=4)
+            axes.set_yticks(range(len(kinds)), kinds, fontsize=6)
+            axes.set(xlim=(-0.01, 1.01), ylim=(-0.7, len(kinds) - 0.3))
             axes.set_title(name, fontsize=9, loc="left")
         grid[-1][1].set_xlabel("recognized by the first network")
 
     about = "Bars are 95 % intervals of the rate under the conditions that all designs share."
     return Drawing("designs", "The designs, best first", draw, (7.0, 1.3 * len(runs) + 0.4), about)
-
-
-def _bar(axes: Any, height: float, estimate: Estimate | None, color: str) -> None:
-    if estimate is not None:
-        axes.hlines(height, estimate.low, estimate.high, colors=color, linewidth=3, alpha=0.4)
-        axes.plot(estimate.value, height, "o", color=color, markersize=4)

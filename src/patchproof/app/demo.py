@@ -8,6 +8,7 @@ to gain.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from patchproof.app.verify import verify_photos
@@ -70,34 +71,21 @@ def run_demo(
 ) -> list[str]:
     """Run every step into the folder `out`, before the built-in classifier or detector; returns the summary's lines."""
     with new_folder(out, OWN, overwrite) as folder:
+        pdf, photos, report = folder / "sheet.pdf", folder / "photos", folder / "report"
         run = optimize_scene(
             demo_scene(folder, detector),
             folder / "run",
             jobs=jobs,
             on_step=lambda step, total: on_stage("optimize", step.state.number, total),
-            on_promise=lambda done, total: on_stage("promise", done, total),
+            on_promise=partial(on_stage, "promise"),
         )
-        sheet_of(run, folder / "sheet.pdf")
-        reprint(
-            folder / "sheet.pdf",
-            run,
-            PHOTOS,
-            folder / "photos",
-            sessions=SESSIONS,
-            jobs=jobs,
-            on_photo=lambda done, total: on_stage("photograph", done, total),
-        )
-        report = verify_photos(
-            folder / "photos",
-            folder / "sheet.json",
-            folder / "report",
-            jobs=jobs,
-            on_photo=lambda done, total: on_stage("verify", done, total),
-        )
+        sheet_of(run, pdf)
+        reprint(pdf, run, PHOTOS, photos, sessions=SESSIONS, jobs=jobs, on_photo=partial(on_stage, "photograph"))
+        judged = verify_photos(photos, folder / "sheet.json", report, jobs=jobs, on_photo=partial(on_stage, "verify"))
     return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
         *promise_lines(run.promise, behind(run.scene.settings.model_dump())),
-        *verdict_lines(report),
+        *verdict_lines(judged),
         *(f"{out}/{name}" for name in ("run/design.png", "sheet.pdf", "sheet.json", "photos/", "report/report.html")),
     ]
 

@@ -16,11 +16,11 @@ from itertools import takewhile
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, Strict, nearest, ordered
+from patchproof.base.strict import Refused, Strict, models_in, nearest, ordered
 from patchproof.sheets.board import BoardTemplate
 from patchproof.sheets.template import Template
 
@@ -45,7 +45,7 @@ DOCUMENTS: Documents = {
 def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -> str:
     """The page of these documents as Markdown, or what it says of one kind of file."""
     if name is None:
-        where: dict[type[Strict], str] = {}
+        where: dict[type[BaseModel], str] = {}
         return "\n".join([head, *(_document(name, *documents[name], where) for name in documents)])
     if name not in documents:
         raise Refused(f"one of {', '.join(documents)}", f'"{name}"', nearest(name, documents))
@@ -53,7 +53,7 @@ def keys_page(documents: Documents, name: str | None = None, head: str = HEAD) -
 
 
 @lru_cache
-def meanings(model: type[Strict]) -> dict[str, str]:
+def meanings(model: type[BaseModel]) -> dict[str, str]:
     """By key the comment that says what it means; a key without one is missing."""
     texts = {}
     for owner in reversed(model.__mro__):
@@ -72,7 +72,7 @@ def meanings(model: type[Strict]) -> dict[str, str]:
     return texts
 
 
-def _document(name: str, about: str, settings: type[Strict], where: dict[type[Strict], str]) -> str:
+def _document(name: str, about: str, settings: type[Strict], where: dict[type[BaseModel], str]) -> str:
     """One file's tables; those in `where` are told there."""
     lines = [f"## {name}", "", about, ""]
     for path, model in tables(settings):
@@ -87,24 +87,17 @@ def _document(name: str, about: str, settings: type[Strict], where: dict[type[St
     return "\n".join(lines)
 
 
-def tables(model: type[Strict], path: str = "") -> Iterator[tuple[str, type[Strict]]]:
+def tables(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
     """The settings and the tables in them, each with its place as TOML writes it."""
     yield path, model
     for key, hint in get_type_hints(model).items():
-        for inner, many in models_in(hint):
+        many = any(get_origin(each) is tuple for each in (hint, *get_args(hint)))
+        for inner in models_in(hint):
             place = f"{path.strip('[]')}.{key}".strip(".")
             yield from tables(inner, f"[[{place}]]" if many else f"[{place}]")
 
 
-def models_in(hint: Any, many: bool = False) -> Iterator[tuple[type[Strict], bool]]:
-    """The settings classes in a type, and whether it holds many of each."""
-    if isinstance(hint, type) and issubclass(hint, Strict):
-        yield hint, many
-    for inner in get_args(hint):
-        yield from models_in(inner, many or get_origin(hint) is tuple)
-
-
-def _row(model: type[Strict], key: str, field: FieldInfo) -> str:
+def _row(model: type[BaseModel], key: str, field: FieldInfo) -> str:
     kind = _kind(get_type_hints(model, include_extras=True)[key])
     meaning = meanings(model).get(key, "its own table" if kind.startswith("table") else "")
     cells = (f"`{key}`", kind, _UNITS.get(key.rpartition("_")[2], ""), default_text(field), meaning)

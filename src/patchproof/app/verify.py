@@ -4,7 +4,7 @@ In: a folder of photographs (or of folders, one a session) and SHEET.json. Out: 
 report.html, pictures, coco.json with the piece's and a detected object's place, and photos.jsonl, one line per finished
 photograph, from which `resume` goes on. This joins what must not know each other: the judge, its networks and the page.
 The promise's primary network always judges, whatever others are named. Only a given run brings its scene, the renderer
-and the optimizer in (see `forecaster`).
+and the optimizer in.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.evidence.batch import WITH_PICTURES
 from patchproof.evidence.boxes import from_square, given_boxes
-from patchproof.evidence.classify import Box
 from patchproof.evidence.journal import file_sha256
-from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Origin, Report
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import LEDGER_PHOTOS, Options
@@ -85,8 +83,15 @@ def verify_photos(
         ledger_photos=ledger_photos,
     )
     if boxes is not None:
-        options = replace(options, boxes=_drawn(boxes, manifest, options))
-    forecast = None if run is None else forecaster(run, manifest)
+        if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
+            got = "none that judges these photographs"
+            raise Refused("a detector, which alone looks at boxes", got, "leave boxes out")
+        options = replace(options, boxes=given_boxes(boxes, manifest.promise.target.label))
+    forecast = None
+    if run is not None:
+        from patchproof.reprints.retake import retaker  # brings scene, renderer and optimizer in
+
+        forecast = retaker(run, manifest)
     report = gather_evidence(
         photos,
         manifest,
@@ -99,38 +104,18 @@ def verify_photos(
         on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
         progress=on_photo,
     )
-    given = {
-        "scan_dpi": scan_dpi,
-        "ruler_mm": ruler_mm,
-        "camera": camera and Path(camera).name,
-        "boxes": boxes and Path(boxes).name,
-        "ledger_photos": ledger_photos,
-    }
-    hashes = {"manifest": file_sha256(Path(sheet))} | {
-        f"network {network.name}": network.sha256 for network in options.models
-    }
+    given = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "camera": camera and Path(camera).name}
+    given |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
+    hashes = {"manifest": file_sha256(Path(sheet)), **{f"network {each.name}": each.sha256 for each in options.models}}
     report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
-    _drop_pictures(out / "pictures", {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]})
+    shown = {stem_of(photo.file) for photo in report.photos[:WITH_PICTURES]}
+    for path in list((out / "pictures").glob("*")):  # those of photographs that this report does not show
+        if path.name.rsplit(".", 2)[0] not in shown:
+            path.unlink()
     ledger = report.ledger and report.ledger.model_dump()
     write_report(report.model_dump(mode="json"), manifest.model_dump(mode="json"), out, ledger)
     write_whole(out / "coco.json", _boxes(report, manifest, options.camera))
     return report
-
-
-def forecaster(run: str | Path | Run, manifest: Manifest) -> Callable[[Shot], float | None]:
-    """What gives each photograph of a sheet the chance of being recognized, by the run (or its folder) that the sheet
-    is of: see `reprints.retake`.
-    """
-    from patchproof.reprints.retake import retaker  # brings scene, renderer and optimizer in
-
-    return retaker(run, manifest)
-
-
-def _drawn(boxes: str | Path, manifest: Manifest, options: Options) -> dict[str, Box]:
-    """The boxes of a file, refused before networks that do not look at them."""
-    if manifest.promise is None or not any(model.LOOKS_AT_BOXES for model in options.models):
-        raise Refused("a detector, which alone looks at boxes", "none that judges these photographs", "leave boxes out")
-    return given_boxes(boxes, manifest.promise.target.label)
 
 
 def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
@@ -176,20 +161,13 @@ def _check_out(out: Path, resume: bool, overwrite: bool) -> None:
     check_folder(out, OWN, overwrite)
 
 
-def _drop_pictures(folder: Path, files: set[str]) -> None:
-    """Remove pictures of photographs that this report does not show."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.name.rsplit(".", 2)[0] not in files:
-            path.unlink()
-
-
 def _networks(manifest: Manifest, models: Sequence[str | Classifier] | None) -> tuple[str | Classifier, ...]:
     """The primary network first, then the others asked for, or else the promise's; of one given in memory, itself."""
     given = {model.name if isinstance(model, Classifier) else model: model for model in models or ()}
+    if manifest.promise is None and not given:
+        got = f"the {manifest.kind} sheet {manifest.sheet_id}"
+        raise Refused("a sheet that promises something", got, "name --models")
     if manifest.promise is None:
-        if not given:
-            got = f"the {manifest.kind} sheet {manifest.sheet_id}"
-            raise Refused("a sheet that promises something", got, "name --models")
         return tuple(given.values())
     promised = tuple(model.name for model in manifest.promise.models)
     names = dict.fromkeys((promised[0], *(given or promised)))

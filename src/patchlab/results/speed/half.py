@@ -15,9 +15,8 @@ import numpy as np
 import torch
 
 import patchproof as pp
-from patchlab.bench.measure import clocked
+from patchlab.bench.measure import clocked, in_turn
 from patchlab.results.rows import write_rows
-from patchproof.app.plan.cost import in_turn
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design

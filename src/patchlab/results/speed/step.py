@@ -17,9 +17,8 @@ import torch
 from torch import nn
 
 import patchproof as pp
-from patchlab.bench.measure import clocked
+from patchlab.bench.measure import clocked, in_turn
 from patchlab.results.rows import write_rows
-from patchproof.app.plan.cost import in_turn
 from patchproof.base.workers import keep_freed_memory
 from patchproof.optimizer import loop, training_views
 from patchproof.optimizer.problem import set_problem

@@ -15,9 +15,8 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from patchlab.bench.measure import clocked
+from patchlab.bench.measure import clocked, in_turn
 from patchlab.results.rows import write_rows
-from patchproof.app.plan.cost import in_turn
 from patchproof.base.workers import keep_freed_memory
 from patchproof.classifier import load_classifier
 from patchproof.networks.windows import Windows

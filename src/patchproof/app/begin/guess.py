@@ -1,8 +1,10 @@
-"""What a file tells of an object before anybody says it: which axis is up, how long it is, what it is called.
+"""What a file tells of an object before anybody says it: which axis is up, how long it is, what it is called, and
+where a piece goes on it.
 
-In: a mesh file, and names of files. Out: `Up`, a length in millimeters, a label. Each guess carries the words for the
-comment beside it in the scene file. Where there is no telling, a length is refused, since everything in a scene is in
-millimeters; so is a label.
+In: a mesh file, and names of files. Out: `Up`, a length in millimeters, a label, and `Hang`: the largest piece that
+lies well in the middle of one of its sides. Each guess carries the words for the comment beside it in the scene file.
+Where there is no telling, a length is refused, since everything in a scene is in millimeters; so is a label.
+Left out on purpose: other places than middles, which the search for a place knows better.
 
 glTF has a standard: y up, meters. Other formats have habits: OBJ is mostly written y up, printers' STL and scanners'
 PLY z up, all without units. Whether an object lies oddly is judged by what it would stand on.
@@ -13,14 +15,21 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from patchproof.base.strict import Refused
+from patchproof.app.begin.sides import SIDE_NAMES
+from patchproof.base.strict import Refused, Side
 from patchproof.classifier.labels import find_labels, find_words
 from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.mesh import Mesh
+from patchproof.scene.bend import lay_for
+from patchproof.scene.fitting import laid_well, largest
+from patchproof.scene.placement import Frame, side_frame
+from patchproof.sheets.piece import smallest_piece_mm
 
 _GLTF = (".glb", ".gltf")
 Axis = Literal["y", "z"]
@@ -31,6 +40,13 @@ _FOOT = 0.005  # of the object's height: what is no higher touches the ground
 _HARDLY = 0.25  # of its footprint: a cylinder that lies touches 14 % by these rules, one that stands 79 %
 _FIRMLY = 2.0  # times as much: where the other axis is clearly the better one
 _FEW_LABELS = 20  # of a network: all of them are said
+_SIDE_SHARE = 0.7  # of a side's extent that a piece covers at most
+_LARGEST_MM = (165.0, 175.0)  # of a piece on A4, with the chart and the rulers around it
+_LONGER = 1.6  # a piece's longer side over its shorter one at most
+_FRONT = 1.25  # times as large has to be what is preferred to the front, or to a flat card
+_TOP = 0.5  # of a top's size: who looks at it looks from above, as few photographs do
+_ENOUGH = 0.8  # of the largest piece that any side is asked for: a flat card as large is not bent for more
+_TRIED: tuple[Side, ...] = ("+z", "+x", "-x", "-z", "+y")
 
 
 @dataclass(frozen=True)
@@ -46,12 +62,12 @@ def guess_up(path: Path) -> Up:
     """The axis by the format's standard or habit; one that the object hardly stands on is odd, and of a mere habit the
     other one is taken then.
     """
-    kind = path.suffix.lower()
+    kind, name = path.suffix.lower(), path.suffix[1:].upper()
     axis: Axis = "y" if kind in _GLTF else _HABIT.get(kind, "z")
     odd = lies_oddly(load_mesh(path, 100.0, axis).vertices, axis)
     if odd is not None and kind not in _GLTF:
-        return Up(other_axis(axis), f"as it stands: {kind[1:].upper()} files say nothing")
-    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {kind[1:].upper()} files", odd)
+        return Up(other_axis(axis), f"as it stands: {name} files say nothing")
+    return Up(axis, "glTF's standard" if kind in _GLTF else f"the habit of {name} files", odd)
 
 
 def lies_oddly(vertices: np.ndarray, up: Axis) -> str | None:
@@ -116,13 +132,9 @@ def label_of(labels: Sequence[str], said: str | None, path: str) -> str | int:
             return _written(labels, find_words(labels, text, whole=True))
         except Refused:
             continue
-    few = f": {', '.join(map(_in_quotes, labels))}" if len(labels) <= _FEW_LABELS else ""
+    few = ": " + ", ".join(f'"{label}"' for label in labels) if len(labels) <= _FEW_LABELS else ""
     do = f"add --label with what it is to be recognized as{few}"
     raise Refused("a file that is called what it shows", f'"{" ".join(words)}", which no label of the network is', do)
-
-
-def _in_quotes(label: str) -> str:
-    return f'"{label}"'
 
 
 def _written(labels: Sequence[str], index: int) -> str | int:
@@ -134,3 +146,53 @@ def _written(labels: Sequence[str], index: int) -> str | int:
         except Refused:
             continue
     return index
+
+
+@dataclass(frozen=True)
+class Hang:
+    """Where the piece goes: a side's middle, or wherever the search finds; how large it is, and whether it bends."""
+
+    side: Side | None
+    size_mm: tuple[float, float]
+    bend: bool
+
+    @property
+    def worth(self) -> float:
+        """Its area, that of a flat card on the front counting more, and on the top less."""
+        sides: dict[Side | None, float] = {"+z": _FRONT, "+y": _TOP}
+        return prod(self.size_mm) * (1 if self.bend else _FRONT) * sides.get(self.side, 1)
+
+    @property
+    def words(self) -> str:
+        """Where that is, for a sentence."""
+        where = "wherever the search finds" if self.side is None else f"on its {SIDE_NAMES[self.side]} ({self.side})"
+        return f"{'bent, ' if self.bend else ''}{where}"
+
+
+def place_for(mesh: Mesh, length_mm: float) -> Hang:
+    """The largest piece that lies well in the middle of a side; where none does, the least, to be searched for."""
+    sides: dict[Side, tuple[float, float]] = {side: _wanted(side_frame(mesh, side)) for side in _TRIED}
+    flat = [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, False))]
+    if any(prod(hang.size_mm) >= _ENOUGH * max(map(prod, sides.values())) for hang in flat):
+        return max(flat, key=lambda hang: hang.worth)  # bending takes seconds to try
+    hangs = flat + [hang for side, size in sides.items() if (hang := _on_side(mesh, side, size, True))]
+    if hangs:
+        return max(hangs, key=lambda hang: hang.worth)
+    least = smallest_piece_mm()
+    if least > length_mm:
+        do = "check --length-mm: markers of 8 mm need that much"
+        raise Refused(f"an object with room for a piece of {least:g} mm", f"one of {length_mm:g} mm", do)
+    return Hang(None, (least, least), False)
+
+
+def _wanted(frame: Frame) -> tuple[float, float]:
+    """The largest piece that a side is asked for."""
+    width, height = (_SIDE_SHARE * extent for extent in frame.extent_mm)
+    return min(width, _LONGER * height, _LARGEST_MM[0]), min(height, _LONGER * width, _LARGEST_MM[1])
+
+
+def _on_side(mesh: Mesh, side: Side, size_mm: tuple[float, float], bend: bool) -> Hang | None:
+    """The largest piece of that shape that lies well in the middle of a side."""
+    frame, lay = side_frame(mesh, side), lay_for(bend)
+    found = largest(size_mm, lambda trial: laid_well(mesh, frame, trial, 0.0, lay), smallest_piece_mm())
+    return None if found is None else Hang(side, found, bend)

@@ -14,8 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis
-from patchproof.app.begin.hang import place_for
+from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis, place_for
 from patchproof.app.begin.sides import SIDE_NAMES
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import check_file, write_whole
@@ -24,6 +23,7 @@ from patchproof.base.strict import NETWORK_FILE, Refused, validated
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.primitives import longest_mm
 from patchproof.scene.image_scene import label_rows
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.places import Ground
@@ -57,35 +57,24 @@ def new_scene(
         raise Refused("a mesh with --length-mm or --up", f"the folder {thing}", do)
     else:
         text, lines = _of_folder(Path(thing), base, label, models)
-    warnings = _checked(text, base)
+    scene = build_scene(validated(SceneSettings, tomllib.loads(text), "the new scene"), base)
+    if isinstance(scene, OpenScene):
+        Ground(scene).spots(1)  # refused where it has no place
     write_whole(out, text)
-    return [*lines, *(f"warning: {warning}" for warning in warnings)]
+    return [*lines, *(f"warning: {warning}" for warning in scene.warnings)]
 
 
 def _of_mesh(
     thing: str, base: Path, label: str | None, length_mm: float | None, axis: Axis | None, models
 ) -> tuple[str, list[str]]:
     named = label_of(_labels(models, base), label, thing)
-    path = Path(thing)
-    if thing.startswith("primitive:"):
-        from patchproof.mesh import primitives
-
-        up, said = Up("y", "primitives are"), "the primitive's own"
-        own_mm = primitives.longest_mm(thing.partition(":")[2])
-    else:
-        up, said, own_mm = (
-            Up(axis, "as given") if axis else guess_up(path),
-            "by the file's units, meters: measure it",
-            None,
-        )
+    path, primitive, said = Path(thing), thing.startswith("primitive:"), "as given"
+    up = Up("y", "primitives are") if primitive else Up(axis, said) if axis else guess_up(path)
     if length_mm is None:
-        length_mm = own_mm or length_of(path)
-    else:
-        said = "as given"
-    mesh = load_mesh(thing, length_mm, up.axis)
-    hang = place_for(mesh, length_mm)
-    mesh_name = thing if thing.startswith("primitive:") else _path(path, base)
-    near, far = (_rounded(times * length_mm) for times in (NEAR, FAR))
+        said = "the primitive's own" if primitive else "by the file's units, meters: measure it"
+        length_mm = longest_mm(thing.partition(":")[2]) if primitive else length_of(path)
+    hang = place_for(load_mesh(thing, length_mm, up.axis), length_mm)
+    near, far = (float(f"{times * length_mm:.2g}") for times in (NEAR, FAR))
     azimuth, elevation = "of the camera about the vertical; 0 faces the piece", "above the horizontal"
     if hang.side == "+y":
         azimuth, elevation = "of the camera to left and right of straight above", "from there toward the back"
@@ -94,7 +83,7 @@ def _of_mesh(
         [
             *_HEAD,
             "[object]",
-            f"mesh = {_quoted(mesh_name)}",
+            f"mesh = {_quoted(thing if primitive else _path(path, base))}",
             _line(f"length_mm = {length_mm:g}", f"its longest extent, {said}"),
             _line(f'up = "{up.axis}"', f"the file's axis that points up: {up.reason}"),
             *_turned(up),
@@ -120,14 +109,13 @@ def _of_mesh(
         ]
     )
     width, height = hang.size_mm
-    lines = [
-        f'up: "{up.axis}", {up.reason}'
-        + (f"; {up.odd}: if the preview shows it lying, {_again(up)}" if up.odd else ""),
+    odd = f"; {up.odd}: if the preview shows it lying, {_again(up)}" if up.odd else ""
+    return text, [
+        f'up: "{up.axis}", {up.reason}{odd}',
         f"length: {length_mm:g} mm, {said}",
         f"piece: {width:g} × {height:g} mm, {hang.words}",
         f'label: "{named}" ({models[0]})',
     ]
-    return text, lines
 
 
 def _turned(up: Up) -> list[str]:
@@ -144,33 +132,21 @@ def _again(up: Up) -> str:
 
 def _of_folder(folder: Path, base: Path, label: str | None, models) -> tuple[str, list[str]]:
     tables = sorted(folder.glob("*.csv"))
-    manifests = [
-        path for path in sorted([*folder.glob("*.json"), *folder.resolve().parent.glob("*.json")]) if _blank(path)
-    ]
+    found = sorted([*folder.glob("*.json"), *folder.resolve().parent.glob("*.json")])
+    manifests = [path for path in found if _blank(path)]
     if not tables and not manifests:
         expected = "a CSV of labels among images, or a blank sheet's JSON in or beside the folder of photographs"
         raise Refused(expected, f"neither for {folder}", "put one there, or name a mesh")
     if not tables and len(manifests) > 1:
-        names = ", ".join(path.name for path in manifests)
-        raise Refused(
-            "one blank sheet's JSON", names, "lay the one that hangs there into the folder, the others elsewhere"
-        )
+        do = "lay the one that hangs there into the folder, the others elsewhere"
+        raise Refused("one blank sheet's JSON", ", ".join(path.name for path in manifests), do)
     if not tables:
         named = label_of(_labels(models, base), label, folder.resolve().name)
         sheet = _line(f"sheet = {_quoted(_path(manifests[0], base))}", "of the blank that hangs on the object there")
-        lines = [
-            "[object]",
-            f"photos = {_quoted(_path(folder, base))}",
-            sheet,
-            "",
-            _line("[patch]", "as the blank's"),
-            "",
-        ]
-        text = "\n".join([*_HEAD, *lines, *_target(named, models, base), ""])
-        return text, [
-            f"photographs: {folder}, with the blank of {manifests[0].name}",
-            f'label: "{named}" ({models[0]})',
-        ]
+        lines = ["[object]", f"photos = {_quoted(_path(folder, base))}", sheet, "", _line("[patch]", "as the blank's")]
+        text = "\n".join([*_HEAD, *lines, "", *_target(named, models, base), ""])
+        said = f"photographs: {folder}, with the blank of {manifests[0].name}"
+        return text, [said, f'label: "{named}" ({models[0]})']
     table = next((path for path in tables if path.stem == "labels"), tables[0])
     counts = Counter(named for name, named in label_rows(table) if is_file(folder / name))
     if not counts:
@@ -234,17 +210,3 @@ def _path(path: Path, base: Path) -> str:
 def _quoted(text: str) -> str:
     """A TOML string; JSON's escapes are TOML's."""
     return json.dumps(text, ensure_ascii=False)
-
-
-def _rounded(value_mm: float) -> float:
-    """To two figures."""
-    return float(f"{value_mm:.2g}")
-
-
-def _checked(text: str, base: Path) -> tuple[str, ...]:
-    """The warnings of the scene that the text describes; refused where it cannot be loaded or has no place."""
-    settings = validated(SceneSettings, tomllib.loads(text), "the new scene")
-    scene = build_scene(settings, base)
-    if isinstance(scene, OpenScene):
-        Ground(scene).spots(1)
-    return scene.warnings

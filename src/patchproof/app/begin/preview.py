@@ -9,6 +9,7 @@ masks on, which 3D programs such as Blender export.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +18,7 @@ import numpy as np
 import torch
 
 from patchproof.app.begin.guess import lies_oddly, other_axis
-from patchproof.app.begin.sides import (
-    SIDE_NAMES,
-    extent_mm,
-    gap_colors,
-    side_of,
-    side_views,
-    stretch_colors,
-)
-from patchproof.app.begin.turntable import turntable
+from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp, side_of, side_views, turntable
 from patchproof.app.begin.views import Look, looks
 from patchproof.base.color import codes_of
 from patchproof.base.output import image_bytes, new_folder, write_whole
@@ -81,9 +74,10 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             design = _gray_design(stage)
             _write_object(stage, design, folder / OBJECT)
             sides = [(view, data_uri(png(view.picture))) for view in side_views(stage)]
-            turns = [(turn, _webp(turn.picture)) for turn in turntable(stage, design)]
-        facts = _facts(scene, settings)
-        lines = tuple(f"{name}: {text}" for name, text in facts) + tuple(_answers(settings, seen))
+            for azimuth_deg, picture in turntable(stage, design).items():
+                webp = image_bytes(picture, "WEBP", {"quality": 80})  # 3 to 10 kB: as JPEG it would be twice as large
+                turns.append((azimuth_deg, picture.shape[:2], base64_uri(webp, "image/webp")))
+        facts, summaries = _facts(scene, settings), _answers(settings, seen)
         problems = [text for text in (refused, unknown) if text]
         text = page(
             "preview.html.j2",
@@ -97,18 +91,19 @@ def preview_scene(scene_path: str | Path, out: str | Path, *, overwrite: bool = 
             turns=turns,
             first_deg=_FIRST_DEG,
             looks=[(look, data_uri(jpeg(look.picture))) for look in seen],
-            summaries=_answers(settings, seen),
+            summaries=summaries,
         )
         write_whole(folder / PAGE, text)
+    lines = (*(f"{name}: {text}" for name, text in facts), *summaries)
     return Preview(Path(out) / PAGE, lines, warnings, " ".join(problems) or None)
 
 
 def _lying(scene: Scene, settings: SceneSettings) -> tuple[str, ...]:
     """What to do about an object that would stand better with its file's other axis up."""
     up, name = settings.object.up, settings.object.mesh or ""
-    odd = lies_oddly(scene.mesh.vertices, up) if isinstance(scene, MeshScene) and ":" not in name else None
-    other = other_axis(up)
-    return () if odd is None else (f'the object may lie: {odd}. If it does, write up = "{other}" in [object]',)
+    if not isinstance(scene, MeshScene) or ":" in name or (odd := lies_oddly(scene.mesh.vertices, up)) is None:
+        return ()
+    return (f'the object may lie: {odd}. If it does, write up = "{other_axis(up)}" in [object]',)
 
 
 def _scene(settings: SceneSettings, base: Path) -> tuple[Scene, str | None]:
@@ -146,52 +141,36 @@ def _facts(scene: Scene, settings: SceneSettings) -> list[tuple[str, str]]:
     """What is where, in words."""
     facts = [("object", scene.description())]
     if isinstance(scene, MeshScene):
-        width, height, depth = extent_mm(scene.mesh)
+        width, height, depth = np.ptp(scene.mesh.vertices, axis=0)
         size = f"{width:.0f} × {height:.0f} × {depth:.0f} mm (width, height and depth of its front)"
-        facts = [("object", f"{size}, {len(scene.mesh.faces)} faces")]
         front, view = side_of(scene.frame.normal), scene.settings.view
         (left, right), (low, high), (near, far) = view.azimuth_deg, view.elevation_deg, view.distance_mm
-        facts.append(
-            (
-                "camera",
-                f"{left:g}° to {right:g}° about the {SIDE_NAMES[front]} ({front}), {low:g}° to {high:g}° above it, "
-                f"{near:g} to {far:g} mm away",
-            )
-        )
+        around = f"{left:g}° to {right:g}° about the {SIDE_NAMES[front]} ({front}), {low:g}° to {high:g}° above it"
+        facts = [("object", f"{size}, {len(scene.mesh.faces)} faces")]
+        facts.append(("camera", f"{around}, {near:g} to {far:g} mm away"))
     lies = scene.lies()
-    width, height = lies["size_mm"]
+    size = "{:g} × {:g} mm".format(*lies["size_mm"])
     if isinstance(scene, PatchScene):
         side = side_of(scene.placement.normal)
-        where = f"facing {SIDE_NAMES[side]} ({side})"
         fits = (
             f"gap {lies['gap_mm']:.1f} mm at most, {lies['gap_mean_mm']:.1f} mm on average; "
             f"{lies['overhang_share']:.0%} overhangs; stretch {lies['stretch']:.2%}"
         )
-        facts.append(("piece", f"{lies['family']}, {width:g} × {height:g} mm, {where}: {fits}"))
-        facts.append(
-            ("markers", f"{scene.piece.marker_mm:.1f} mm, unreadable in {scene.unreadable_share:.0%} of views")
-        )
-    elif isinstance(scene, OpenScene):
-        facts.append(("piece", "not placed"))
+        facts.append(("piece", f"{lies['family']}, {size}, facing {SIDE_NAMES[side]} ({side}): {fits}"))
+        readable = f"unreadable in {scene.unreadable_share:.0%} of views"
+        facts.append(("markers", f"{scene.piece.marker_mm:.1f} mm, {readable}"))
     else:
-        facts.append(("piece", f"{width:g} × {height:g} mm: {lies['reason']}"))
+        facts.append(("piece", "not placed" if isinstance(scene, OpenScene) else f"{size}: {lies['reason']}"))
     if isinstance(scene, TextureScene):
-        facts.extend(("texture", text) for text in _textures(scene))
+        for name, mask in zip(scene.canvas.names, scene.canvas.mask, strict=True):
+            if mask.any():
+                texels = f"{mask.shape[1]} × {mask.shape[0]} texels, of which {mask.mean():.0%} may change"
+                facts.append(("texture", f'"{name}", {texels}'))
     if settings.patch.place == "auto":
         side = settings.patch.side
-        tried = f"until then it is tried on the {SIDE_NAMES[side]} ({side})" if isinstance(scene, PatchScene) else ""
-        facts.append(("place", f'"auto": optimize searches the object for it{"; " if tried else ""}{tried}'))
+        tried = f"; until then it is tried on the {SIDE_NAMES[side]} ({side})" if isinstance(scene, PatchScene) else ""
+        facts.append(("place", f'"auto": optimize searches the object for it{tried}'))
     return facts
-
-
-def _textures(scene: TextureScene) -> list[str]:
-    """Each texture that may change, of how many texels a mask is drawn for."""
-    canvas = scene.canvas
-    return [
-        f'"{name}", {mask.shape[1]} × {mask.shape[0]} texels, of which {mask.mean():.0%} may change'
-        for name, mask in zip(canvas.names, canvas.mask, strict=True)
-        if mask.any()
-    ]
 
 
 def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
@@ -199,12 +178,11 @@ def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
     lines = []
     for number, first in enumerate(seen[0].answers):
         answers = [look.answers[number] for look in seen]
-        names = [answer.labels[0][0] for answer in answers]
-        most = max(dict.fromkeys(names), key=names.count)
+        ((most, times),) = Counter(answer.labels[0][0] for answer in answers).most_common(1)
         count = sum(answer.recognized for answer in answers)
         lines.append(
             f'{first.network}: "{settings.target.label}" first in {count} of {len(seen)} views of the bare object; '
-            f'most often "{most}" ({names.count(most)})'
+            f'most often "{most}" ({times})'
         )
     return lines
 
@@ -212,27 +190,15 @@ def _answers(settings: SceneSettings, seen: Sequence[Look]) -> list[str]:
 def _maps(scene: PatchScene) -> list[dict[str, str]]:
     """The piece's gap and stretch, each a picture with the words at the ends of its scale."""
     laid = scene.placement
-    shape = "{:g} / {:g}".format(*laid.size_mm)
-    maps = [
-        {
-            "title": "gap to the surface",
-            "shape": shape,
-            "picture": data_uri(png(gap_colors(laid))),
-            "low": "0 mm",
-            "high": f"{gap_limit_mm(laid.size_mm):.2g} mm: too much",
-        }
-    ]
+    rows = [("gap to the surface", gap_colors(laid), "0 mm", f"{gap_limit_mm(laid.size_mm):.2g} mm: too much")]
     if not laid.is_flat:
-        maps.append(
-            {
-                "title": "stretch of the paper",
-                "shape": shape,
-                "picture": data_uri(png(stretch_colors(laid))),
-                "low": "0 %",
-                "high": f"{STRETCH_LIMIT:.0%}: refused",
-            }
-        )
-    return maps
+        stretches = ramp(laid.stretches / STRETCH_LIMIT)
+        rows.append(("stretch of the paper", stretches, "0 %", f"{STRETCH_LIMIT:.0%}: refused"))
+    shape = "{:g} / {:g}".format(*laid.size_mm)
+    return [
+        {"title": title, "shape": shape, "picture": data_uri(png(colors)), "low": low, "high": high}
+        for title, colors, low, high in rows
+    ]
 
 
 def _write_object(stage: Stage, design: np.ndarray | None, path: Path) -> None:
@@ -254,8 +220,3 @@ def _gray_design(stage: Stage) -> np.ndarray | None:
     size_mm = stage.scene.piece.size_mm
     width, height = (max(8, round(side * _DESIGN_PX / max(size_mm))) for side in size_mm)
     return codes_of(stage.look.shown(torch.full((3, height, width), 0.5)).srgb).cpu().numpy()
-
-
-def _webp(picture: np.ndarray) -> str:
-    """A picture for the page in 3 to 10 kB: as JPEG it would be twice as large."""
-    return base64_uri(image_bytes(picture, "WEBP", {"quality": 80}), "image/webp")

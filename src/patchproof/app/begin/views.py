@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from patchproof.base.geometry import rect_border
 from patchproof.classifier.network import Classifier
@@ -23,7 +24,7 @@ from patchproof.render.stage import Stage
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import PieceScene
 
-VIEWS, TOP = 8, 5
+_VIEWS, _TOP = 8, 5
 _LEAST_PX = 200  # what is smaller is hard to look at
 _STEPS = 8  # points along each edge: bent paper has bent edges
 
@@ -50,10 +51,10 @@ class Look:
 
 
 def looks(stage: Stage, classifiers: Sequence[Classifier], indices: Sequence[tuple[int, ...]]) -> tuple[Look, ...]:
-    """`VIEWS` of the bare object; `indices` are the target's in each network, empty where it is not known."""
+    """`_VIEWS` of the bare object; `indices` are the target's in each network, empty where it is not known."""
     network_px = max(classifier.input_px for classifier in classifiers)
     side_px = network_px * math.ceil(_LEAST_PX / network_px)
-    conditions = stage.scene.draw("train", VIEWS)
+    conditions = stage.scene.draw("train", _VIEWS)
     with torch.no_grad():
         pictures = photograph(stage, None, conditions, (side_px, side_px), jpeg=False)
         logits = [classifier.logits(pictures, stage.scene.boxes(conditions)) for classifier in classifiers]
@@ -70,17 +71,15 @@ def looks(stage: Stage, classifiers: Sequence[Classifier], indices: Sequence[tup
                 for classifier, own, known in zip(classifiers, logits, indices, strict=True)
             ),
         )
-        for i in range(VIEWS)
+        for i in range(_VIEWS)
     )
 
 
-def _answer(classifier: Classifier, logits: torch.Tensor, known: tuple[int, ...]) -> Answer:
-    best = classifier.probabilities(logits[None])[0].topk(min(TOP, len(classifier.labels)))
-    pairs = zip(best.indices.tolist(), best.values.tolist(), strict=True)
-    labels = tuple((classifier.labels[index], share) for index, share in pairs)
-    return Answer(
-        Path(classifier.name).name, labels, bool(known) and bool(classifier.recognized(logits[None], known)[0])
-    )
+def _answer(classifier: Classifier, logits: Tensor, known: tuple[int, ...]) -> Answer:
+    best = classifier.probabilities(logits[None])[0].topk(min(_TOP, len(classifier.labels)))
+    labels = tuple((classifier.labels[index], share) for share, index in zip(*map(Tensor.tolist, best), strict=True))
+    recognized = bool(known) and bool(classifier.recognized(logits[None], known)[0])
+    return Answer(Path(classifier.name).name, labels, recognized)
 
 
 def _outline(stage: Stage, conditions: Conditions, side_px: int) -> np.ndarray | None:

@@ -15,7 +15,6 @@ import hashlib
 import os
 import re
 from pathlib import Path
-from types import TracebackType
 
 from patchproof.base.output import check_folder, make_folder
 from patchproof.base.strict import Refused
@@ -116,9 +115,7 @@ class Incoming:
     def __enter__(self) -> Incoming:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._leave()
 
     def write(self, chunk: bytes) -> None:

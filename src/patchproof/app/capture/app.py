@@ -89,16 +89,10 @@ class _Desk:
 
     async def page(self, request: Request) -> Response:
         """The page; scripts and styles of others are not let in, nor requests to others."""
-        promise, nonce = self._gathered.manifest.promise, secrets.token_urlsafe(16)
-        folder = Path(__file__).parent
-        html = page(
-            "page.html.j2",
-            folder,
-            nonce=nonce,
-            sheet_id=self._gathered.manifest.sheet_id,
-            target=promise.target if promise else None,
-            most_bytes=MOST_BYTES,
-        )
+        manifest, nonce = self._gathered.manifest, secrets.token_urlsafe(16)
+        target = manifest.promise and manifest.promise.target
+        values = {"nonce": nonce, "sheet_id": manifest.sheet_id, "target": target, "most_bytes": MOST_BYTES}
+        html = page("page.html.j2", Path(__file__).parent, **values)
         policy = (
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; "
             "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -126,9 +120,8 @@ class _Desk:
             except (ClientDisconnect, TimeoutError):
                 return _refusal(408, "Expected a whole photograph, got a part: send it again.")
             except OSError as error:
-                return _refusal(
-                    507, f"Expected room for a photograph, got {error.strerror}: make room and send it again."
-                )
+                got = f"Expected room for a photograph, got {error.strerror}: make room and send it again."
+                return _refusal(507, got)
         async with self._one_at_a_time:
             answer = await anyio.to_thread.run_sync(self._measured, path)
         return JSONResponse({"photo": answer, "state": self._state})

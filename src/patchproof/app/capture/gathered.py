@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from patchproof.app.capture.album import CONTROLS_FOLDER, JOURNAL, Album
-from patchproof.app.verify import forecaster
 from patchproof.base.workers import Workers
 from patchproof.evidence.batch import Item, measure_all, shot_again
 from patchproof.evidence.classify import judges_of
@@ -31,25 +29,14 @@ from patchproof.evidence.run import report_of, with_forecast
 from patchproof.evidence.task import Options, Task, task_of
 from patchproof.sheets.manifest import Manifest, load_manifest
 
-
-@dataclass(frozen=True)
-class ForecastFrom:
-    """The folder of the run and its sheet's manifest, from which each photograph gets its forecast."""
-
-    run: Path
-    sheet: Path
+RunAndSheet = tuple[Path, Path]  # the folder of a run and its sheet's manifest
 
 
 class Gathered:
-    """What is known of an album's photographs; called by one thread at a time."""
+    """What is known of an album's photographs; called by one thread at a time. By `forecast` each has its forecast."""
 
     def __init__(
-        self,
-        album: Album,
-        manifest: Manifest,
-        options: Options,
-        workers: Workers,
-        forecast: ForecastFrom | None = None,
+        self, album: Album, manifest: Manifest, options: Options, workers: Workers, forecast: RunAndSheet | None = None
     ):
         self.album, self.manifest = album, manifest
         self._judges = judges_of(options.models, manifest)
@@ -97,10 +84,10 @@ class Gathered:
     def report(self) -> Report:
         """What the photographs that are measured say together."""
         photos, grouping = self.photos, self._grouping()
+        own = [photos.pop(path) for path in grouping.paths]
         controls: dict[str, list[PhotoEntry]] = {}
-        for path in sorted(photos.keys() - set(grouping.paths)):
-            controls.setdefault(path.parent.name, []).append(photos[path].entry)
-        own = [photos[path] for path in grouping.paths]
+        for path, photo in photos.items():
+            controls.setdefault(path.parent.name, []).append(photo.entry)
         return report_of(self.manifest, self._judges, own, grouping, controls, side_px=self.side_px)
 
     def _grouping(self) -> Grouping:
@@ -123,10 +110,12 @@ def ready(_: object) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _forecast_there(source: ForecastFrom, task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> MeasuredPhoto:
-    return with_forecast(partial(shot_again, task, size_px), _forecaster(source), *item)
+def _forecast_there(source: RunAndSheet, task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> MeasuredPhoto:
+    return with_forecast(partial(shot_again, task, size_px), _forecaster(*source), *item)
 
 
 @lru_cache(maxsize=1)
-def _forecaster(source: ForecastFrom) -> Callable[[Shot], float | None]:
-    return forecaster(source.run, load_manifest(source.sheet))
+def _forecaster(run: Path, sheet: Path) -> Callable[[Shot], float | None]:
+    from patchproof.reprints.retake import retaker  # brings scene, renderer and optimizer in
+
+    return retaker(run, load_manifest(sheet))

@@ -8,7 +8,6 @@ browsers allow to encrypted pages only; the phone's own camera takes better ones
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import socket
@@ -20,7 +19,7 @@ from typing import Annotated
 from pydantic import Field
 
 from patchproof.app.capture.album import ADDRESS, Album
-from patchproof.app.capture.gathered import ForecastFrom, Gathered, ready
+from patchproof.app.capture.gathered import Gathered, ready
 from patchproof.app.verify import options_of
 from patchproof.base.input import read_json
 from patchproof.base.output import write_whole
@@ -36,6 +35,11 @@ _CONNECTIONS = 64
 class _Address(Strict):
     token: Annotated[str, Field(pattern="^[A-Za-z0-9_-]{22,64}$")]
     port: Annotated[int, Field(ge=0, le=65535)]
+
+    def write(self, path: Path) -> None:
+        path.unlink(missing_ok=True)
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+            file.write(self.model_dump_json())
 
 
 def serve_capture(
@@ -63,7 +67,7 @@ def serve_capture(
         got = f"the {manifest.kind} sheet {manifest.sheet_id}"
         raise Refused("a sheet that promises something", got, "photograph it with any camera")
     options = options_of(sheet, manifest, models, camera)
-    forecast = None if run is None else ForecastFrom(Path(run).resolve(), Path(sheet).resolve())
+    forecast = None if run is None else (Path(run).resolve(), Path(sheet).resolve())
     album = Album(Path(out))
     with open_workers(1, apart=True) as workers:
         workers.map(ready, [None])
@@ -72,7 +76,7 @@ def serve_capture(
             kept = _kept_address(album.folder)
             with _listening(_host(lan), kept.port) as listener:
                 host, port = listener.getsockname()
-                _keep_address(album.folder, kept.changed(port=port))
+                write_whole(album.folder / ADDRESS, kept.changed(port=port).write)
                 on_address(f"http://{host}:{port}/{kept.token}/")
                 config = uvicorn.Config(
                     capture_app(gathered, kept.token),
@@ -118,12 +122,10 @@ def _own_address() -> str:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(_NOWHERE)
-            address = probe.getsockname()[0]
+            return probe.getsockname()[0]
         except OSError as error:
-            raise Refused(
-                "a local network", f"none ({error.strerror})", "connect to one, or leave --lan out"
-            ) from error
-    return address
+            do = "connect to one, or leave --lan out"
+            raise Refused("a local network", f"none ({error.strerror})", do) from error
 
 
 def _kept_address(folder: Path) -> _Address:
@@ -132,12 +134,3 @@ def _kept_address(folder: Path) -> _Address:
         return validated(_Address, read_json(folder / ADDRESS, "an address", "remove it"), ADDRESS)
     except Refused:
         return _Address(token=secrets.token_urlsafe(24), port=0)
-
-
-def _keep_address(folder: Path, address: _Address) -> None:
-    def write(part: Path) -> None:
-        part.unlink(missing_ok=True)
-        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-            json.dump(address.model_dump(), file)
-
-    write_whole(folder / ADDRESS, write)

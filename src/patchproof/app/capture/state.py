@@ -6,6 +6,7 @@ advice, the verdict's reason, the plan page's counts.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +26,14 @@ _USUAL_SESSIONS = 4  # where no number of them would do
 _PREVIEW = {"quality": 80}
 
 
-def _number(path: Path) -> str:
-    return path.name  # in the order in which they came
-
-
 def state_of(gathered: Gathered, sessions: int | None) -> dict[str, Any]:
     """All that the page shows but single answers; `sessions` of `EACH` photographs are planned."""
     report = gathered.report()
-    counts = {session.name: session for session in report.summary.sessions}
-    rows = [
-        {"name": name, "judged": counts[name].judged, "recognized": counts[name].recognized}
-        if name in counts
-        else {"name": name, "judged": 0, "recognized": 0}
-        for name in gathered.album.sessions
-    ]
-    plain = report.summary.model_dump()
-    summary, promise = report.summary, gathered.manifest.promise
+    summary, plain, promise = report.summary, report.summary.model_dump(), gathered.manifest.promise
+    counts = {row["name"]: row for row in plain["sessions"]}
+    rows = [counts.get(name, {"name": name, "judged": 0, "recognized": 0}) for name in gathered.album.sessions]
     promised = promise.controls if promise is not None else ()
+    names = sorted(gathered.photos, key=lambda path: path.name)  # in the order in which they came
     return {
         "verdict": summary.verdict,
         "headline": VERDICTS[summary.verdict],
@@ -60,23 +52,22 @@ def state_of(gathered: Gathered, sessions: int | None) -> dict[str, Any]:
         ],
         "controls_known": [name for name in CONTROLS if name in promised] or CONTROLS,
         "map": _map(gathered, EACH * (sessions or _USUAL_SESSIONS)),
-        "latest": [answer_of(gathered, path) for path in sorted(gathered.photos, key=_number)[-_LATEST:][::-1]],
+        "latest": [answer_of(gathered, path) for path in names[-_LATEST:][::-1]],
     }
 
 
 def answer_of(gathered: Gathered, path: Path, picture: np.ndarray | None = None) -> dict[str, Any]:
     """What one measured photograph says, and what to do; `picture` (uint8 H×W×3) goes along as a data URI."""
-    photo, promise, prediction = gathered.photos[path], gathered.manifest.promise, None
-    entry, control = photo.entry, gathered.control_of(path)
+    photo, promise, answer, prediction = gathered.photos[path], gathered.manifest.promise, "not counted", None
+    entry = photo.entry
     if promise is not None and photo.counted:
         prediction = entry.predictions.get(promise.models[0].name)
-    answer = "not counted"
     if prediction is not None:
         answer = "recognized" if prediction.recognized else "not recognized"
     return {
         "file": f"{path.parent.name}/{path.name}",
         "answer": answer,
-        "control": control,
+        "control": gathered.control_of(path),
         "label": prediction and f"{prediction.label} {prediction.confidence:.0%}",
         "code": entry.code,
         "advice": entry.remark and entry.remark.advice,
@@ -100,21 +91,19 @@ def _view(entry: PhotoEntry) -> str:
 
 def _map(gathered: Gathered, wanted: int) -> dict[str, Any] | None:
     """The map with its rows' and columns' names: degrees, and the piece's share of the picture's shorter side."""
-    promise, side_px = gathered.manifest.promise, gathered.side_px
-    photos = gathered.photos
+    promise, side_px, photos = gathered.manifest.promise, gathered.side_px, gathered.photos
     counted = [photo.entry for path, photo in photos.items() if photo.counted and gathered.control_of(path) is None]
     views = promise and map_views(promise.conditions, counted, wanted, side_px)
     if not views:
         return None
-    columns = [_side(low, high) for low, high in zip(views.azimuth_deg, views.azimuth_deg[1:], strict=False)]
-    pairs = zip(views.px_per_mm, views.px_per_mm[1:], strict=False)
+    pairs = pairwise(views.px_per_mm)
     if side_px is None:
         rows = [f"{low:.1f}–{high:.1f} px/mm" for high, low in pairs]
     else:
         share = 100 * gathered.manifest.cut_mm[2] / side_px
         rows = [f"{share * low:.0f}–{share * high:.0f} %" for high, low in pairs]
     return {
-        "columns": columns,
+        "columns": [_side(low, high) for low, high in pairwise(views.azimuth_deg)],
         "rows": rows,
         "photos": views.photos,
         "wanted": views.wanted,

@@ -55,27 +55,21 @@ def map_views(
     azimuth_deg, distance = np.linspace(left, right, columns + 1), np.linspace(1 / largest, 1 / smallest, _ROWS + 1)
 
     def counts(points: np.ndarray) -> np.ndarray:
-        table = np.zeros((_ROWS, columns), int)
-        row, column = _bins(1 / points[:, 1], distance), _bins(points[:, 0], azimuth_deg)
-        np.add.at(table, (row, column), 1)
-        return table
+        row, column = 1 / points[:, 1], points[:, 0]
+        inside = np.clip(row, distance[0], distance[-1]), np.clip(column, left, right)
+        return np.histogram2d(*inside, (distance, azimuth_deg))[0]
 
-    shown = [
-        (figures.get("azimuth_deg"), figures.get("px_per_mm")) for e in entries for figures in [figures_of(e, side_px)]
-    ]
+    figures = [figures_of(entry, side_px) for entry in entries]
+    shown = [(each.get("azimuth_deg"), each.get("px_per_mm")) for each in figures]
     placed = np.array([view for view in shown if None not in view]).reshape(-1, 2)
     return ViewMap(
         azimuth_deg=tuple(map(float, azimuth_deg)),
         px_per_mm=tuple(float(1 / d) for d in distance),
         photos=_rows(counts(placed)),
-        wanted=_rows(np.rint(wanted * counts(views) / len(views)).astype(int)),
+        wanted=_rows(np.rint(wanted * counts(views) / len(views))),
         elsewhere=len(shown) - len(placed),
     )
 
 
-def _bins(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
-
-
 def _rows(table: np.ndarray) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(map(int, row)) for row in table)
+    return tuple(map(tuple, table.astype(int).tolist()))

@@ -49,11 +49,10 @@ def preview(
     shown = preview_scene(scene, out, overwrite=overwrite)
     warn(shown.warnings)
     say(*shown.lines, f"page: {shown.page}")
-    if not shown.refused:
-        say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
     if shown.refused:
         print(shown.refused, file=sys.stderr)
         raise typer.Exit(1)
+    say(f"next: patchproof optimize {scene} --out run (--draft for a first look)")
 
 
 def plan(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -38,8 +39,7 @@ def printer(
         raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
     else:
         with progress() as bar:
-            on_photo = lambda done, total: bar("chart", done, total)  # noqa: E731
-            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, on_photo)
+            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, partial(bar, "chart"))
     warn(warned)
     say(*lines)
 

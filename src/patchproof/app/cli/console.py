@@ -11,7 +11,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +21,7 @@ import typer
 from patchproof.base.output import disk_is_full
 from patchproof.base.strict import Refused
 from patchproof.base.version import __version__
-from patchproof.base.workers import keep_freed_memory
+from patchproof.base.workers import can_fork, free_cores, keep_freed_memory, threads
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace this command's earlier output.")]
 Device = Annotated[str, typer.Option(help="cpu or cuda.")]
@@ -95,21 +95,16 @@ def carried_out(verb: Callable[..., None]) -> Callable[..., None]:
     return carry_out
 
 
-@contextmanager
-def _on_free_cores(given: dict[str, Any]) -> Iterator[None]:
+def _on_free_cores(given: dict[str, Any]) -> AbstractContextManager[None]:
     """One process for each free core, each on one thread, where they can be forked; a GPU, a cluster and processes that
     would import everything anew have the number that is asked for, one by default, and the threads of this one.
     """
     if "jobs" not in given:
-        yield
-        return
-    from patchproof.base.workers import can_fork, free_cores, threads
-
+        return nullcontext()
     by_processes = can_fork() and given.get("device", "cpu") == "cpu"
     if given["jobs"] is None:
         given["jobs"] = free_cores() if by_processes and given.get("cluster") is None else 1
-    with threads(1) if by_processes else nullcontext():
-        yield
+    return threads(1) if by_processes else nullcontext()
 
 
 def _stopped(given: dict[str, Any]) -> str:
@@ -117,8 +112,7 @@ def _stopped(given: dict[str, Any]) -> str:
     if "resume" not in given or not Path(out or "").is_dir():
         return "Stopped: nothing was written."
     again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
-    again = shlex.join([_program(), *again, "--resume"])
-    return f"Stopped: {out} keeps what was finished. Go on with: {again}"
+    return f"Stopped: {out} keeps what was finished. Go on with: {shlex.join([_program(), *again, '--resume'])}"
 
 
 def _program() -> str:
@@ -150,16 +144,16 @@ def run_command_line(app: typer.Typer) -> None:
     warnings.formatwarning = lambda message, *where: f"warning: {message}\n"
     try:
         app()
-    except Refused as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
     except Exception as error:
-        if disk_is_full(error):
-            print("Expected room on the disk, got none left: make room, then run the command again.", file=sys.stderr)
-            raise SystemExit(1) from None
-        if not isinstance(error, OSError):
+        if isinstance(error, Refused):
+            sentence = str(error)
+        elif disk_is_full(error):
+            sentence = "Expected room on the disk, got none left: make room, then run the command again."
+        elif isinstance(error, OSError):
+            sentence = f"Expected files that can be read and written, got {error}: mend that and try again."
+        else:
             raise
-        print(f"Expected files that can be read and written, got {error}: mend that and try again.", file=sys.stderr)
+        print(sentence, file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         print("Stopped.", file=sys.stderr)
@@ -201,7 +195,6 @@ def pair_of(text: str, option: str) -> tuple[float, float]:
         if not (0 < x < float("inf") and 0 < y < float("inf")):
             raise ValueError
     except ValueError:
-        raise typer.BadParameter(
-            "takes one or two positive numbers, such as 0.97 or 0.97x0.98", param_hint=option
-        ) from None
+        needed = "takes one or two positive numbers, such as 0.97 or 0.97x0.98"
+        raise typer.BadParameter(needed, param_hint=option) from None
     return x, y

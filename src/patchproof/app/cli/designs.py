@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,22 +42,16 @@ def import_picture(
     from patchproof.report.summary import imported_lines, promise_lines
 
     with progress() as bar:
-        options: dict[str, Any] = {
-            "seed": seed,
-            "device": device,
-            "overwrite": overwrite,
-            "jobs": jobs or 1,
-            "promise_views": promise or (DRAFT[1] if draft else None),
-            "on_scene": lambda loaded: warn(loaded.warnings),
-            "on_promise": lambda done, total: bar("promise", done, total),
-        }
+        options: dict[str, Any] = {"seed": seed, "device": device, "overwrite": overwrite, "jobs": jobs or 1}
+        options |= {"promise_views": promise or (DRAFT[1] if draft else None), "on_promise": partial(bar, "promise")}
+        options |= {"on_scene": lambda loaded: warn(loaded.warnings)}
         if picture.is_dir():
             runs = import_folder(picture, scene, out, resume=resume, **options)
         else:
             runs = [import_patch(picture, scene, out, **options)]
     for run in runs:
-        background = behind(run.scene.settings.model_dump())
-        say(*imported_lines(run.details["imported"]), *promise_lines(run.promise, background), f"run: {run.folder}")
+        say(*imported_lines(run.details["imported"]))
+        say(*promise_lines(run.promise, behind(run.scene.settings.model_dump())), f"run: {run.folder}")
 
 
 def evaluate(
@@ -78,21 +73,11 @@ def evaluate(
     if (out is None) != (len(runs) == 1):
         raise typer.BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
     with progress() as bar:
-        options: dict[str, Any] = {
-            "models": names_of(models),
-            "n": n,
-            "seed": seed,
-            "device": device,
-            "jobs": jobs or 1,
-            "cluster": cluster,
-            "overwrite": overwrite,
-            "on_view": lambda done, total: bar("evaluate", done, total),
-        }
-        if out is None:
-            lines = [*evaluation_lines(evaluate_run(runs[0], **options)), f"written: {runs[0] / 'evaluate.json'}"]
-            compared = None
-        else:
-            compared, lines = compare_runs(runs, out, **options), [f"page: {out / 'designs.html'}"]
-    if compared is not None:
-        say_study(compared)
-    say(*lines)
+        options: dict[str, Any] = {"models": names_of(models), "n": n, "seed": seed, "device": device}
+        options |= {"jobs": jobs or 1, "cluster": cluster, "overwrite": overwrite, "on_view": partial(bar, "evaluate")}
+        done: Any = evaluate_run(runs[0], **options) if out is None else compare_runs(runs, out, **options)
+    if out is None:
+        say(*evaluation_lines(done), f"written: {runs[0] / 'evaluate.json'}")
+    else:
+        say_study(done)
+        say(f"page: {out / 'designs.html'}")

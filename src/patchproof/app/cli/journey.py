@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -22,9 +23,6 @@ from patchproof.app.cli.console import (
     say,
     warn,
 )
-
-if TYPE_CHECKING:
-    from patchproof.sheets.manifest import Manifest
 
 Control = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
 Shown = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
@@ -85,26 +83,21 @@ def optimize(
             promise_views=promise,
             jobs=jobs or 1,
             on_scene=lambda loaded: warn(loaded.warnings),
-            on_place=lambda done, total: bar("place", done, total),
+            on_place=partial(bar, "place"),
             on_step=lambda step, total: bar("optimize", step.state.number, total),
-            on_promise=lambda done, total: bar("promise", done, total),
+            on_promise=partial(bar, "promise"),
         )
-    background = behind(run.scene.settings.model_dump())
-    say(*promise_lines(run.promise, background), *_place_lines(out), f"run: {out}")
+    say(*promise_lines(run.promise, behind(run.scene.settings.model_dump())))
+    if (out / "place.json").is_file():  # what searches a place is loaded where one was searched for
+        from patchproof.optimizer.place_files import read_place
+        from patchproof.optimizer.places import place_lines
+
+        if (place := read_place(out)) is not None:
+            say(*place_lines(place))
+    say(f"run: {out}")
     if run.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {out} --out sheet.pdf")
     raise typer.Exit(1 if require == "better" and run.promise.worth != "better" else 0)
-
-
-def _place_lines(run: Path) -> list[str]:
-    """The place that a search chose for a run's piece, if one did."""
-    if not (run / "place.json").is_file():
-        return []
-    from patchproof.optimizer.place_files import read_place
-    from patchproof.optimizer.places import place_lines
-
-    place = read_place(run)
-    return [] if place is None else place_lines(place)
 
 
 def promise(
@@ -119,9 +112,7 @@ def promise(
     from patchproof.report.summary import promise_lines
 
     with progress() as bar:
-        made = promise_run(
-            run, views=n, device=device, jobs=jobs or 1, on_promise=lambda done, total: bar("promise", done, total)
-        )
+        made = promise_run(run, views=n, device=device, jobs=jobs or 1, on_promise=partial(bar, "promise"))
     say(*promise_lines(made.promise, behind(made.scene.settings.model_dump())))
     if made.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
@@ -158,36 +149,25 @@ def sheet(
     paths = manifest_paths(out, len(runs))
     for path in (out, *paths):
         check_file(path, overwrite)
-    if runs:
-        manifests = _write_sheets(runs, out, template, control, copies)
-    else:
+    if not runs:
         manifests = [blank_page(out, template=template, control=control)]
+    else:
+        from patchproof.optimizer.run import load_run
+        from patchproof.reprints.run_sheet import sheet_of
+        from patchproof.reprints.several_runs import sheet_of_several
+
+        first, *others = loaded = [load_run(folder) for folder in runs]
+        if others:
+            manifests = sheet_of_several(loaded, out, template=template, control=control)
+        else:
+            manifests = [sheet_of(first, out, template=template, control=control, copies=copies)]
     for manifest, path in zip(manifests, paths, strict=True):
-        say(
-            *(
-                []
-                if manifest.promise is None
-                else [manifest.promise.headline, f"promised before {behind(manifest.settings)}"]
-            )
-        )
+        if manifest.promise is not None:
+            say(manifest.promise.headline, f"promised before {behind(manifest.settings)}")
         say(f"sheet {manifest.sheet_id} ({manifest.kind}): {out}, {path.name}")
     if check:
         lines = (line for manifest in manifests for line in check_sheet(manifest))
         say(*dict.fromkeys(lines), *shop_lines(out))  # what holds for several designs is said once
-
-
-def _write_sheets(
-    folders: list[Path], out: Path, template: str | None, control: Control | None, copies: int
-) -> list[Manifest]:
-    """Write the page of finished runs; a manifest for each."""
-    from patchproof.optimizer.run import load_run
-    from patchproof.reprints.run_sheet import sheet_of
-    from patchproof.reprints.several_runs import sheet_of_several
-
-    runs = [load_run(folder) for folder in folders]
-    if len(runs) == 1:
-        return [sheet_of(runs[0], out, template=template, control=control, copies=copies)]
-    return sheet_of_several(runs, out, template=template, control=control)
 
 
 def reprint(
@@ -195,8 +175,7 @@ def reprint(
     n: Annotated[int, typer.Option("--n", min=1, help="Photographs to take.")],
     out: Annotated[Path, typer.Option(help="Folder for the photographs.")],
     run: Annotated[
-        Path | None,
-        typer.Option(help="The run it was made from; none for blank, chart and board pages."),
+        Path | None, typer.Option(help="The run it was made from; none for blank, chart and board pages.")
     ] = None,
     sessions: Annotated[
         int, typer.Option(min=1, help="Places to take them in, each with its light, camera and folder.")
@@ -228,9 +207,8 @@ def reprint(
     how = Hanging(printer, scale, control, path_traced)
     if run is None:
         if scan_dpi is not None or control is not None or path_traced or sessions > 1:
-            raise typer.BadParameter(
-                "scans, controls, sessions and path tracing are of a run's sheet; name the run", param_hint="--run"
-            )
+            only = "scans, controls, sessions and path tracing are of a run's sheet; name the run"
+            raise typer.BadParameter(only, param_hint="--run")
         reprint_pages(pdf, n, out, how, seed=seed, overwrite=overwrite)
         return say(f"{n} photographs: {out}")
     made = load_run(run)
@@ -249,7 +227,7 @@ def reprint(
                 overwrite=overwrite,
                 jobs=jobs or 1,
                 cluster=cluster,
-                on_photo=lambda done, total: bar("photograph", done, total),
+                on_photo=partial(bar, "photograph"),
             )
     say(f"{len(truth)} photographs: {out}")
 
@@ -307,13 +285,14 @@ def verify(
             cluster=cluster,
             resume=resume,
             overwrite=overwrite,
-            on_photo=lambda done, total: bar("verify", done, total),
+            on_photo=partial(bar, "verify"),
         )
     say(*verdict_lines(report), f"report: {out / 'report.html'}")
-    nothing = report.summary.judged == 0 and report.summary.measured == 0
+    summary = report.summary
+    nothing = summary.judged == 0 and summary.measured == 0
     if nothing:
         see = "Expected photographs that can be judged or measured, got none: see the codes in the report."
         print(see, file=sys.stderr)
-    if require == "kept" and report.summary.meets("kept") and not report.summary.meets("helps"):
+    if require == "kept" and summary.meets("kept") and not summary.meets("helps"):
         print("The promise held, and the patch is not shown to help: --require helps asks for both.", file=sys.stderr)
-    raise typer.Exit(1 if nothing or (require is not None and not report.summary.meets(require)) else 0)
+    raise typer.Exit(1 if nothing or (require is not None and not summary.meets(require)) else 0)

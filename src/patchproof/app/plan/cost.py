@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Hashable, Mapping
-from itertools import count
-from typing import TypeVar
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -28,8 +26,6 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import needs_mesh
 
 REPEATS = 5
-Name = TypeVar("Name", bound=Hashable)
-Answer = TypeVar("Answer")
 
 
 class Part(Strict):
@@ -54,33 +50,14 @@ def measure_cost(
     problem: Problem, design: Tensor, on_step: Callable[[int, int], None] = lambda done, total: None
 ) -> Cost:
     """The cost of a step that shows `design`, with all classifiers of the problem."""
-    rows = in_turn({"step": steps_ms(problem, design)}, REPEATS, on_step)["step"]
-    median = {name: statistics.median(row[name] for row in rows) for name in rows[0]}
+    views, threads, rows = problem.scene.settings.optimize.views, torch.get_num_threads(), []
+    for number in range(REPEATS + 1):  # the first one warms up
+        rows.append(_step_ms(problem, design, problem.scene.draw("train", views, start=number * views)))
+        on_step(number + 1, REPEATS + 1)
+    median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
     total = sum(median.values())
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())
-    threads = torch.get_num_threads()
-    views = problem.scene.settings.optimize.views
     return Cost(views=views, side_px=problem.training_px, threads=threads, ms=total, parts=parts)
-
-
-def in_turn(
-    calls: Mapping[Name, Callable[[], Answer]],
-    rounds: int,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> dict[Name, list[Answer]]:
-    """What each call returns in each of some rounds, all calls in turn in every round; a round before them warms up."""
-    answers: dict[Name, list[Answer]] = {name: [] for name in calls}
-    for number in range(rounds + 1):
-        for name, call in calls.items():
-            answers[name].append(call())
-        progress(number + 1, rounds + 1)
-    return {name: values[1:] for name, values in answers.items()}
-
-
-def steps_ms(problem: Problem, design: Tensor) -> Callable[[], dict[str, float]]:
-    """Milliseconds of each part of one step that shows `design`: of the first step, then of the next each time."""
-    views, numbers = problem.scene.settings.optimize.views, count()
-    return lambda: _step_ms(problem, design, problem.scene.draw("train", views, start=next(numbers) * views))
 
 
 def _step_ms(problem: Problem, design: Tensor, conditions: Conditions) -> dict[str, float]:

@@ -94,7 +94,7 @@ def measure_terms(
         for term, pictures in zip(wholes, whole[1:], strict=True):
             shows = bool(rows[term.name].codes_mean)
             rows[term.name] = _row(problem, term, whole[0], pictures, boxes).changed(in_training=shows)
-        judged = {row.name: row for row in _judged(terms, rows, threshold)}
+        judged = _judged(terms, rows, threshold)
         gone, setup, together = [t for t in on if t.key and judged[t.name].verdict == "can go"], base, None
         for term in gone:
             setup = term.change(setup) or setup
@@ -110,26 +110,19 @@ def measure_terms(
     )
 
 
-def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: float) -> list[TermError]:
-    """The rows of all terms, with verdicts; terms without a row are off."""
-    verdicts, sum_of_gone = {}, 0.0
-    changes = {name: row.confidence or 0.0 for name, row in rows.items()}
+def _judged(terms: tuple[Term, ...], rows: dict[str, TermError], threshold: float) -> dict[str, TermError]:
+    """The rows of all terms by name, with verdicts; terms without a row are off."""
+    judged = {term.name: TermError(name=term.name, key=term.key, verdict="off") for term in terms}
+    changes, sum_of_gone = {name: row.confidence or 0.0 for name, row in rows.items()}, 0.0
     for term in sorted((t for t in terms if t.name in rows), key=lambda t: changes[t.name]):
         change = changes[term.name]
         small = change < threshold or change == 0
-        if not term.modeled:
-            verdicts[term.name] = "left out" if small else "missing"
-            continue
-        if small and term.key:  # errors that are small one by one may add up
+        if term.modeled and small and term.key:  # errors that are small one by one may add up
             small = sum_of_gone + change < threshold or change == 0
             sum_of_gone += change
-        verdicts[term.name] = "can go" if small else "keep"
-    return [
-        rows[t.name].changed(verdict=verdicts[t.name])
-        if t.name in rows
-        else TermError(name=t.name, key=t.key, verdict="off")
-        for t in terms
-    ]
+        verdict = ("can go" if small else "keep") if term.modeled else ("left out" if small else "missing")
+        judged[term.name] = rows[term.name].changed(verdict=verdict)
+    return judged
 
 
 def _row(problem: Problem, term: Term, base: Tensor, changed: Tensor, boxes: np.ndarray | None) -> TermError:
@@ -158,26 +151,24 @@ def _squares(
     """(1 + len(setups))×N×3×S×S views as the primary classifier gets them: the base setup's, then each other one's."""
     size_px, stack = (side_px, side_px), []
     for rows in _chunks(len(base.conditions), side_px):
-        views, parts = _views(base, base.conditions[rows], size_px), []
+        known, parts = base.conditions[rows], []
+        views = see(base.stage, base.shown, known, size_px)
         for setup in (base, *setups):
-            conditions, known = setup.conditions[rows], base.conditions[rows]
+            conditions = setup.conditions[rows]
             same = setup.stage is base.stage and (conditions.pose.printed_scale == known.pose.printed_scale).all()
-            shown = relit(views, conditions) if same else _views(setup, conditions, size_px)
-            parts.append(_pictures(problem, shown, setup.shown))
+            seen = relit(views, conditions) if same else see(setup.stage, setup.shown, conditions, size_px)
+            parts.append(_pictures(problem, seen, setup.shown))
         stack.append(torch.stack(parts))
-        on_view(len(base.conditions))
+        on_view(len(known))
     return torch.cat(stack, 1)
 
 
-def _views(setup: Setup, conditions: Conditions, size_px: tuple[int, int]) -> Views:
-    return see(setup.stage, setup.shown, conditions, size_px)
-
-
 def _pictures(problem: Problem, views: Views, shown: Shown) -> Tensor:
-    """A whole photograph goes through a real JPEG, a training view as training exposes it."""
+    """A whole photograph goes through a real JPEG file, a training view as training exposes it."""
     pictures, quality = expose(views, shown, jpeg=views.reduced), views.conditions.sensor.jpeg
     if not views.reduced and quality.any():
-        pictures = _stored(pictures, quality)
+        files = [image_bytes(as_pixels(p), "JPEG", {"quality": int(q)}) for p, q in zip(pictures, quality, strict=True)]
+        pictures = torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])
     return center_square(pictures, problem.classifiers[0].input_px)
 
 
@@ -185,9 +176,3 @@ def _chunks(views: int, side_px: int) -> list[slice]:
     """The views to render at a time."""
     count = max(1, _PIXELS_AT_ONCE // side_px**2)
     return [slice(first, first + count) for first in range(0, views, count)]
-
-
-def _stored(pictures: Tensor, quality: np.ndarray) -> Tensor:
-    """Pictures N×3×H×W that were JPEG files in between."""
-    files = [image_bytes(as_pixels(p), "JPEG", {"quality": int(q)}) for p, q in zip(pictures, quality, strict=True)]
-    return torch.stack([from_pixels(image_pixels(file), pictures.device) for file in files])

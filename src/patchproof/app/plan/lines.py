@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from patchproof.app.plan.cost import Cost
 from patchproof.app.plan.errors import TermError
 from patchproof.app.plan.plan import Geometry, Markers, Plan, Resolution, Surface
-from patchproof.app.plan.samples import sample_lines
 from patchproof.optimizer.places import place_lines
 from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 
@@ -25,9 +23,17 @@ def geometry_lines(plan: Geometry) -> list[str]:
 def measured_lines(plan: Plan) -> list[str]:
     """What a plan measured."""
     lines = _term_lines(plan)
-    lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)", *sample_lines(plan.samples)]
+    lines += [f"chance, at the draft's rate of {plan.draft.rate:.0%} (95 %)"]
+    lines += [
+        f"  {s.name:27} {s.n:4d} samples leave ±{s.half_width:.3f}, {s.next_n} would ±{s.next_half_width:.3f}"
+        for s in plan.samples
+    ]
     lines += ["not modeled", *(f"  {text}" for text in plan.omitted)]
-    return lines if plan.cost is None else [*lines, *_cost_lines(plan.cost)]
+    if (cost := plan.cost) is not None:
+        views = f"{cost.views} views of {cost.side_px} px, {cost.threads} threads"
+        lines += [f"cost of a step ({views}): {cost.ms:.0f} ms"]
+        lines += [f"  {part.name:32} {part.ms:7.0f} ms {part.share:6.1%}" for part in cost.parts]
+    return lines
 
 
 def _surface_lines(surface: Surface) -> list[str]:
@@ -50,17 +56,14 @@ def _resolution_lines(views: Resolution) -> list[str]:
         f"  {far:.2f} to {near:.2f} px/mm at the network's {views.network_px} px, {far_photo:.2f} to {near_photo:.2f} "
         f"in photographs of {views.photo_px[0]} × {views.photo_px[1]} px (5 % and 95 % of the views)"
     ]
+    density = f"{views.texels_per_px:.1f} per pixel along a side in the closest"
     if views.design_px is None or views.printed_px is None:
-        return [
-            *lines,
-            f"  {views.texels} texels may change, {views.texels_per_px:.1f} per pixel along a side in the closest view",
-        ]
-    width, height = views.design_px
+        return [*lines, f"  {views.texels} texels may change, {density} view"]
     return [
         *lines,
-        f"  design {width} × {height} texels, {views.texels_per_px:.1f} per pixel along a side in the closest possible "
-        f"view ({views.closest_px_per_mm:.2f} px/mm)",
-        f"  printed as {views.printed_px[0]} × {views.printed_px[1]} px, {views.printed_px_per_mm:.1f} per mm",
+        "  design {} × {} texels, ".format(*views.design_px)
+        + f"{density} possible view ({views.closest_px_per_mm:.2f} px/mm)",
+        "  printed as {} × {} px, ".format(*views.printed_px) + f"{views.printed_px_per_mm:.1f} per mm",
     ]
 
 
@@ -97,8 +100,3 @@ def _term_line(term: TermError) -> str:
         f"  {term.name:23} {term.codes_mean:11.2f} {term.codes_p95:6.1f}   {term.confidence:.3f} ({term.bias:+.3f})"
         f"   {verdict}{key}{unseen}"
     )
-
-
-def _cost_lines(cost: Cost) -> list[str]:
-    lines = [f"cost of a step ({cost.views} views of {cost.side_px} px, {cost.threads} threads): {cost.ms:.0f} ms"]
-    return [*lines, *(f"  {part.name:32} {part.ms:7.0f} ms {part.share:6.1%}" for part in cost.parts)]

@@ -6,6 +6,11 @@ light, camera and renderer would leave, what chance leaves, and the cost of a st
 optimizes: a draft of a few steps is what the terms are measured with, because a classifier that a design says nothing
 to would miss none of them.
 
+Chance is what selection and promise may be off by with as many samples as they take, and with four times as many, which
+is the next rung: it shrinks with their root, cost grows with them. The promise's interval is Wilson's, of views that
+share no session. What photographs can say depends on how much sessions differ, which the promise measures: the sheet's
+plan page has it.
+
 Left out on purpose: deciding for the user. The plan says what can go; the scene file says what is modeled.
 """
 
@@ -21,12 +26,13 @@ from torch import Tensor
 
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
-from patchproof.app.plan.samples import Sample, sample_plan
+from patchproof.base.claims import wilson
 from patchproof.base.strict import Strict
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.places import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
+from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.scene.bent_scene import other_surface
 from patchproof.scene.interface import PieceScene, needs_piece
 from patchproof.scene.open_scene import OpenScene
@@ -37,7 +43,7 @@ from patchproof.sheets.piece import SMALLEST_MARKER_MM
 
 TERM_VIEWS = 16
 DRAFT_VIEWS = 120  # that the draft is trained on
-_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
+_NEXT = 4  # times as many samples
 
 
 class Surface(Strict):
@@ -81,6 +87,16 @@ class Draft(Strict):
 
     steps: int
     rate: float
+
+
+class Sample(Strict):
+    """Half the width of a 95 % interval, of a mean confidence or a rate in [0, 1], from `n` and from `next_n`."""
+
+    name: str
+    n: int
+    half_width: float
+    next_n: int
+    next_half_width: float
 
 
 class Geometry(Strict):
@@ -184,6 +200,17 @@ def marker_plan(scene: PieceScene) -> Markers:
         needed_mm=max(MODULES * PX_PER_MODULE / float(px_per_mm), SMALLEST_MARKER_MM),
         printed_mm=scene.piece.marker_mm,
         unreadable_share=scene.unreadable_share,
+    )
+
+
+def sample_plan(rate: float, standard_error: float) -> tuple[Sample, ...]:
+    """The samples' ladder at a rate; `standard_error` is that of the selection set's mean confidence."""
+    selection = [1.96 * standard_error / k**0.5 for k in (1, _NEXT)]
+    promise = [np.ptp(wilson(round(rate * n), n)) / 2 for n in (PROMISE_VIEWS, _NEXT * PROMISE_VIEWS)]
+    rows = (("selection: mean confidence", SELECT_VIEWS, selection), ("promise: rate", PROMISE_VIEWS, promise))
+    return tuple(
+        Sample(name=name, n=n, half_width=now, next_n=_NEXT * n, next_half_width=after)
+        for name, n, (now, after) in rows
     )
 
 

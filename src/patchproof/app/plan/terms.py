@@ -19,7 +19,7 @@ from patchproof.optimizer.problem import Problem
 from patchproof.render.pixels import Shown
 from patchproof.render.stage import Stage, set_stage
 from patchproof.scene.conditions import Conditions, without
-from patchproof.scene.interface import Part, Scene
+from patchproof.scene.interface import Part
 from patchproof.scene.mesh_scene import needs_mesh
 from patchproof.scene.patch_scene import needs_patch
 from patchproof.scene.placement import Placement
@@ -53,22 +53,20 @@ class Term:
 def scene_terms(problem: Problem, design: Tensor, other_surface: Placement | None) -> tuple[Term, ...]:
     """The terms that a problem's kind of scene has."""
     scene = problem.scene
-    effects = {table: _shown_by(scene, table) for table in ("light", "printer", "camera")}
+    effects = {
+        table: tuple(term for term in effect_terms(table) if scene.models(EFFECT[term.name]))
+        for table in ("light", "printer", "camera")
+    }
     own = {part: Term(part.name, part.key, partial(_without_part, part=part), whole=part.whole) for part in scene.PARTS}
     terms = (*effects["light"], *(term for term in own.values() if not term.key))
     if scene.HAS_PIECE:
         terms = (*terms, Term(PRINTER, "printer.profile", partial(_without_printer, problem, design)))
     terms = (*terms, *effects["printer"], *effects["camera"], *(term for term in own.values() if term.key))
     if other_surface is not None:
-        lies = needs_patch(scene).placement
+        lies, change = needs_patch(scene).placement, partial(_on_surface, placement=other_surface)
         name = "bent piece" if lies.is_flat else f"{lies.family}, not a card"
-        change = partial(_on_surface, placement=other_surface)
         terms = (*terms, Term(name, "patch.bend", change, modeled=not lies.is_flat))
     return terms
-
-
-def _shown_by(scene: Scene, table: str) -> tuple[Term, ...]:
-    return tuple(term for term in effect_terms(table) if scene.models(EFFECT[term.name]))
 
 
 def effect_terms(table: str) -> tuple[Term, ...]:
