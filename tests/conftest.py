@@ -29,6 +29,14 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_core():
+    """What takes all free cores where nothing is said takes one: the others have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("patchproof.base.workers.free_cores", lambda: 1)
+        yield
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of real networks, meshes and photographs."""

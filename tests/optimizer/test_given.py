@@ -30,6 +30,7 @@ from patchproof.sheets.raster import attached_manifest
 from test_optimize import scene_with, toml
 
 RNG = np.random.default_rng(0)
+SMALL = {"camera__photo_px": [96, 96], "background__color": [0.5, 0.5, 0.5]}
 DRAFT = {"promise_views": 8, "controls": ("bare",)}
 
 
@@ -48,9 +49,9 @@ def journey(tmp_path_factory):
     """A folder with picture.png, scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
     folder = tmp_path_factory.mktemp("given")
     Image.fromarray(noise(230, 230)).save(folder / "picture.png")  # 2 px per mm: as fine as designs are printed
-    toml(folder / "scene.toml", camera__photo_px=[1600, 1200], background__color=[0.5, 0.5, 0.5])
+    toml(folder / "scene.toml", camera__photo_px=[1200, 900])
     run, pdf, photos = folder / "run", folder / "sheet.pdf", folder / "photos"
-    assert command("import", folder / "picture.png", folder / "scene.toml", "--out", run, "--promise", 8) == 0
+    assert command("import", folder / "picture.png", folder / "scene.toml", "--out", run, "--promise", 12) == 0
     assert command("sheet", run, "--out", pdf) == 0
     assert command("reprint", pdf, "--run", run, "--n", 2, "--out", photos) == 0
     judged = ("--models", "module:fake_networks.red_against_blue", "--ledger", 0)
@@ -66,7 +67,7 @@ def test_pixels_come_through_unchanged_where_no_marker_lies(journey):
 
 def test_pixels_of_a_coarse_picture_become_blocks(tmp_path):
     picture = noise(50, 50)
-    run = import_patch(picture, scene_with(tmp_path, camera__photo_px=[96, 96]), tmp_path / "run", **DRAFT)
+    run = import_patch(picture, scene_with(tmp_path, **SMALL), tmp_path / "run", **DRAFT)
     assert run.design.shape == (250, 250, 3)  # 115 mm at 2 px per mm or more
     assert (run.design[free(run)] == picture.repeat(5, 0).repeat(5, 1)[free(run)]).all()
     assert run.details["imported"]["dpi"] == pytest.approx(25.4 * 50 / 115, abs=0.05)
@@ -94,7 +95,7 @@ def test_the_sheet_of_another_template_belongs_to_the_same_run_read_anew(journey
 
 
 def test_designs_on_one_scene_have_markers_of_their_own(tmp_path):
-    scene = scene_with(tmp_path, camera__photo_px=[96, 96])
+    scene = scene_with(tmp_path, **SMALL)
     runs = [import_patch(noise(64, 64), scene, tmp_path / name, **DRAFT) for name in "ab"]
     a, b = ({marker.id for marker in run.scene.piece.markers} for run in runs)
     assert not a & b and runs[0].scene.sheet_id != scene.sheet_id
@@ -174,11 +175,11 @@ def test_pictures_are_read_like_photographs(tmp_path, kind):
 
 def test_gamut_is_the_printers_own_table(tmp_path):
     picture = np.full((64, 64, 3), (0, 255, 0), np.uint8)
-    record = import_patch(picture, scene_with(tmp_path, camera__photo_px=[96, 96]), tmp_path / "run", **DRAFT).details
+    record = import_patch(picture, scene_with(tmp_path, **SMALL), tmp_path / "run", **DRAFT).details
     green = float(load_printer("coated").gamut[0, -1, 0])
     assert green > 2 and record["imported"]["out_of_gamut"] == 1
     assert record["imported"]["delta_e00"] == pytest.approx(green, abs=0.01)
-    exact = scene_with(tmp_path, camera__photo_px=[96, 96], printer__profile="identity")
+    exact = scene_with(tmp_path, **SMALL, printer__profile="identity")
     record = import_patch(picture, exact, tmp_path / "exact", **DRAFT).details["imported"]
     assert record["out_of_gamut"] == record["delta_e00"] == 0
     assert not list(record["notes"])
@@ -238,7 +239,7 @@ def test_a_stopped_import_leaves_an_earlier_run_as_it_was(tmp_path, monkeypatch)
     def stop(*_):
         raise KeyboardInterrupt
 
-    scene, out = scene_with(tmp_path, camera__photo_px=[96, 96]), tmp_path / "run"
+    scene, out = scene_with(tmp_path, **SMALL), tmp_path / "run"
     import_patch(noise(64, 64), scene, out, **DRAFT)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     monkeypatch.setattr(run_module, "promise_of", stop)
@@ -256,14 +257,14 @@ def several(tmp_path_factory):
     (folder / "pictures").mkdir()
     for name, color in (("red", (220, 30, 30)), ("gray", (128, 128, 128)), ("blue", (30, 30, 220))):
         Image.new("RGB", (64, 64), color).save(folder / "pictures" / f"{name}.png")
-    scene = toml(folder / "scene.toml", background__color=[0.5, 0.5, 0.5])
+    scene = toml(folder / "scene.toml")
     assert command("import", folder / "pictures", scene, "--out", folder / "runs", "--promise", 8) == 0
     return folder
 
 
 def test_a_folder_of_pictures_is_compared_on_the_same_conditions(several, capsys):
     runs, out = [several / "runs" / name for name in ("blue", "gray", "red")], several / "compared"
-    assert command("evaluate", *runs, "--out", out, "--n", 12) == 0
+    assert command("evaluate", *runs, "--out", out, "--n", 6) == 0
     assert "The best two, under conditions that had no say in choosing them" in capsys.readouterr().out
     tables = json.loads((out / "designs.json").read_text())["tables"]
     order = [row[0] for row in tables["designs"]["rows"]]
@@ -271,14 +272,14 @@ def test_a_folder_of_pictures_is_compared_on_the_same_conditions(several, capsys
     assert [row[0] for row in tables["fresh"]["rows"]] == order[:2] and tables["fresh"]["rows"][0][6] is None
     rates = {row[0]: row[3]["value"] for row in tables["designs"]["rows"]}
     for row in tables["designs"]["rows"][1:]:
-        assert row[6]["value"] == pytest.approx(rates[row[0]] - rates["red"]) and row[6]["n"] == 12
+        assert row[6]["value"] == pytest.approx(rates[row[0]] - rates["red"]) and row[6]["n"] == 6
     assert "data:image/png" in (out / "designs.html").read_text("utf-8")
     assert command("evaluate", *runs) == 2 and "--out" in capsys.readouterr().err
     assert command("evaluate", runs[0], "--out", out) == 2
 
 
 def test_runs_that_are_not_seen_alike_are_not_compared(several, tmp_path):
-    other = scene_with(several, camera__photo_px=[96, 64], background__color=[0.5, 0.5, 0.5])
+    other = scene_with(several, **SMALL | {"camera__photo_px": [96, 64]})
     import_patch(noise(64, 64), other, tmp_path / "other", **DRAFT)
     with pytest.raises(
         Refused, match=r"runs that are seen alike, as red is, got other: compare runs whose scenes differ"

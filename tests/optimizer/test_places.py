@@ -33,8 +33,9 @@ SETTINGS = {
     "patch": {"place": "auto", "side": "+z", "width_mm": 60, "height_mm": 60},
     "target": {"label": "bright", "models": ["module:fake_networks.bright"]},
     "view": STRAIGHT,
+    "background": {"color": [0.5, 0.5, 0.5]},
     "camera": {"photo_px": [64, 64]},
-    "optimize": {"steps": 2, "gamut": 0.0},
+    "optimize": {"steps": 1, "views": 2, "gamut": 0.0},
 }
 SHARP = {"camera__photo_px": [1600, 1200]}  # photographs in which small markers are read: a piece hardly larger
 
@@ -50,8 +51,9 @@ def open_scene(base=".", mesh=None, seed=0, **changes):
 
 
 @pytest.fixture(autouse=True)
-def few_views_for_the_size_of_markers(monkeypatch):
+def few_views_for_the_size_of_markers_and_few_points(monkeypatch):
     monkeypatch.setattr("patchproof.scene.patch_scene.SCALE_VIEWS", 32)
+    monkeypatch.setattr("patchproof.scene.places._POOL", 32)
 
 
 @pytest.fixture
@@ -80,13 +82,16 @@ class Counted(Bright):
 
 @functools.cache
 def searched():
-    """The place that a whole search of a network chooses, and the passes of that network in it."""
+    """The place that a search of a third of the default one's passes chooses, and those of its network in it."""
     network = Counted()
     classifier = pp.classifier_of(network, 32, ["bright", "dark"], "python:bright")
     network.passes = 0
     load_classifier(classifier, Path())
     doubting, network.passes = network.passes, 0  # whether the network can be trusted is asked first
-    place = choose_place(open_scene(), models=[classifier])
+    with pytest.MonkeyPatch.context() as patch:
+        for name, count in (("PASSES", 200), ("PLACES", 12), ("TURNED", 2), ("HELD_OUT_VIEWS", 8)):
+            patch.setattr(places, name, count)
+        place = choose_place(open_scene(), models=[classifier])
     return place, network.passes - doubting
 
 
@@ -101,7 +106,8 @@ def test_the_place_is_where_the_network_looks():
 
 
 def test_another_side_is_chosen_where_the_views_show_it_better(monkeypatch):
-    monkeypatch.setattr(places, "PLACES", 8)
+    for name, count in (("PASSES", 120), ("PLACES", 8), ("TURNED", 1), ("HELD_OUT_VIEWS", 8)):
+        monkeypatch.setattr(places, name, count)
     scene = open_scene(mesh=trimesh.creation.box((300, 300, 300)), view__azimuth_deg=[65, 75])
     assert choose_place(scene).at[0] == 150  # azimuth 90 faces +x where 0 faces +z
 
@@ -142,7 +148,7 @@ def test_places_fit_are_apart_and_the_same_for_the_same_seed():
 
 
 def test_a_gap_is_no_larger_than_asked():
-    ball, small = trimesh.creation.icosphere(4, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
+    ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
     least = min(spot.placement.gap_mm for spot in Ground(open_scene(mesh=ball, **small)).spots(12))
     with pytest.raises(Refused, match=r"Expected a place for a piece of .* mm that views face, got none"):
         Ground(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
@@ -185,9 +191,10 @@ def test_with_front_left_out_views_face_the_patch_as_before():
 def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     place, passes = searched()
     assert place.passes == passes and place.run_share == place.passes / default_passes()
+    assert 200 - 3 * 2 * places.DRAFT_VIEWS < place.passes <= 200
     screens = (places.PLACES + 3 * places.TURNED) * 2 * places.SCREEN_VIEWS + places.SCREEN_VIEWS
     drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
-    assert screens + drafts <= default_passes() / 4 and default_passes() / 5 < place.passes <= default_passes() / 4
+    assert screens + drafts <= places.PASSES <= default_passes() / 4
     assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
 
 
@@ -261,7 +268,9 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
     monkeypatch.setattr(places, "choose_place", no_search)
     loaded = pp.load_run(out)
     np.testing.assert_array_equal(loaded.scene.placement.world_from_piece, first.scene.placement.world_from_piece)
-    assert loaded.scene.sheet_id == first.scene.sheet_id
+    details = json.loads((out / "run.json").read_text())
+    again = pp.make_scene(validated(SceneSettings, details["settings"], "run"), base=tmp_path)
+    assert loaded.scene.sheet_id == first.scene.sheet_id == again.sheet_id, "its settings are a scene with that place"
     design = (out / "design.png").read_bytes()
     (out / "run.json").unlink()
     again = pp.optimize(path, out, resume=True)
@@ -271,13 +280,6 @@ def test_a_run_keeps_its_place_and_neither_loads_nor_resumes_by_searching(tmp_pa
     (out / "place.json").write_text("{")
     with pytest.raises(Refused, match="Expected the record of a search"):
         pp.optimize(scene_file(tmp_path), out, resume=True)
-
-
-def test_the_settings_of_a_run_are_a_scene_file_with_that_place(tmp_path, a_small_run):
-    chosen = pp.optimize(scene_file(tmp_path), tmp_path / "run")
-    details = json.loads((tmp_path / "run" / "run.json").read_text())
-    again = pp.make_scene(validated(SceneSettings, details["settings"], "run"), base=tmp_path)
-    assert again.sheet_id == chosen.scene.sheet_id
 
 
 def test_the_picture_shows_the_places_and_the_chosen_outline(tmp_path):
