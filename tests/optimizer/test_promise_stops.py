@@ -25,7 +25,7 @@ from test_verify_verdict import promise_of
 @pytest.fixture
 def promised(tmp_path):
     """Promises a blue design's rate on up to 40 views in sessions of four; counts are told to `told`."""
-    problem = set_problem(scene_with(tmp_path, target__label="blue"))
+    problem = set_problem(scene_with(tmp_path, target__label="blue", background__color=[0.5, 0.5, 0.5]))
     blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
     conditions = problem.scene.draw("promise", 40, per_session=PER_SESSION)
@@ -74,7 +74,8 @@ def test_a_control_that_was_left_out_is_compared_where_both_were_shown():
 
 def test_a_scene_asks_for_a_half_width_and_a_number_of_views_for_all_of_them(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "PROMISE_VIEWS", 40)
-    scene = scene_with(tmp_path, optimize__steps=1, promise__half_width=0.3)
+    gray = {"background__color": [0.5, 0.5, 0.5]}
+    scene = scene_with(tmp_path, optimize__steps=1, promise__half_width=0.3, **gray)
     assert SceneSettings.model_fields["promise"].default.half_width == 0.04
     whole = run.optimize_scene(scene, tmp_path / "run", controls=("bare",))
     assert whole.promise.n == 20 and not whole.promise.draft
@@ -106,7 +107,7 @@ def held(runs, rate, correlation, looks, half_width=0.05, seed=3):
 
 
 def test_stopping_leaves_the_interval_its_level():
-    share, views = held(300, 0.9, 0.3, _looks(400, PER_SESSION)[1:])
+    share, views = held(120, 0.9, 0.3, _looks(400, PER_SESSION)[1:])
     assert share >= 0.92 and views < 360
 
 
@@ -150,10 +151,10 @@ LOOKS = [50, 75, 100]
 
 
 def test_leaving_controls_out_leaves_their_difference_its_level():
-    assert told_apart(300, 0, 0.2, LOOKS)[1] <= 0.08, "no difference is not told for one more often"
-    share, _, sessions = told_apart(300, 0.15, 0.2, LOOKS)
+    assert told_apart(200, 0, 0.2, LOOKS)[1] <= 0.08, "no difference is not told for one more often"
+    share, _, sessions = told_apart(200, 0.15, 0.2, LOOKS)
     assert share >= 0.92 and sessions < 100
-    assert told_apart(100, 0.5, 0.2, LOOKS)[2] == 50
+    assert told_apart(40, 0.5, 0.2, LOOKS)[2] == 50
 
 
 @cache

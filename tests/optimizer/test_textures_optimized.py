@@ -36,6 +36,8 @@ models = ["builtin"]
 azimuth_deg = [-40, 40]
 elevation_deg = [0, 25]
 distance_mm = [600, 800]
+[background]
+color = [0.5, 0.5, 0.5]
 [camera]
 photo_px = [96, 96]
 [optimize]
@@ -52,9 +54,9 @@ PATCHES = {
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """A promise of few views, where its rate does not matter, and a checkpoint every other step."""
-    monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_AFTER", 4)
-    monkeypatch.setattr(loop, "SELECT_VIEWS", 8)
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
 
 
 def textures():
@@ -171,10 +173,10 @@ def test_a_texture_run_is_read_back_evaluated_and_refused_a_sheet(tmp_path, caps
     finished = optimize_scene(scene_file(tmp_path, "texture"), tmp_path / "run")
     again = load_run(tmp_path / "run")
     np.testing.assert_array_equal(again.design, finished.design)
-    assert again.promise == finished.promise and again.promise.n == 16
+    assert again.promise == finished.promise and again.promise.n == 8
     assert set(again.promise.controls) == {"bare", "mean", "gray", "noise"}
-    result = evaluate_run(tmp_path / "run", n=8)
-    assert result["n"] == 8 and (tmp_path / "run" / "evaluate.json").is_file()
+    result = evaluate_run(tmp_path / "run", n=4)
+    assert result["n"] == 4 and (tmp_path / "run" / "evaluate.json").is_file()
     assert command("sheet", tmp_path / "run", "--out", tmp_path / "sheet.pdf") == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("Expected a run of a patch, got one of the object's own texture:")
