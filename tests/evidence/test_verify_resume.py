@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 import weakref
 from concurrent.futures import Future
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from synthetic_photos import make_manifest, save
 
 from patchproof.app.verify import _networks, verify_photos
 from patchproof.base.strict import Refused
-from patchproof.base.workers import WorkerDied
+from patchproof.base.workers import WorkerDied, can_fork
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence import batch, measure, placed
@@ -29,12 +28,6 @@ from patchproof.sheets.manifest import dump_manifest
 from test_verify_run import NET, promise, shot
 
 WRITTEN = ("report.json", "report.csv", "report.html", "photos.jsonl")
-KILLED = """
-import os, signal, sys
-from patchproof.app.verify import verify_photos
-die = lambda done, total: done == 3 and os.kill(os.getpid(), signal.SIGKILL)
-verify_photos(sys.argv[1], sys.argv[2], sys.argv[3], on_photo=die)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +57,27 @@ def sheet(tmp_path_factory) -> Path:
     return path
 
 
+def killed_after_three(folder: Path, sheet: Path, out: Path) -> None:
+    def die(done, total):
+        if done == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    verify_photos(folder, sheet, out, on_photo=die)
+
+
 def test_a_kill_costs_what_was_in_work_and_not_the_report(folder, sheet, tmp_path):
-    verify_photos(folder, sheet, tmp_path / "whole")
-    killed, out = [sys.executable, "-c", KILLED, str(folder), str(sheet), str(tmp_path / "killed")], tmp_path / "killed"
-    assert subprocess.run(killed, check=False).returncode == -signal.SIGKILL
+    verify_photos(folder, sheet, tmp_path / "whole", ledger_photos=2)
+    out = tmp_path / "killed"
+    process = get_context("fork" if can_fork() else "spawn").Process(target=killed_after_three, args=(folder, sheet, out))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     assert len((out / "photos.jsonl").read_text().splitlines()) == 3 and not (out / "report.json").exists()
     with pytest.raises(Refused, match="unfinished verification: add --resume"):
         verify_photos(folder, sheet, out)
     with open(out / "photos.jsonl", "a") as file:
         file.write('{"file": "b4.jpg", "sha')  # a line that the kill cut short
-    verify_photos(folder, sheet, out, resume=True)
+    verify_photos(folder, sheet, out, resume=True, ledger_photos=2)
     for name in WRITTEN:
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     pictures = {p.name: p.read_bytes() for p in (out / "pictures").iterdir()}
@@ -163,7 +167,8 @@ def test_a_figure_that_is_no_number_costs_one_photograph(folder, monkeypatch):
     blur_px = placed.blur_px
     monkeypatch.setattr(batch, "measure", wrong)
     monkeypatch.setattr(placed, "blur_px", lambda m: float("nan") if names[-1] == "b3.jpg" else blur_px(m))
-    found = gather_evidence(folder, make_manifest(promise()), Options([NET], identity_printer())).photos
+    options = Options([NET], identity_printer(), ledger_photos=0)
+    found = gather_evidence(folder, make_manifest(promise()), options).photos
     assert [p.file for p in found if p.status == "rejected"] == ["a.JPG", "b3.jpg"]
 
 
@@ -198,7 +203,7 @@ def test_names_of_any_length_and_bytes_are_reported(folder, sheet, tmp_path):
     photos.mkdir()
     for name, source in ((b"\xff" * 9, "b0.jpg"), (b"x" * 245, "b1.jpg")):
         (photos / os.fsdecode(name + b".jpg")).write_bytes((folder / source).read_bytes())
-    report = verify_photos(photos, sheet, tmp_path / "report")
+    report = verify_photos(photos, sheet, tmp_path / "report", ledger_photos=0)
     assert sorted(p.file for p in report.photos) == ["\\udcff" * 9 + ".jpg", "x" * 245 + ".jpg"]
     assert {p.code for p in report.photos} == {None} and len(list((tmp_path / "report" / "pictures").iterdir())) >= 4
 

@@ -268,13 +268,13 @@ def folder(tmp_path_factory):
 
 
 def verified(folder, jobs=1, progress=lambda done, total: None, **options):
-    options = Options([NET], identity_printer(), **options)
+    options = Options([NET], identity_printer(), **{"ledger_photos": 0} | options)
     return gather_evidence(folder, make_manifest(promise()), options, jobs=jobs, progress=progress)
 
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):
     calls = []
-    report = verified(folder, progress=lambda done, total: calls.append((done, total)))
+    report = verified(folder, progress=lambda done, total: calls.append((done, total)), ledger_photos=2)
     assert [p.file for p in report.photos] == ["a.JPG", *(f"b{i}.jpg" for i in range(6)), "c.png"]
     assert [p.code for p in report.photos] == ["unreadable", *[None] * 6, "too_few_markers"]
     summary = report.summary
@@ -302,7 +302,7 @@ def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(
         save(picture.astype(np.uint8), tmp_path / f"{name}.png")
 
     def report():
-        return gather_evidence(tmp_path, make_manifest(promise()), Options([always], identity_printer()))
+        return gather_evidence(tmp_path, make_manifest(promise()), Options([always], identity_printer(), ledger_photos=0))
 
     nothing = report()
     for photo in nothing.photos:

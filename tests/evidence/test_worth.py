@@ -69,13 +69,13 @@ def test_the_page_says_so_in_its_first_line():
 
 
 def test_a_design_that_is_not_better_exits_with_1_only_where_that_is_asked(tmp_path, monkeypatch):
-    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
+    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
     scene = tmp_path / "scene.toml"
     scene.write_text(
         '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 60\nheight_mm = 60\n'
         '[target]\nlabel = "mug"\nmodels = ["builtin"]\n[camera]\nphoto_px = [96, 96]\n'
-        "[optimize]\nsteps = 1\nviews = 1\n"
+        "[optimize]\nsteps = 1\nviews = 1\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
     )
 
     def run(name, *more):
