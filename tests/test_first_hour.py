@@ -87,8 +87,8 @@ def messed_up(photos: Path) -> None:
     (third / "._photo.jpg").write_bytes(bytes(99))
 
 
-def spent(folder: Path, typed: Typed) -> dict[str, tuple[str, float]]:
-    """What each line said, and its seconds; every line has to end as `HOUR` says."""
+def spent(folder: Path, typed: Typed, settings: str = "") -> dict[str, tuple[str, float]]:
+    """What each line said, and its seconds; every line has to end as `HOUR` says. Settings are added to the scene."""
     prepared(folder)
     said = {}
     for line, wanted in HOUR:
@@ -97,7 +97,7 @@ def spent(folder: Path, typed: Typed) -> dict[str, tuple[str, float]]:
         said[line] = text, seconds
         if line.startswith("new") and code == 0:
             edited = (folder / "scene.toml").read_text(encoding="utf-8").replace("340  ", "345  ")  # as measured
-            (folder / "scene.toml").write_text(edited, encoding="utf-8")
+            (folder / "scene.toml").write_text(edited + settings, encoding="utf-8")
         if line.startswith("reprint"):
             messed_up(folder / "photos")
     return said
@@ -128,7 +128,9 @@ def typed_apart(line: str, folder: Path) -> tuple[int, str, float]:
 
 def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)  # what they cost is time
-    said = {line: text for line, (text, _) in spent(tmp_path, typed_here).items()}
+    monkeypatch.setattr("patchproof.optimizer.run.DRAFT", (24, 40))
+    small = "[camera]\nphoto_px = [1040, 780]\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
+    said = {line: text for line, (text, _) in spent(tmp_path, typed_here, small).items()}
     asked, new, preview, optimize, sheet, _, refused, verify = said.values()
     assert 'add --label with what it is to be recognized as: "lamp", "vase", "stone"' in asked
     assert "length: 340 mm, by the file's units" in new and "next: patchproof preview scene.toml" in new
