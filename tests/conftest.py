@@ -6,6 +6,7 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 
@@ -13,6 +14,7 @@ from patchproof.base.workers import keep_freed_memory
 
 # the tests run side by side, a process per core, and so do the programs that they start
 torch.set_num_threads(1)
+cv2.setNumThreads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
 keep_freed_memory()
 

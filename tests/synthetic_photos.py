@@ -125,8 +125,8 @@ def view(azimuth_deg=0.0, elevation_deg=0.0, distance_mm=500.0, roll_deg=0.0, si
     return plane_homography(intrinsics(fov_deg, size_px), look_at(eye, [0, 0, 0], roll_deg), world_from_page)
 
 
-def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, light=0.8, jpeg=None, seed=0, fine=4):
-    """uint8 sRGB photo: 4×4 exact samples per pixel, Gaussian blur, light and noise in linear light, JPEG if asked."""
+def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, light=0.8, jpeg=None, seed=0, fine=2):
+    """uint8 sRGB photo: `fine`² exact samples per pixel, Gaussian blur, light and noise in linear light, JPEG if asked."""
     width, height = size_px
     raster_from_px = np.diag([PX_PER_MM, PX_PER_MM, 1.0]) @ np.linalg.inv(px_from_mm)
     # warpPerspective wants index-based matrices: index i of the fine grid lies at (i + 0.5) / fine px
@@ -160,9 +160,9 @@ def save(srgb: np.ndarray, path: Path, focal_35mm: int | None = None) -> Path:
     return path
 
 
-def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=3, blur_px=0.6, seed=0):
+def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=2, blur_px=0.6, seed=0):
     """uint8 sRGB photo of the piece rolled round an upright cylinder that touches the page's plane at the design's
-    center: each ray of 3×3 per pixel is met with the cylinder, so nothing of the tool's own model is used.
+    center: each ray of `fine`² per pixel is met with the cylinder, so nothing of the tool's own model is used.
     """
     center, radius = np.array(DESIGN_MM[:2]) + np.array(DESIGN_MM[2:]) / 2, 1 / curvature
     width, height = size_px

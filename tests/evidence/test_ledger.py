@@ -191,7 +191,7 @@ def raster(faded: bool, two_colors: bool = False) -> np.ndarray:
 def evidence(folder, faded=False, light=0.75, **look):
     for i in range(PHOTOS):
         homography = view(8 * i - 16, 5, 280, size_px=SIZE)  # nearer to each other they are one
-        taken = dict(blur_px=0.3, noise=0.002, jpeg=95, fine=2, light=light, seed=i) | look
+        taken = dict(blur_px=0.3, noise=0.002, jpeg=95, light=light, seed=i) | look
         save(photograph(raster(faded), homography, SIZE, **taken), folder / f"{i}.png")
     with pytest.MonkeyPatch.context() as patch:  # what controls would have cost is not asked here
         patch.setattr("patchproof.evidence.run.estimate_effect", lambda *_: None)
@@ -221,7 +221,7 @@ def test_known_culprits_are_named(tmp_path, change, culprit):
 
 def test_of_two_colors_print_and_light_are_one_step(tmp_path):
     homography = view(5, 5, 280, size_px=SIZE)
-    save(photograph(raster(True, True), homography, SIZE, blur_px=0.3, fine=2, light=0.75), tmp_path / "a.png")
+    save(photograph(raster(True, True), homography, SIZE, blur_px=0.3, light=0.75), tmp_path / "a.png")
     found = gather_evidence(tmp_path, sheet(two_colors=True), Options([NET], identity_printer()))
     assert list(found.summary.ledger) == ["gamut", "print_light_and_camera", "blur_and_noise", "photo"]
     assert found.summary.ledger["print_light_and_camera"].share > 0.1
@@ -230,7 +230,7 @@ def test_of_two_colors_print_and_light_are_one_step(tmp_path):
 
 
 def test_no_ledger_where_none_was_asked_for(tmp_path):
-    save(photograph(raster(False), view(size_px=SIZE, distance_mm=280), SIZE, fine=2), tmp_path / "a.png")
+    save(photograph(raster(False), view(size_px=SIZE, distance_mm=280), SIZE), tmp_path / "a.png")
     found = gather_evidence(tmp_path, sheet(), Options([NET], identity_printer(), ledger_photos=0))
     assert found.summary.ledger is None and found.ledger is None
 
@@ -238,7 +238,7 @@ def test_no_ledger_where_none_was_asked_for(tmp_path):
 @pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.01), (3.0, 0.03)])
 def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
     surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
-    srgb = photograph(raster(False), homography, SIZE, blur_px=sigma, light=0.75, fine=2)
+    srgb = photograph(raster(False), homography, SIZE, blur_px=sigma, light=0.75)
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     found = pattern_light(srgb, homography, on_piece, surface.dictionary, 0.9 * sigma)
     assert found.paper == pytest.approx(0.75, abs=tolerance + 0.02) and found.ink == pytest.approx(0, abs=tolerance)
@@ -251,7 +251,7 @@ def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
 
 def test_a_photograph_whose_markers_lie_elsewhere_than_its_homography_says_is_left_out():
     surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
-    srgb = photograph(raster(False), homography, SIZE, blur_px=0.5, light=0.75, fine=2)
+    srgb = photograph(raster(False), homography, SIZE, blur_px=0.5, light=0.75)
     photo = measured(srgb, manifest=sheet())
     geometry = photo.entry.geometry
     rest = geometry.blur_px, photo.light, surface, 96
@@ -276,7 +276,7 @@ def test_a_piece_put_into_a_photograph_is_what_a_photograph_of_it_shows():
     """Of another print on the same sheet, in the photograph's own light and blur and in a promised condition's."""
     surface, homography = surface_of(sheet()), view(15, 5, 300, size_px=SIZE)
     taken, other, promised_one = (
-        photograph(raster(False, two), homography, SIZE, blur_px=blur_px, light=light)
+        photograph(raster(False, two), homography, SIZE, blur_px=blur_px, light=light, fine=4)
         for two, light, blur_px in ((False, 0.75, 0.8), (True, 0.75, 0.8), (True, 0.5, 0.3))
     )
     photo = measured(taken, manifest=sheet())

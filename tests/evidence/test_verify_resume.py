@@ -68,7 +68,9 @@ def killed_after_three(folder: Path, sheet: Path, out: Path) -> None:
 def test_a_kill_costs_what_was_in_work_and_not_the_report(folder, sheet, tmp_path):
     verify_photos(folder, sheet, tmp_path / "whole", ledger_photos=2)
     out = tmp_path / "killed"
-    process = get_context("fork" if can_fork() else "spawn").Process(target=killed_after_three, args=(folder, sheet, out))
+    process = get_context("fork" if can_fork() else "spawn").Process(
+        target=killed_after_three, args=(folder, sheet, out)
+    )
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL

@@ -59,7 +59,7 @@ def raster(only_piece: bool, first_id: int = 0):
 
 def shot(azimuth=10, distance=550, only_piece=True, first_id=0, **look):
     homography = view(azimuth, 5, distance, size_px=(800, 600))
-    return photograph(raster(only_piece, first_id), homography, (800, 600), fine=3, **{"blur_px": 0.5, **look})
+    return photograph(raster(only_piece, first_id), homography, (800, 600), **{"blur_px": 0.5, **look})
 
 
 def measured(srgb, conditions=(), focal_px=None, scan_dpi=None, manifest=None):
@@ -247,7 +247,7 @@ def test_the_uncut_page_and_scans_are_measured_but_not_counted():
     for sx, sy, code in ((1.0, 1.0, None), (0.97, 0.965, "scale_off"), (1.003, 0.997, None)):
         homography = np.diag([100 / 25.4 * sx, 100 / 25.4 * sy, 1.0])
         homography[:2, 2] = 7.3, 4.9
-        scan = photograph(raster(False), homography, (860, 1200), blur_px=0.5, light=0.9, fine=3)
+        scan = photograph(raster(False), homography, (860, 1200), blur_px=0.5, light=0.9)
         look = measured(scan, scan_dpi=100)
         assert (look.entry.status, look.entry.code, look.counted) == ("measured", code, False)
         scale = look.entry.scale
@@ -302,7 +302,9 @@ def test_photographs_that_show_nothing_never_count_whatever_the_network_answers(
         save(picture.astype(np.uint8), tmp_path / f"{name}.png")
 
     def report():
-        return gather_evidence(tmp_path, make_manifest(promise()), Options([always], identity_printer(), ledger_photos=0))
+        return gather_evidence(
+            tmp_path, make_manifest(promise()), Options([always], identity_printer(), ledger_photos=0)
+        )
 
     nothing = report()
     for photo in nothing.photos:
@@ -368,7 +370,7 @@ def test_two_tones_show_something_from_a_code_or_two_on(contrast, nothing):
 
 def test_only_scans_have_no_rate(tmp_path):
     homography = np.diag([4.0, 4.0, 1.0])
-    save(photograph(raster(False), homography, (860, 1200), light=0.9, fine=3), tmp_path / "scan.png")
+    save(photograph(raster(False), homography, (860, 1200), light=0.9), tmp_path / "scan.png")
     summary = verified(tmp_path, scan_dpi=101.6).summary
     assert (summary.judged, summary.measured, summary.rate, summary.verdict) == (0, 1, None, "cannot_tell")
 

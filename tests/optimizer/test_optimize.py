@@ -123,7 +123,11 @@ def test_the_gradient_through_printer_scene_and_camera_is_a_difference_of_losses
 def test_assist_turns_the_patch_red_and_deceive_blue(tmp_path, optimizer, monkeypatch):
     monkeypatch.setattr(loop, "SELECT_VIEWS", 8)  # by which nothing is selected: it is tried once, at the end
     for goal, channel in (("assist", 0), ("deceive", 2)):
-        optimize = {"optimize__optimizer": optimizer, "optimize__step_size": 0.05, "optimize__views": 2}  # far, in twelve steps
+        optimize = {
+            "optimize__optimizer": optimizer,
+            "optimize__step_size": 0.05,
+            "optimize__views": 2,
+        }  # far, in twelve steps
         state = last(set_problem(scene_with(tmp_path, target__goal=goal, **optimize))).state
         color = state.best.mean((1, 2))
         assert int(color.argmax()) == channel and float(color[channel] - color[2 - channel]) > 0.5

@@ -57,7 +57,7 @@ def test_large_sharp_markers_do_not_move_as_wholes(manifest, piece, azimuth):
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 2.0, 3.0])
 def test_blur_is_read_off_the_borders(piece, blur_px):
     # 300 mm away a module is 8 px wide, so 3 px of blur still leave its middle dark
-    found = find_markers(photograph(piece, view(0, 0, 300), blur_px=blur_px, noise=0.003), IDS)
+    found = find_markers(photograph(piece, view(0, 0, 300), blur_px=blur_px, noise=0.003, fine=4), IDS)
     measured = np.median([b.blur_px for b in found.markers.values()])
     assert measured == pytest.approx(blur_px, rel=0.15, abs=0.1)
 
@@ -97,7 +97,7 @@ def test_the_search_stops_at_the_level_that_shows_everything(piece, monkeypatch)
     sizes = []
     inner = detect._detect
     monkeypatch.setattr(detect, "_detect", lambda level, *rest: sizes.append(level.shape) or inner(level, *rest))
-    photo = photograph(piece, view(0, 0, 400, size_px=(1600, 1200)), (1600, 1200), fine=2)
+    photo = photograph(piece, view(0, 0, 400, size_px=(1600, 1200)), (1600, 1200))
     assert len(find_markers(photo, IDS).markers) == 8 and sizes == [(600, 800)]
     sizes.clear()
     find_markers(photo, IDS | {999})
@@ -139,7 +139,7 @@ def test_quadrilaterals_that_no_square_can_make_are_impossible():
 
 def test_a_covered_stretch_of_a_border_does_not_move_it(manifest, piece):
     homography = view(0, 0, 300)
-    photo = photograph(piece, homography, blur_px=0.7)
+    photo = photograph(piece, homography, blur_px=0.7, fine=4)
     edge = apply_homography(homography, [[CUT_MM[0] + 2, CUT_MM[1] + 7]])[0].astype(int)  # left border of marker 100
     photo[edge[1] - 6 : edge[1] + 6, edge[0] - 6 : edge[0] + 4] = 150
     found = find_markers(photo, IDS)
@@ -148,7 +148,7 @@ def test_a_covered_stretch_of_a_border_does_not_move_it(manifest, piece):
 
 def test_a_covered_marker_does_not_send_the_search_to_finer_levels(manifest, piece, monkeypatch):
     homography, sizes = view(10, 5, 300, size_px=(1600, 1200)), []
-    photo = photograph(piece, homography, (1600, 1200), blur_px=0.5, fine=2)
+    photo = photograph(piece, homography, (1600, 1200), blur_px=0.5)
     quad = apply_homography(homography, corners_mm(manifest)[100])
     low, high = quad.min(0).astype(int) - 5, quad.max(0).astype(int) + 5
     photo[low[1] : high[1], low[0] : high[0]] = 150
@@ -159,7 +159,7 @@ def test_a_covered_marker_does_not_send_the_search_to_finer_levels(manifest, pie
 
 
 def test_finer_levels_look_only_where_markers_are_missing(manifest, piece, monkeypatch):
-    photo = photograph(piece, view(45, 0, 1000, size_px=(1600, 1200)), (1600, 1200), blur_px=0.8, fine=2)
+    photo = photograph(piece, view(45, 0, 1000, size_px=(1600, 1200)), (1600, 1200), blur_px=0.8)
     sizes, inner = [], detect._detect
     monkeypatch.setattr(detect, "_detect", lambda level, *rest: sizes.append(level.shape) or inner(level, *rest))
     found = find_sheet(photo, IDS | {900}, corners_mm(manifest) | {900: corners_mm(manifest)[100] + [60.0, 60.0]})

@@ -74,14 +74,14 @@ def test_one_marker_is_far_less_certain_than_eight():
 
 
 def test_the_stated_uncertainty_covers_the_truth_in_drawn_corners():
-    # corners drawn with known noise above the floor: the 95 % figure must hold in 90 to 99 % of 120 draws
+    # corners drawn with known noise above the floor: the 95 % figure must hold in 90 to 99 % of 60 draws
     hits = 0
-    for seed in range(120):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         true = view(rng.uniform(-60, 60), rng.uniform(-20, 20), rng.uniform(350, 900), rng.uniform(-20, 20))
         fit = fit_page(noisy_corners(true, 0.15, seed), marker_corners())
         hits += worst_error_mm(fit.px_from_mm, true) <= corner_uncertainty_mm(fit, DESIGN_MM)
-    assert 107 <= hits <= 120
+    assert 54 <= hits <= 60
 
 
 @pytest.mark.parametrize(
@@ -94,14 +94,14 @@ def test_few_markers_state_as_wide_an_uncertainty_as_they_have(ids, typical_mm):
     of its noise: taken for the floor, its 95 % figure held in 29 %.
     """
     hits, stated = 0, []
-    for seed in range(24):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         true = view(rng.uniform(-60, 60), rng.uniform(-20, 20), rng.uniform(350, 900), rng.uniform(-20, 20))
         noisy = noisy_corners(true, 0.15, seed)
         fit = fit_page({i: noisy[i] for i in ids}, marker_corners())
         stated.append(corner_uncertainty_mm(fit, DESIGN_MM))
         hits += worst_error_mm(fit.px_from_mm, true) <= stated[-1]
-    assert hits >= 20 and np.median(stated) == pytest.approx(typical_mm, rel=0.25)
+    assert hits >= 10 and np.median(stated) == pytest.approx(typical_mm, rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_sheet_too_small_to_tell_left_from_right_says_so(ids, good_mm, bad_mm)
     matrix, center = intrinsics(40, (1200, 900)), np.array([105.0, 130.0])
     for distance, tells in ((good_mm, True), (bad_mm, False)):
         azimuths, stated = [], []
-        for seed in range(12):
+        for seed in range(8):
             noisy = noisy_corners(view(10, 3, distance), 0.045, seed)
             fit = fit_page({i: noisy[i] for i in ids}, marker_corners())
             azimuths.append(view_angles(plane_pose(fit.px_from_mm, matrix), center)[0])
@@ -126,14 +126,14 @@ def test_a_sheet_too_small_to_tell_left_from_right_says_so(ids, good_mm, bad_mm)
 def test_the_stated_uncertainty_covers_the_truth_in_photographs():
     piece = page_raster(make_manifest(), only_piece=True) * np.float32(0.97) + np.float32(0.02)
     rng, ratios = np.random.default_rng(5), []
-    for seed in range(10):
+    for seed in range(6):
         true = view(rng.uniform(-60, 60), rng.uniform(-25, 25), rng.uniform(350, 750), rng.uniform(-20, 20), (900, 700))
         look = dict(blur_px=rng.uniform(0, 1), noise=rng.uniform(0, 0.01), jpeg=int(rng.integers(65, 96)), seed=seed)
-        photo = photograph(piece, true, (900, 700), light=rng.uniform(0.4, 0.95), fine=3, **look)
+        photo = photograph(piece, true, (900, 700), light=rng.uniform(0.4, 0.95), **look)
         found = complete(photo, find_markers(photo, frozenset(PIECE_IDS)), marker_corners())
         fit = fit_page({i: b.corners_px for i, b in found.markers.items()}, marker_corners())
         ratios.append(worst_error_mm(fit.px_from_mm, true) / corner_uncertainty_mm(fit, DESIGN_MM))
-    # over 200 views of two kinds of pieces 95 to 97 %; ten views allow for a miss or two, but never a wild one
+    # over 200 views of two kinds of pieces 95 to 97 %; six views allow for a miss, but never a wild one
     assert np.mean(np.array(ratios) <= 1) >= 0.8
     assert max(ratios) < 2.5 and np.median(ratios) > 0.2
 

@@ -132,7 +132,7 @@ def test_light_is_averaged_and_clipped_pixels_are_counted(step):
 
 def test_colors_are_those_of_all_pixels(piece, surface, monkeypatch):
     manifest = make_manifest()
-    photo = photograph(piece, view(20, 5, 300, size_px=(1600, 1200)), (1600, 1200), fine=2, blur_px=0.6, noise=0.005)
+    photo = photograph(piece, view(20, 5, 300, size_px=(1600, 1200)), (1600, 1200), blur_px=0.6, noise=0.005)
     photo = view_of(Photo(photo, None), None)
 
     def color():

@@ -99,7 +99,7 @@ def test_the_unrolled_picture_shows_the_design_where_its_homography_says():
     photo = curled_photograph(page, pose(), MATRIX, 1 / 150)
     corners = {i: rolled_px(mm, 1 / 150, pose()) for i, mm in markers_mm().items()}
     flat = unroll(photo, corners, markers_mm(), CUT_MM, MATRIX[0, 0])
-    expected = photograph(page, flat.fit.px_from_mm, SIZE, blur_px=0.9, fine=2)
+    expected = photograph(page, flat.fit.px_from_mm, SIZE, blur_px=0.9)
     quad = apply_homography(flat.fit.px_from_mm, rect_corners(DESIGN_MM))
     (x0, y0), (x1, y1) = quad.min(0).astype(int) + 20, quad.max(0).astype(int) - 20
     off = np.abs(flat.srgb[y0:y1, x0:x1].astype(float) - expected[y0:y1, x0:x1]).mean()
@@ -124,7 +124,7 @@ def test_the_designs_own_pixels_say_where_it_lies():
     manifest, true = make_manifest(), view(20, 10, 450)
     page, surface = page_raster(manifest, only_piece=True), surface_of(manifest)
     design = with_markers(page_raster(manifest, True)[600:2000:4, 350:1750:4], surface, np.zeros(3))
-    photo = photograph(page, true, SIZE, blur_px=0.6, fine=2)
+    photo = photograph(page, true, SIZE, blur_px=0.6)
     moved = true @ np.array([[1, 0, 2.0], [0, 1, 0], [0, 0, 1]])
     for homography, shift in ((true, 0.0), (moved, -2.0)):
         cells = register(photo, homography, DESIGN_MM, design, 2.5, 0.7)
@@ -143,7 +143,7 @@ def test_an_uncut_page_is_not_counted_however_it_curls(radius_mm, monkeypatch):
     whole = page_raster(manifest, only_piece=False)
     with monkeypatch.context() as patch:
         patch.setattr(synthetic_photos, "CUT_MM", (0.0, 0.0, *synthetic_photos.PAGE_MM))
-        photo = curled_photograph(whole, pose(), MATRIX, 1 / radius_mm, fine=2)
+        photo = curled_photograph(whole, pose(), MATRIX, 1 / radius_mm)
     assert not measured(photo).counted
-    piece = curled_photograph(page_raster(manifest, only_piece=True), pose(), MATRIX, 1 / radius_mm, fine=2)
+    piece = curled_photograph(page_raster(manifest, only_piece=True), pose(), MATRIX, 1 / radius_mm)
     assert measured(piece).counted
