@@ -14,7 +14,7 @@ from browser import Browser
 from patchproof.app import cli
 from patchproof.app.begin.guess import footing, guess_up, label_of, length_of
 from patchproof.app.begin.new import new_scene
-from patchproof.app.begin.preview import OBJECT, PAGE, preview_scene
+from patchproof.app.begin.preview import OBJECT, PAGE, _lying, preview_scene
 from patchproof.app.begin.sides import (
     NO_SURFACE,
     PICTURE_PX,
@@ -211,25 +211,29 @@ def test_a_file_without_units_says_how_long_it_is_in_its_own(tmp_path):
         length_of(tmp_path / "carton.stl")
 
 
-def test_an_object_that_may_lie_is_turned_by_one_word(bottles, tmp_path):
+@pytest.fixture(scope="module")
+def standing(bottles):
+    """The scene of the bottle that stands, and what `new` said of it."""
+    path = bottles / "standing.toml"
+    return path, new_scene(str(bottles / "bottle.glb"), path)
+
+
+def test_an_object_that_may_lie_is_turned_by_one_word(bottles, standing, tmp_path):
     """The scene has the other axis as a comment, the preview says which, `new` writes it whole."""
     path = tmp_path / "scene.toml"
     bottle = {"label": "bottle", "overwrite": True}
     lines = new_scene(str(bottles / "lying.glb"), path, **bottle)
     assert "write the scene again with --up z" in lines[0] and load_scene_settings(path).object.up == "y"
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8") + "[camera]\nphoto_px = [400, 300]\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
     path.write_text(re.sub(r'(?m)^up = "y".*\n# (up = "z")', r"\1", text), encoding="utf-8")
-    turned = load_scene(path).mesh
-    assert np.argmax(np.ptp(turned.vertices, axis=0)) == 1
-    assert not [each for each in preview_scene(path, tmp_path / "b").warnings if "may lie" in each]
+    turned = load_scene(path)
+    assert np.argmax(np.ptp(turned.mesh.vertices, axis=0)) == 1 and not _lying(turned, turned.settings)
     path.write_text(text, encoding="utf-8")
     (warning,) = [each for each in preview_scene(path, tmp_path / "a").warnings if "may lie" in each]
     assert warning.endswith('write up = "z" in [object]')
     lines = new_scene(str(bottles / "lying.glb"), path, up="z", **bottle)
     assert lines[0] == 'up: "z", as given' and "# up" not in path.read_text(encoding="utf-8")
-    standing = tmp_path / "standing.toml"
-    new_scene(str(bottles / "bottle.glb"), standing, label="bottle")
-    assert load_scene_settings(path).patch == load_scene_settings(standing).patch
+    assert load_scene_settings(path).patch == load_scene_settings(standing[0]).patch
 
 
 def test_a_side_is_preferred_to_a_top_that_is_not_twice_as_large(tmp_path):
@@ -275,17 +279,17 @@ def test_the_largest_piece_is_found_between_those_that_fit():
     assert largest((100, 50), lambda size: True, 51) is None
 
 
-def test_a_new_scene_loads_and_says_what_was_guessed(bottles, tmp_path):
-    lines = new_scene(str(bottles / "bottle.glb"), tmp_path / "scene.toml")
-    settings = load_scene_settings(tmp_path / "scene.toml")
+def test_a_new_scene_loads_and_says_what_was_guessed(bottles, standing):
+    path, lines = standing
+    settings = load_scene_settings(path)
     assert (settings.object.length_mm, settings.object.up, settings.target.label) == (250, "y", "bottle")
     assert settings.view.distance_mm == (380, 680) and settings.patch.bend and settings.patch.side == "+z"
     assert lines[0] == 'up: "y", glTF\'s standard' and "by the file's units" in lines[1]
-    scene = load_scene(tmp_path / "scene.toml")
+    scene = load_scene(path)
     assert scene.placement.family == "cylinder" and scene.placement.gap_mm < 1
     assert 39 <= min(scene.piece.size_mm) <= 80 * 0.7
     with pytest.raises(Refused, match="add --overwrite"):
-        new_scene(str(bottles / "bottle.glb"), tmp_path / "scene.toml")
+        new_scene(str(bottles / "bottle.glb"), path)
 
 
 def test_a_new_scene_of_a_primitive_has_a_flat_card_where_one_will_do(tmp_path):

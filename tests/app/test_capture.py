@@ -44,7 +44,7 @@ from test_verify_run import NET, promise, shot
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network net:UserWarning")  # it sees no color
 TOKEN = "a-token-that-is-nobodys-own"
-SHOTS = 32
+SHOTS = 16
 
 
 def condition(azimuth_deg: float, px_per_mm: float) -> dict:
@@ -164,7 +164,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
             for photo in own:
                 answers.append(client.send(photo, into).json)
 
-        for session, part in (("session_01", photos[:16]), ("session_02", photos[16:])):
+        for session, part in (("session_01", photos[:8]), ("session_02", photos[8:])):
             tabs = [threading.Thread(target=tab, args=(own, session)) for own in (part[::2], part[1::2])]
             for thread in tabs:
                 thread.start()
@@ -175,7 +175,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
         assert client.send(save(shot(3, light=0.1), tmp_path / "gray.jpg").read_bytes(), "gray").status == 200
         state = client.get("state").json
     files = [path for path in files_in(folder) if path.endswith(".jpg")]
-    assert files[0] == "controls/gray/photo_0033.jpg" and len(files) == SHOTS + 1
+    assert files[0] == "controls/gray/photo_0017.jpg" and len(files) == SHOTS + 1
     assert sorted((folder / file).read_bytes() for file in files[1:]) == sorted(photos)  # EXIF and all
     assert len({answer["photo"]["file"] for answer in answers}) == SHOTS
     assert {answer["photo"]["code"] for answer in answers} >= {None, "too_few_markers"}
@@ -187,7 +187,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
     assert tuple(state["prediction_interval"]) == summary.prediction_interval
     assert state["interval"] == pytest.approx(summary.interval, abs=1e-12)
     assert state["recognized"] == round(summary.rate * summary.judged)
-    assert state["judged"] == summary.judged > 20 and 3 <= summary.judged - state["recognized"] <= 4  # the dark ones
+    assert state["judged"] == summary.judged > 10 and 1 <= summary.judged - state["recognized"] <= 2  # the dark ones
     said = {(s["name"], s["recognized"], s["judged"]) for s in state["sessions"]}
     assert (
         said == {(s.name, s.recognized, s.judged) for s in summary.sessions}
@@ -408,7 +408,11 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
         measured.append((done, total))
 
     capture = partial(serve.serve_capture, sheet, tmp_path / "photos", on_photo=progress, on_address=begin)
-    reports = [capture(), capture()]
+    with monkeypatch.context() as patch:  # the first time in this process, which has imported everything
+        patch.setattr(serve, "open_workers", lambda *_, **__: open_workers(1))
+        patch.setattr(serve, "ready", lambda _: None)
+        reports = [capture()]
+    reports.append(capture())
     assert [report.summary.judged for report in reports] == [1, 2] and measured == [(0, 0), (1, 1)]
     assert answers == [200, 200] and addresses[0] == addresses[1]
     assert (tmp_path / "photos" / ".capture.json").stat().st_mode & 0o777 == 0o600

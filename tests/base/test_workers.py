@@ -16,6 +16,7 @@ import pytest
 import torch
 import toy_studies as toy
 
+from patchlab.study.study import Work, carry_out
 from patchproof.base import workers as processes
 from patchproof.base.strict import Refused
 from patchproof.base.workers import can_fork, free_cores, open_workers, result_of, sharing, threads
@@ -182,17 +183,24 @@ def test_jobs_and_a_cluster_exclude_each_other():
 
 @pytest.mark.filterwarnings("ignore")  # distributed's own, at the end of its processes
 def test_a_cluster_gives_the_same_also_when_workers_die(tmp_path):
+    """Of single items, and to the byte of a whole study, in whose midst a worker dies."""
     distributed = pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
-    (tmp_path / "5").touch()
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        open_workers(cluster=cluster.scheduler_address) as workers,
-    ):
-        assert workers.map(toy.double_or_die, [(tmp_path, i) for i in range(8)]) == [2 * i for i in range(8)]
-        assert workers.map(toy.threads, range(3)) == [1, 1, 1]
-        with pytest.raises(Refused, match=r"^Expected a, got 7: c\.$"):
-            workers.map(toy.refuse, [7])
-    assert not (tmp_path / "5").exists()
+    settings = toy.ToySettings(numbers=tuple(range(8)), die_in=str(tmp_path))
+    carry_out(toy.STUDY, settings, tmp_path, tmp_path / "here")
+    (tmp_path / "n3").touch()
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        with open_workers(cluster=cluster.scheduler_address) as workers:
+            assert workers.map(toy.double, range(8)) == [2 * i for i in range(8)]
+            assert workers.map(toy.threads, range(3)) == [1, 1, 1]
+            with pytest.raises(Refused, match=r"^Expected a, got 7: c\.$"):
+                workers.map(toy.refuse, [7])
+        carry_out(toy.STUDY, settings, tmp_path, tmp_path / "there", Work(cluster=cluster.scheduler_address))
+    assert not (tmp_path / "n3").exists()
+    here, there = (
+        {path.relative_to(out): path.read_bytes() for path in out.rglob("*.*")}
+        for out in (tmp_path / "here", tmp_path / "there")
+    )
+    assert here == there and len(here) > 16
     killer = Future()
     killer.set_exception(distributed.scheduler.KilledWorker("task", cluster, 3))
     with pytest.raises(Refused, match="several that died of it"):

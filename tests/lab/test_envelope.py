@@ -215,7 +215,7 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is
     monkeypatch.setattr("patchlab.validation.envelope.sweeps.measured", lambda _, points, __: [[unseen]] * len(points))
     config, out = tmp_path / "envelope.toml", tmp_path / "out"
     config.write_text(
-        f'run = "{blue_run}"\nn = 16\nphotos = 1\nmap_n = 8\nmap_photos = 1\n'
+        f'run = "{blue_run}"\nn = 8\nphotos = 1\nmap_n = 4\nmap_photos = 1\n'
         'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 200, points = 3}]\n'
         'maps = [{x = "noise", y = "mismatch", points = 3}]\n'
     )

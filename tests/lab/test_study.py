@@ -160,15 +160,3 @@ def test_a_kill_in_the_middle_and_more_workers_change_no_byte(tmp_path):
     assert len(list(killed.glob("cells/*.json"))) < 12
     carry_out(toy.STUDY, settings, BASE, killed, Work(resume=True))
     assert contents(killed) == contents(whole)
-
-
-@pytest.mark.filterwarnings("ignore")  # distributed's own, at the end of its processes
-def test_a_cluster_that_loses_a_worker_changes_no_byte(tmp_path):
-    distributed = pytest.importorskip("distributed", reason="needs dask: pip install 'patchproof[cluster]'")
-    settings = toy.ToySettings(numbers=tuple(range(8)), die_in=str(tmp_path))
-    carry_out(toy.STUDY, settings, BASE, tmp_path / "here")
-    (tmp_path / "n3").touch()
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        carry_out(toy.STUDY, settings, BASE, tmp_path / "there", Work(cluster=cluster.scheduler_address))
-    assert not (tmp_path / "n3").exists()
-    assert contents(tmp_path / "there") == contents(tmp_path / "here")

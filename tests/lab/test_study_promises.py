@@ -56,10 +56,10 @@ def test_shares_and_biases_by_hand():
 
 def small_study(study, tmp_path, monkeypatch, more=""):
     """A finished study of that name: one cell, two sessions of five photographs by our own renderer."""
-    monkeypatch.setattr(run, "PROMISE_VIEWS", 16)
+    monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
-    data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [480, 360]}}
-    data["optimize"] |= {"steps": 2}
+    data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [560, 420]}}
+    data |= {"background": {"color": [0.5, 0.5, 0.5]}, "optimize": data["optimize"] | {"steps": 2, "views": 2}}
     lines = [
         line
         for table, values in data.items()
@@ -76,7 +76,7 @@ def small_study(study, tmp_path, monkeypatch, more=""):
 def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
     finished = small_study("promises", tmp_path, monkeypatch, "elsewhere = 6\nrendered = 2\n")
     (one,) = finished.results
-    assert len(one.answers["promised"]) == 16 and one.answers["per_session"] == PER_SESSION
+    assert len(one.answers["promised"]) == 8 and one.answers["per_session"] == PER_SESSION
     assert len(one.answers["elsewhere"]) == 6 and [n for _, n in one.answers["rendered"]] == [5, 5]
     judged = [judged for _, judged in one.answers["sessions"]]
     assert len(judged) == 2 and all(recognized <= judged <= 5 for recognized, judged in one.answers["sessions"])
@@ -87,7 +87,7 @@ def test_a_picture_made_elsewhere_takes_the_place_of_a_design(tmp_path, monkeypa
     Image.new("RGB", (48, 48), (220, 30, 30)).save(tmp_path / "red.png")
     finished = small_study("promises", tmp_path, monkeypatch, 'pictures = {scene = ["red.png"]}\n')
     (only,) = finished.results
-    assert only.cell.values["picture"] == "red.png" and len(only.answers["promised"]) == 16
+    assert only.cell.values["picture"] == "red.png" and len(only.answers["promised"]) == 8
     (row, _) = next(table for table in finished.tables if table.name == "promises").rows
     assert row[4] == "red"
     (tmp_path / "b").mkdir()

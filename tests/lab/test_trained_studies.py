@@ -51,7 +51,7 @@ def table(finished, name):
 
 
 def test_a_design_helps_the_network_that_agrees_and_harms_the_one_that_reads_the_opposite(tmp_path):
-    config = written(tmp_path, config=f'networks = ["{RED}", "{BLUE}"]\nn = 24\nlights = 2\n')
+    config = written(tmp_path, config=f'networks = ["{RED}", "{BLUE}"]\nn = 12\nlights = 2\n')
     finished = run_study("transfer", config, tmp_path / "out")
     assert not finished.failed
     rows = {
@@ -162,10 +162,10 @@ def test_a_design_that_did_not_move_gains_exactly_nothing(tmp_path):
 
 
 def test_a_study_finds_what_optimize_and_evaluate_find(tmp_path):
-    config = written(tmp_path, "carton", 'networks = ["builtin"]\nn = 12\nlights = 1\nseeds = [3]\n')
+    config = written(tmp_path, "carton", 'networks = ["builtin"]\nn = 8\nlights = 1\nseeds = [3]\n')
     finished = run_study("transfer", config, tmp_path / "out")
     optimize_scene(tmp_path / "texture.toml", tmp_path / "run", seed=3)
-    found = evaluate_run(tmp_path / "run", n=12)["models"]["builtin"]
+    found = evaluate_run(tmp_path / "run", n=8)["models"]["builtin"]
     original, design = table(finished, "matrix")
     assert design["rate"].value == found["rate"] and original["rate"].value == found["controls"]["bare"]["rate"]
     # cells keep five digits
@@ -177,7 +177,7 @@ def test_a_study_finds_what_optimize_and_evaluate_find(tmp_path):
 
 
 def test_deceptive_textures_stand_beside_controls(tmp_path):
-    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 16\n')
+    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 8\n')
     finished = run_study("deceive", config, tmp_path / "out")
     rates, minus = table(finished, "rates"), table(finished, "differences")
     assert [row["way"] for row in rates] == ["free", "within_8"]

@@ -77,7 +77,7 @@ def test_every_fault_is_found_in_the_file(pdf_path, tmp_path, spoil, problem):
 
 def test_resolution_is_that_of_the_drawn_size(pdf_path):
     (line,) = (line for line in shop_lines(pdf_path) if "ppi" in line)
-    assert "128 × 128 pixels on 136.0 × 136.0 mm, 24 ppi; lossless" in line  # 128 / 136 × 25.4 = 23.9
+    assert "140 × 140 pixels on 136.0 × 136.0 mm, 26 ppi; lossless" in line  # 140 / 136 × 25.4 = 26.1
 
 
 def test_what_is_no_pdf_is_refused(tmp_path):

@@ -74,6 +74,7 @@ def detect(pixels):
     """{id: 4×2 corners in px, pixel centers at .5}."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.minMarkerPerimeterRate = 100 / max(pixels.shape)  # not in every letter
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(
         cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
