@@ -14,8 +14,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import patchproof as pp
+from patchlab.training import pictures as rendered
 from patchlab.training import train_detector
-from patchlab.training.pictures import pictures
 from patchproof.base.geometry import intrinsics, project
 from patchproof.base.goal import Goal
 from patchproof.base.strict import Refused
@@ -216,7 +216,9 @@ def shipped():
 
 @pytest.fixture(scope="module")
 def fresh():
-    return pictures(10, 7_000_000, INPUT_PX)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rendered, "VIEWS_PER_SHAPE", 4)
+        return rendered.pictures(4, 7_000_000, INPUT_PX)
 
 
 def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(shipped, fresh):
@@ -224,7 +226,7 @@ def test_it_is_small_and_finds_fresh_objects_about_as_well_as_its_card_says(ship
     assert card["held_out_ap50"] >= 0.8 and (HERE / "builtin_detector.safetensors").stat().st_size < 5_000_000
     found = train_detector.precision(train_detector.found_by_class(shipped.network, fresh), fresh)
     assert shipped.least_score == card["least_score"]
-    assert found.mean() > card["held_out_ap50"] - 0.15  # ten views of one shape are alike
+    assert found.mean() > card["held_out_ap50"] - 0.15  # four views of one shape are alike
 
 
 @pytest.fixture
@@ -258,14 +260,16 @@ def test_crops_are_opencv_s(two_stage):
 
 @pytest.mark.parametrize("name", ["builtin-detector", "module:two_stage.rcnn"])
 def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stage, monkeypatch):
-    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 2)
+    monkeypatch.setattr("patchproof.reprints.retake.DRAWS", 2)
     scene = pp.make_scene(
         {
             "object": {"mesh": "primitive:box_truck", "length_mm": 400},
             "patch": {"width_mm": 120, "height_mm": 120, "side": "+x"},
             "target": {"label": "box truck", "models": [name], "least_score": 0.4},
+            "background": {"color": [0.5, 0.5, 0.5]},
             "camera": {"photo_px": [320, 240]},
-            "optimize": {"steps": 2},
+            "optimize": {"steps": 2, "views": 2},
         }
     )
     run = pp.optimize(scene, tmp_path / "run", promise_views=8, controls=["bare"])
@@ -275,7 +279,7 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stag
     pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
     found = pp.evaluate(run.folder, n=4)["models"][name]["ap50"]
     assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
-    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=[name])
+    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=[name], ledger_photos=1)
     said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
     assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
     truth = scene.boxes(scene.draw("reprint", 3))

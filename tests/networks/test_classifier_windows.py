@@ -464,7 +464,8 @@ def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatc
     torch.manual_seed(0)
     network = classifier_of(plain(), 192, ["red", *"bcde"])
     camera = {"camera__noise": [0.0, 0.0], "camera__blur_px": [0.0, 2.0], "view__distance_mm": [700, 900]}
-    scene = scene_with(tmp_path, optimize__steps=3, target__models=["python:network"], **camera)
+    camera |= {"background__color": [0.5, 0.5, 0.5]}
+    scene = scene_with(tmp_path, optimize__steps=2, target__models=["python:network"], **camera)
     problem = replace(set_problem(scene, models=[network]), jobs=jobs)
     asked = asked_of(problem.classifiers[0].network, monkeypatch)
     designs = [best_design(problem)]
