@@ -51,7 +51,7 @@ def test_one_session_allows_for_more_than_the_same_photographs_in_many():
 @pytest.mark.parametrize("correlation", [0.02, 0.1, 0.3])
 def test_intervals_hold_for_new_sessions(correlation):
     """As many sessions as a promise has; of each, one new session and four of ten photographs."""
-    rng, inside, within, trials = np.random.default_rng(1), 0, 0, 300
+    rng, inside, within, trials = np.random.default_rng(1), 0, 0, 150
     for rate in rng.beta(2, 1, trials):
         spread = spread_of(drawn(rng, rate, correlation, 6, 100), [6] * 100)
         for photos in ((40,), (10,) * 4):

@@ -251,7 +251,7 @@ def test_photographs_that_show_no_chart(shots):
     _, manifest, (shot, _) = shots
     photo = shot.photo
     with pytest.raises(CannotJudge, match="too_few_markers"):
-        read_chart(Photo(np.full_like(photo.srgb, 90), None), manifest)
+        read_chart(Photo(np.full((600, 800, 3), 90, np.uint8), None), manifest)
     with pytest.raises(CannotJudge, match="mirrored"):
         read_chart(Photo(np.ascontiguousarray(photo.srgb[:, ::-1]), None), manifest)
     light = linear_from_srgb(photo.srgb / 255) * 8

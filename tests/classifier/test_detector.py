@@ -279,7 +279,9 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stag
     pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
     found = pp.evaluate(run.folder, n=4)["models"][name]["ap50"]
     assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1
-    report = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=[name], ledger_photos=1)
+    report = pp.verify(
+        tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=[name], ledger_photos=1
+    )
     said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
     assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
     truth = scene.boxes(scene.draw("reprint", 3))

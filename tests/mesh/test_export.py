@@ -99,16 +99,24 @@ def test_a_textured_object_survives_whole(data, tmp_path):
     assert np.allclose(np.ptp(back.vertices, axis=0), np.ptp(mesh.vertices, axis=0), rtol=1e-6)
 
 
-def test_the_same_bytes_in_every_process(tmp_path):
-    code = (
-        "import sys, numpy as np; from patchproof.mesh.load_mesh import load_mesh;"
-        "from patchproof.mesh.export import write_glb; m = load_mesh('primitive:box_truck', 300);"
-        "write_glb(m, [np.full((2, 3, 3), i, np.uint8) for i in range(len(m.materials))], sys.argv[1])"
-    )
-    made = []
-    for seed in ("1", "2"):  # sets of names come out in another order
-        path = tmp_path / f"{seed}.glb"
-        environment = {**os.environ, "PYTHONHASHSEED": seed}
-        subprocess.run([sys.executable, "-c", code, str(path)], check=True, env=environment)
-        made.append(path.read_bytes())
-    assert made[0] == made[1]
+BOTH = """
+import hashlib, sys, numpy as np
+from patchproof.mesh.export import write_glb
+from patchproof.mesh.load_mesh import load_mesh
+from patchproof.mesh.unwrap import unwrap
+truck, mug = load_mesh("primitive:box_truck", 300), load_mesh("primitive:mug", 300)
+write_glb(truck, [np.full((2, 3, 3), i, np.uint8) for i in range(len(truck.materials))], sys.argv[1])
+mug = unwrap(mug, np.ones(len(mug.faces), bool), 128)
+print(hashlib.sha256(mug.corner_uv.tobytes() + mug.materials[0].texture_srgb.tobytes()).hexdigest())
+"""
+
+
+def test_written_and_unwrapped_meshes_are_the_same_bytes_in_every_process(tmp_path, monkeypatch, capsys):
+    seed = "2" if os.environ.get("PYTHONHASHSEED") == "1" else "1"  # sets of names come out in another order
+    ours, theirs = str(tmp_path / "ours.glb"), str(tmp_path / "theirs.glb")
+    command, environment = [sys.executable, "-c", BOTH, theirs], os.environ | {"PYTHONHASHSEED": seed}
+    there = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
+    monkeypatch.setattr(sys, "argv", ["-c", ours])
+    exec(BOTH, {})
+    assert capsys.readouterr().out == there and len(there) > 60
+    assert (tmp_path / "ours.glb").read_bytes() == (tmp_path / "theirs.glb").read_bytes()

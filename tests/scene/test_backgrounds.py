@@ -126,7 +126,7 @@ def test_promises_of_another_scene_meet_other_draws_and_evaluations_the_same():
 
 def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
     """So that a place stays the same whatever shows in it: all that is random is drawn before a texture is made."""
-    places = [module.place(number) for number in range(0, 40, 2)]
+    places = [module.place(number) for number in range(0, 16, 2)]
 
     def at_once(rng, px):
         picture = patterns.drawn_texture(rng, px)()
@@ -142,7 +142,7 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
 
 
 def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch):
-    places = [module.place(number) for number in range(0, 40, 2)]
+    places = [module.place(number) for number in range(0, 16, 2)]
     monkeypatch.setattr(module, "_passing", lambda aim, ends: np.arange(aim.shape[1]))
     assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
 

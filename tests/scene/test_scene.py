@@ -198,7 +198,7 @@ def test_what_trains_and_what_is_photographed_agree_in_rate(tmp_path):
     from patchproof.classifier.network import center_square
 
     scene = scene_of(tmp_path, SCENE)
-    stage, conditions, piece = set_stage(scene), scene.draw("evaluate", 12), piece_of(scene)
+    stage, conditions, piece = set_stage(scene), scene.draw("evaluate", 4), piece_of(scene)
     with torch.no_grad():
         small = photograph(stage, piece, conditions, (96, 96))
         large = center_square(photograph(stage, piece, conditions, (800, 600)), 96)
