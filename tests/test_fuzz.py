@@ -16,8 +16,8 @@ import pytest
 from fuzz import READERS, Outcome, attempt
 from watch import MOST_BYTES, SECONDS, Watch
 
-IN_THE_SUITE = {"photo": 30, "largest photo": 1, "sheet.json": 16, "photos.jsonl": 6, "run.json": 10}  # else:
-OF_OTHERS = 14
+IN_THE_SUITE = {"photo": 14, "photos.jsonl": 4, "run.json": 6}  # else:
+OF_OTHERS = 10
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +25,13 @@ def watch() -> Watch:
     return Watch()
 
 
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("reader", [name for name in READERS if name != "largest photo"])  # test_photo_limits has some
 def test_hostile_files_are_read_or_refused(reader, watch):
     outcomes = [attempt(reader, seed, watch) for seed in range(IN_THE_SUITE.get(reader, OF_OTHERS))]
     failed = [f"seed {o.seed}: {o.how}" for o in outcomes if o.how not in ("read", "refused")]
     assert not failed, "\n".join(failed[:3])
     # a journal's broken lines are done again
-    assert reader in ("photos.jsonl", "largest photo") or any(o.how == "refused" for o in outcomes)
+    assert reader == "photos.jsonl" or any(o.how == "refused" for o in outcomes)
 
 
 def test_the_watch_sees_what_it_is_for(watch, tmp_path):

@@ -29,12 +29,12 @@ from patchproof.photo.read import read_photo
 
 FIGURES = ("corners", "azimuth", "distance", "tilt")
 CORNERS = rect_corners((0.0, 0.0, SIDE_MM, SIDE_MM))
-USUAL = ("plain", "plain_8_markers", "noise_mild", "jpeg_60", "defocus_1", "motion_2", "shadow", "lens_mild")
-ROLLED = ("roll_60_100_bends", "roll_100_300_bends", "roll_300_1000_bends", "roll_100_300", "roll_any_axis")
-UNEXPLAINED = ("fold_30", "fold_60", "wobble_4", "wobble_12", "two_prints")
-RISKY = ("noise", "dark", "jpeg_20", "oblique", "lens", "motion_8", "fold_10", "dog_ear", "wobble_1", "waves", "cone")
-OTHERS = ("roll_60_100", "glare", "moire", "covered")
-CROPPED = ("crop_told", "crop_odd", "crop_aside", "crop_middle_told", "zoom_told")
+# One of a kind each: the other kinds, and more photographs of these, are the program's.
+USUAL = ("plain", "plain_8_markers", "jpeg_60", "motion_2", "shadow", "lens_mild")
+ROLLED = ("roll_60_100_bends", "roll_300_1000_bends", "roll_any_axis")
+UNEXPLAINED = ("fold_30", "wobble_12", "two_prints")
+RISKY = ("oblique", "lens", "motion_8", "fold_10", "waves", "cone", "glare", "covered")
+CROPPED = ("crop_told", "crop_aside", "zoom_told")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _corner_error_mm(placed: Placed, true_px: np.ndarray) -> float:
     return float(np.linalg.norm(mm - CORNERS, axis=1).max())
 
 
-@pytest.mark.parametrize("kind", [*USUAL, *ROLLED, *UNEXPLAINED, *RISKY, *OTHERS, *CROPPED])
+@pytest.mark.parametrize("kind", [*USUAL, *ROLLED, *UNEXPLAINED, *RISKY, *CROPPED])
 def test_what_is_called_measured_is_right(kind, tmp_path):
     result = outcome(kind, 0, tmp_path)
     assert not result.wrong()

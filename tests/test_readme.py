@@ -40,8 +40,8 @@ def blocks(language: str) -> list[str]:
 @pytest.fixture(autouse=True)
 def few_views(monkeypatch):
     """Of a promise and of the selection set: what they cost is time."""
-    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
-    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
+    monkeypatch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 16)
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +50,14 @@ def here(tmp_path_factory):
     toml = blocks("toml")[0]
     # fewer steps and smaller photographs than a user would take
     (folder / "scene.toml").write_text(
-        toml + "\n[optimize]\nsteps = 3\nviews = 4\n[camera]\nphoto_px = [1200, 900]\n", encoding="utf-8"
+        toml + "\n[optimize]\nsteps = 3\nviews = 2\n[camera]\nphoto_px = [1040, 780]\n", encoding="utf-8"
     )
     return folder
 
 
 def test_commands(here, monkeypatch, capsys):
     monkeypatch.chdir(here)
-    lines = blocks("console")[0].replace("--n 100", "--n 8")  # fewer views than a user would ask for
+    lines = re.sub(r"--n \d+", "--n 4", blocks("console")[0])  # fewer than a user would ask for
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "patchproof"
@@ -99,11 +99,13 @@ def test_python(tmp_path, monkeypatch, capsys):
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 30
     monkeypatch.chdir(tmp_path)
     names: dict = {}
-    exec(compile(code, "README.md", "exec"), names)
+    fewer = code.replace('run, 6, "photos"', 'run, 2, "photos"')
+    assert fewer != code
+    exec(compile(fewer, "README.md", "exec"), names)
     gradient, difference = (float(value) for value in re.findall(r"tensor\((\S+?)[,)]", capsys.readouterr().out)[:2])
     # float32 pictures of 2 × 96 × 96 pixels, summed, and a difference over 0.04
     assert gradient == pytest.approx(difference, rel=0.02) and gradient != 0
-    assert names["report"].summary.photos == 6
+    assert names["report"].summary.photos == 2
 
 
 def words(path: Path) -> str:
