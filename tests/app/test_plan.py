@@ -78,7 +78,10 @@ def quick_plan(path) -> Plan:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "SELECT_VIEWS", 4)
         patch.setattr(errors, "_chunks", lambda views, side_px: [slice(0, 2), slice(2, views)])
-        return measured_plan(*plan_geometry(path), timing=False, views=3)
+        calls = []
+        plan = measured_plan(*plan_geometry(path), timing=False, views=3, on_stage=lambda *call: calls.append(call))
+    assert {name for name, _, _ in calls} == {"draft", "terms"} and all(done <= total for _, done, total in calls)
+    return plan
 
 
 @pytest.fixture(scope="module")

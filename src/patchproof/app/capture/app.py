@@ -120,8 +120,8 @@ class _Desk:
             except (ClientDisconnect, TimeoutError):
                 return _refusal(408, "Expected a whole photograph, got a part: send it again.")
             except OSError as error:
-                got = f"Expected room for a photograph, got {error.strerror}: make room and send it again."
-                return _refusal(507, got)
+                sentence = f"Expected room for a photograph, got {error.strerror}: make room and send it again."
+                return _refusal(507, sentence)
         async with self._one_at_a_time:
             answer = await anyio.to_thread.run_sync(self._measured, path)
         return JSONResponse({"photo": answer, "state": self._state})
