@@ -84,10 +84,9 @@ class PhotoScene(flat.FlatScene):
 
     def without(self, part: Part) -> Self | None:
         """The scene with photographs that light their paper evenly, or without their own blur or noise."""
-        even, photos = np.array([1.0, 0, 0, 0, 0, 0]), self.photos
+        photos, even = self.photos, [1.0, 0, 0, 0, 0, 0]
         if part == EVEN_LIGHT:
-            coefficients = (photo.light.coefficients * even for photo in photos)
-            lights = [replace(photo.light, coefficients=each) for photo, each in zip(photos, coefficients, strict=True)]
+            lights = [replace(photo.light, coefficients=photo.light.coefficients * even) for photo in photos]
         elif part == OWN_NOISE and any(photo.light.noise for photo in photos):
             lights = [replace(photo.light, noise=0.0) for photo in photos]
         elif part == OWN_BLUR and any(photo.blur_px for photo in photos):
