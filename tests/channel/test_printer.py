@@ -15,16 +15,8 @@ from patchproof.base.settings import PrinterSettings
 from patchproof.base.strict import Refused, shipped
 from patchproof.calibrate import icc
 from patchproof.calibrate.printer import printer_from_icc
-from patchproof.channel.printer import (
-    NODES_8BIT,
-    Printer,
-    identity_printer,
-    load_printer,
-    node_colors,
-    printer_from_table,
-    save_printer,
-    vary,
-)
+from patchproof.calibrate.printer_files import printer_from_table, save_printer
+from patchproof.channel.printer import NODES_8BIT, Printer, identity_printer, load_printer, node_colors, vary
 
 DATA = os.environ.get("PATCHPROOF_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="PATCHPROOF_DATA is unset: no ICC profiles")

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Frame:
-    """The pinhole picture to render before the lens bends it: its size and matrix, and how far it reaches out of the
-    picture on each side.
-    """
+    """The pinhole picture to render before the lens bends it, and how far it reaches beyond each of its sides."""
 
     size_px: tuple[int, int]
     matrix_px: np.ndarray

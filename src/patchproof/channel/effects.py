@@ -152,11 +152,6 @@ class Effect:
         end = _ENDS[source](value)
         return -end, end
 
-    @property
-    def shared(self) -> list[bool]:
-        """Of each column, whether all photographs of a session have it in common."""
-        return [self.anew != "all" and name not in self.anew for name in self.columns]
-
     def sample(self, settings: SceneSettings, unit: np.ndarray, number: np.ndarray) -> dict[str, np.ndarray]:
         """Its fields for N views with numbers N×columns in [0, 1); without columns, the views' own `number` N."""
         ends = (self.range(settings, name) for name in self.columns)
