@@ -255,9 +255,7 @@ def _top(surface: Smooth, near: np.ndarray, under: np.ndarray, size_mm) -> float
 
 
 def _spread(surface: Smooth, frame: Frame, size_mm, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """4×4 world from piece of the plane that touches the surface at the piece's middle, and (s, t) of the piece's net;
-    refused where geodesics leave the neighborhood of the piece.
-    """
+    """4×4 world from piece of the plane tangent at its middle, (s, t) of its net; refused where geodesics run away."""
     middle, normal = (a[0] for a in surface.points_and_normals(np.zeros(1), np.zeros(1)))
     right, up = spun(_facing(frame, normal, middle), spin_deg)
     with np.errstate(all="ignore"):

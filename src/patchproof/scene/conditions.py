@@ -56,9 +56,7 @@ class Conditions(Rows):
 def draw(
     settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0, per_session: int = 1, salt: str = ""
 ) -> Conditions:
-    """Draws `start` to `start + n` of a stream; `per_session` in a row, from the first of all, are one session. Another
-    `salt`, other draws.
-    """
+    """Draws `start` to `start + n` of a stream; `per_session` in a row are one session; another `salt`, other draws."""
     return of_fields(sampled(EFFECTS, settings, stream, n, seed, start, per_session, salt))
 
 
@@ -95,7 +93,8 @@ def sampled(
             unit = np.random.default_rng((*key, zlib.crc32(effect.name.encode()))).random((end, count))
         else:
             unit = shared[:, effect.first : effect.first + count]
-        values |= effect.sample(settings, np.where(effect.shared, unit[first], unit[start:]), views)
+        shared_by_session = [effect.anew != "all" and name not in effect.anew for name in effect.columns]
+        values |= effect.sample(settings, np.where(shared_by_session, unit[first], unit[start:]), views)
     return values
 
 

@@ -157,17 +157,18 @@ def _hang(scene: MeshScene, lay: Lay) -> tuple[Piece, Placement, float, tuple[st
     scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
-    needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
-    marker_mm = marker_size_mm(float(needed_mm), patch.size_mm)
+    needed_mm = float(MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE))
+    marker_mm = marker_size_mm(needed_mm, patch.size_mm)
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    notes = (
-        *mesh.warnings,
-        *scene.backgrounds.notes,
-        *placement.warnings,
-        *_unreadable_warning(unreadable, marker_mm, float(needed_mm)),
-    )
+    notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
+    if unreadable > 1 - READABLE_SHARE:
+        notes += (
+            f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {unreadable:.0%} of the "
+            f"views: view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+            f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
+        )
     return piece, placement, unreadable, notes
 
 
@@ -182,13 +183,3 @@ def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     planes = np.stack([geometry.plane_homography(matrix, pose, card.world_from_piece) for pose in poses])
     mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
     return mean * np.sqrt(np.cos(np.radians(tilt_deg)))
-
-
-def _unreadable_warning(share: float, marker_mm: float, needed_mm: float) -> tuple[str, ...]:
-    if share <= 1 - READABLE_SHARE:
-        return ()
-    return (
-        f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views: "
-        f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
-        f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
-    )

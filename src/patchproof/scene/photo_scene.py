@@ -178,9 +178,8 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
 
 
 def _files(folder: Path) -> list[Path]:
-    return (
-        sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and is_file(p)) if is_folder(folder) else []
-    )
+    inside = folder.iterdir() if is_folder(folder) else ()
+    return sorted(path for path in inside if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
 def _digest(folder: Path) -> str:

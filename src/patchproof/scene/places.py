@@ -93,9 +93,7 @@ class Ground:
         return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
 
     def _middle_of(self, side: Side) -> Spot | None:
-        """The middle of a side that views face, where a piece hangs that is given no other place; however far it stands
-        off there, unless that is limited.
-        """
+        """The middle of a side that views face, where a piece hangs by default; how far off, only `gap_mm` limits."""
         frame, patch = self._frame_at(side), self.scene.settings.patch
         if self._facing(frame.origin_mm[None], frame.normal[None])[0] < _FACING_SHARE:
             return None
