@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from patchproof.base.color import codes_of
 from patchproof.mesh.mesh import Mesh, Part
@@ -48,15 +49,11 @@ def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     corners = np.concatenate([array[faces].reshape(3 * len(faces), -1).astype(float) for array in arrays], axis=1)
     corners, index = np.unique(corners, axis=0, return_inverse=True)
     position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
-    surface = _textured(position, index.reshape(-1, 3), normal, uv, name, texture)
-    if (color != 1).any():
-        # trimesh writes bytes, whatever it is given
-        surface.visual.vertex_attributes["color"] = codes_of(np.insert(color, 3, 1.0, axis=1))
-    return surface
+    return _textured(position, index.reshape(-1, 3), normal, uv, name, texture, color)
 
 
-def _textured(vertices_mm: np.ndarray, faces: np.ndarray, normals: np.ndarray, uv: np.ndarray, name: str, texture):
-    """A trimesh with a matte texture over coordinates V×2 with v down."""
+def _textured(vertices_mm, faces, normals, uv: np.ndarray, name: str, texture: np.ndarray, color: ArrayLike = 1.0):
+    """A trimesh with a matte texture over coordinates V×2 with v down, which corner colors V×3 multiply."""
     import trimesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -66,4 +63,7 @@ def _textured(vertices_mm: np.ndarray, faces: np.ndarray, normals: np.ndarray, u
         name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
     visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    if np.any(np.asarray(color) != 1):
+        # trimesh writes bytes, whatever it is given
+        visual.vertex_attributes["color"] = codes_of(np.insert(np.asarray(color), 3, 1.0, axis=1))
     return trimesh.Trimesh(vertices_mm * _M_FROM_MM, faces, vertex_normals=normals, visual=visual, process=False)

@@ -105,10 +105,11 @@ def fields_of(conditions: Conditions) -> dict[str, np.ndarray]:
 
 def of_fields(values: Mapping[str, np.ndarray]) -> Conditions:
     """The conditions with these fields, in whatever records they are."""
-    records: dict[str, Any] = {record: {} for record in RECORDS}
+    fields: dict[str, Any] = {record: {} for record in RECORDS}
     for name, value in values.items():
-        records[RECORD_OF[name]][name] = value
-    return Conditions(**{record: kind(**records[record]) for record, kind in RECORDS.items()})
+        fields[RECORD_OF[name]][name] = value
+    made: dict[str, Any] = {record: kind(**fields[record]) for record, kind in RECORDS.items()}
+    return Conditions(**made)
 
 
 def with_values(conditions: Conditions, **values: ArrayLike) -> Conditions:

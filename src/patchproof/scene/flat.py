@@ -68,7 +68,7 @@ class FlatScene(PieceScene):
         """Pixels per millimeter of the piece in the closest view."""
         return float(self.piece_scales(self.draw("select", VIEWS_TRIED, 0), size_px).max())
 
-    @cached_property
+    @property
     def unreadable_share(self) -> float:
         """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE` along its
         foreshortened side.

@@ -58,11 +58,12 @@ class Placement:
         frame = self.world_from_piece
         if self.is_flat:
             return points_mm @ frame[:3, :2].T + frame[:3, 3]
-        from scipy.interpolate import RegularGridInterpolator
+        from scipy.interpolate import interpn
 
         xs, ys = (np.unique(self.piece_mm[:, i]) for i in range(2))
         grid = self.vertices_mm.reshape(len(ys), len(xs), 3)
-        return RegularGridInterpolator((ys, xs), grid, bounds_error=False, fill_value=None)(points_mm[:, ::-1])
+        at = points_mm[:, ::-1]  # None extrapolates, which scipy's stubs do not know
+        return interpn((ys, xs), grid, at, bounds_error=False, fill_value=None)  # pyright: ignore[reportArgumentType]
 
     @property
     def is_flat(self) -> bool:
