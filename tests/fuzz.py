@@ -403,7 +403,7 @@ CARD = {"input_px": 16, "labels": ["a", "b", "c"]}
 
 def labels_csv(rng: Rng, folder: Path) -> Read:
     from patchlab.harden.labeled import labeled_files
-    from patchproof.scene.image_scene import labels_of
+    from patchlab.paper.image_classes import labels_of
 
     (folder / "labels.csv").write_bytes(broken_lines(rng, LABELS))
     for name in "abc":

@@ -25,7 +25,7 @@ from patchproof.render.pixels import PHOTOGRAPHED, ObjectTextures, PiecePicture
 from patchproof.render.stage import set_stage
 from patchproof.render.texture import look_up, texel_table
 from patchproof.render.views import apart, relit, see, seen_again
-from patchproof.scene.conditions import draw, with_poses_of, with_values
+from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.piece import marker_image
 
@@ -180,7 +180,7 @@ def test_views_lit_anew_are_views_seen_anew(tmp_path):
     scene = scene_of(tmp_path)
     stage, piece, poses, other = set_stage(scene), piece_of(scene), scene.draw("train", 3), scene.draw("select", 3)
     textures = ObjectTextures(stage.object.textures_srgb)
-    there = with_poses_of(other, poses)
+    there = replace(other, pose=poses.pose)
     elsewhere = replace(there, pose=replace(there.pose, background=other.pose.background))
     for shown in (piece, None, textures):
         laid_out = textures if shown is textures else piece

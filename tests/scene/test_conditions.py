@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import validated
-from patchproof.scene.conditions import draw, fields_of, with_poses_of
+from patchproof.scene.conditions import draw, fields_of
 
 SETTINGS = validated(
     SceneSettings,
@@ -109,12 +111,12 @@ def test_no_two_columns_move_together():
 
 def test_poses_are_kept_while_the_rest_is_drawn_anew():
     poses, new = draw(EVERYTHING, "train", 12, 0), draw(EVERYTHING, "train", 12, 0, start=12)
-    kept = with_poses_of(new, poses)
+    kept = replace(new, pose=poses.pose)
     pose = {"azimuth_deg", "elevation_deg", "distance_mm", "roll_deg", "look_at_offset", "background", "printed_scale"}
     kept, *both = (fields_of(conditions) for conditions in (kept, poses, new))
     for name, values in kept.items():
         source, other = both if name in pose else both[::-1]
         np.testing.assert_array_equal(values, source[name])
         assert not np.array_equal(values, other[name]), name
-    with pytest.raises(ValueError, match="12 conditions cannot take the poses of 3"):
-        with_poses_of(new, poses[:3])
+    with pytest.raises(ValueError, match=r"\[3, 12\] rows"):
+        replace(new, pose=poses[:3].pose)

@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from patchlab.harden.labeled import write_labels
 from patchlab.study.grid import Values, scene_of
 from patchproof.base.color import srgb_from_linear
+from patchproof.base.input import is_file
 from patchproof.base.settings import (
     BackgroundSettings,
     CameraSettings,
@@ -38,7 +39,7 @@ from patchproof.render.photograph import shade
 from patchproof.render.stage import Stage, set_stage
 from patchproof.render.views import see
 from patchproof.report.images import png
-from patchproof.scene.image_scene import ImageScene, build, labels_of, largest_share
+from patchproof.scene.image_scene import ImageScene, build, label_rows, largest_share
 from patchproof.scene.interface import SceneSource
 from patchproof.sheets.piece import Piece
 
@@ -92,6 +93,14 @@ def classes_of(images: str | None, table: str | None, scenes: Sequence[Values], 
         target = values["scene"]["target"]
         classes.append(ImageClass(target["label"], tuple(target["accept"]), values))
     return classes
+
+
+def labels_of(folder: Path, table: Path) -> list[str]:
+    """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
+    found = list(dict.fromkeys(label for name, label in label_rows(table) if is_file(folder / name)))
+    if not found:
+        raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
+    return found
 
 
 def class_scene(

@@ -102,7 +102,7 @@ def epochs(
     steps = recipe.epochs * (len(shown.images) // recipe.batch)
     optimizer = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=recipe.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, recipe.learning_rate, total_steps=steps, pct_start=0.15)
-    cards = torch.from_numpy(np.stack([patterns.card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
+    cards = torch.from_numpy(np.stack([_card(rng) for _ in range(256)])).permute(0, 3, 1, 2)
     for epoch in range(recipe.epochs):
         losses, order = [], torch.randperm(len(shown.images))
         for rows in order[: len(order) // recipe.batch * recipe.batch].split(recipe.batch):
@@ -113,3 +113,16 @@ def epochs(
             schedule.step()
             losses.append(loss.item())
         yield epoch, float(np.mean(losses)), network
+
+
+def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
+    """P×P×3 float32 in [0, 1]: anything, mostly in a frame of white paper with black blocks on it."""
+    picture = patterns.texture(rng, px)
+    if rng.random() < 0.6:
+        margin, cell = int(rng.integers(4, 9)), int(rng.integers(2, 4))
+        blocks = rng.random((px // cell + 1, px // cell + 1)) < rng.uniform(0.2, 0.6)
+        blocks = blocks.repeat(cell, 0).repeat(cell, 1)[:px, :px, None]
+        frame = np.where(blocks, 0.08, 0.95).repeat(3, 2)
+        frame[margin:-margin, margin:-margin] = picture[margin:-margin, margin:-margin]
+        picture = frame
+    return picture.astype(np.float32)

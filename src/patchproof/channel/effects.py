@@ -152,11 +152,6 @@ class Effect:
         end = _ENDS[source](value)
         return -end, end
 
-    @property
-    def shared(self) -> list[bool]:
-        """Of each column, whether all photographs of a session have it in common."""
-        return [self.anew != "all" and name not in self.anew for name in self.columns]
-
     def sample(self, settings: SceneSettings, unit: np.ndarray, number: np.ndarray) -> dict[str, np.ndarray]:
         """Its fields for N views with numbers N×columns in [0, 1); without columns, the views' own `number` N."""
         ends = (self.range(settings, name) for name in self.columns)
@@ -175,20 +170,12 @@ class Effect:
         return replace(record, **{strength: np.full_like(drawn, at_rest)})
 
 
-def _stacked(*columns: np.ndarray) -> np.ndarray:
-    return np.stack(columns, 1)
-
-
 def _view(azimuth, elevation, distance, roll, *offset: np.ndarray) -> tuple[np.ndarray, ...]:
-    return azimuth, elevation, distance, roll, np.stack(offset, 1)
+    return azimuth, elevation, distance, roll, np.column_stack(offset)
 
 
 def _gains(red: np.ndarray, blue: np.ndarray) -> np.ndarray:
     return np.exp(np.stack([red, np.zeros_like(red), blue], 1))
-
-
-def _whole(quality: np.ndarray) -> np.ndarray:
-    return np.round(quality).astype(np.int64)
 
 
 def _even_for_sun(light: Light, facing: Facing) -> Light:
@@ -212,7 +199,7 @@ _SUN = {"light_azimuth_deg": "light.azimuth_deg", "light_elevation_deg": "light.
 
 EFFECTS: tuple[Effect, ...] = (
     Effect("viewpoint", _VIEW | _JITTER, 0, (*_VIEW, "look_at_offset"), _view, anew="all", switch=False),
-    Effect("background", _PLACE, 11, ("background",), _stacked, anew=("x", "y"), switch=False),
+    Effect("background", _PLACE, 11, ("background",), lambda *place: np.column_stack(place), ("x", "y"), False),
     Effect("directional light", {"directional": "light.directional"} | _SUN, 8, instead=_even_for_sun),
     Effect("ambient light", {"ambient": "light.ambient"}, 7, instead=_sun_alone),
     Effect("dot gain", {"dot_gain": "printer.dot_gain"}, 22),
@@ -225,7 +212,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("blur", {"blur_px": "camera.blur_px"}, 19, anew="all", whole=True),
     Effect("noise", {"noise": "camera.noise"}, 20, anew="all", whole=True),
     Effect("grain", {}, 25, ("noise_seed",), switch=False),
-    Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, ("jpeg",), _whole, whole=True),
+    Effect("JPEG", {"jpeg": "camera.jpeg"}, 21, made=lambda quality: quality.round().astype(np.int64), whole=True),
 )
 EFFECT = {effect.name: effect for effect in EFFECTS}
 

@@ -24,7 +24,7 @@ from pydantic import Field
 
 from patchproof.base.input import is_file, read_json
 from patchproof.base.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
-from patchproof.channel.frame import Frame
+from patchproof.channel.cameras import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -130,9 +130,7 @@ def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse a camera whose middle lies outside of its picture, whose tone curve does not grow, or whose distortion
-    cannot be undone; `where` names it.
-    """
+    """Refuse a middle outside the picture, a tone curve that does not grow, or distortion that cannot be undone."""
     (width, height), light = camera.image_px, camera.tone_light
     if not (0 < camera.cx < width and 0 < camera.cy < height):
         raise Refused(
@@ -171,9 +169,7 @@ def _bent(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def _straight(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """The inverse of `_bent` by fixed-point iteration: it converges where the lens moves neighbors by less than their
-    distance.
-    """
+    """The inverse of `_bent` by fixed-point iteration: it converges where neighbors move less than their distance."""
     straight = points
     for _ in range(_ITERATIONS):
         change = points - _bent(camera, straight)

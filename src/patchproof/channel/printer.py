@@ -155,13 +155,8 @@ def _bordered(table: Tensor) -> Tensor:
     grid_sample's gradient is zero on the outermost nodes, where pure black and white lie: a saturated pixel would never
     move again. One layer further out, the border is out of reach.
     """
-    table = table.permute(3, 0, 1, 2)[None]
-    for dim in (2, 3, 4):
-        first, last = table.narrow(dim, 0, 2), table.narrow(dim, SIZE - 2, 2)
-        before = 2 * first.narrow(dim, 0, 1) - first.narrow(dim, 1, 1)
-        after = 2 * last.narrow(dim, 1, 1) - last.narrow(dim, 0, 1)
-        table = torch.cat([before, table, after], dim)
-    return table.contiguous()
+    bordered = np.pad(table.numpy(), [(1, 1)] * 3 + [(0, 0)], mode="reflect", reflect_type="odd")
+    return torch.from_numpy(bordered).permute(3, 0, 1, 2)[None].contiguous()
 
 
 def _look_up(table: Tensor, srgb: Tensor) -> Tensor:

@@ -74,9 +74,7 @@ def exponential_map(surface: Smooth, offsets_mm: np.ndarray, right: np.ndarray, 
 
 
 def stretch_at(surface: Smooth, at: np.ndarray, size_mm: tuple[float, float], n: int) -> np.ndarray:
-    """n×n: the largest relative change of length in any direction at each point of an n×n net of the sheet by rows that
-    lies `at` (s, t).
-    """
+    """n×n: the largest relative change of length at each point of a net of the sheet by rows that lies `at` (s, t)."""
     step = np.array(size_mm) / (n - 1)
     net = at.reshape(n, n, 2)
     by_row, by_column = (np.asarray(np.gradient(net, step[1 - axis], axis=axis, edge_order=2)) for axis in (0, 1))

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from patchproof.base.color import codes_of
 from patchproof.mesh.mesh import Mesh, Part
@@ -35,43 +36,25 @@ def write_glb(mesh: Mesh, textures: Sequence[np.ndarray], path: str | Path, piec
         if len(faces):
             scene.add_geometry(_geometry(mesh, faces, material.name, texture), geom_name=f"{index}_{material.name}")
     if piece is not None:
-        scene.add_geometry(_part(piece), geom_name="piece")
+        if piece.uv is None or piece.normals is None or piece.material.texture_srgb is None:
+            raise ValueError("a part without a texture")
+        arrays = piece.vertices, piece.faces, piece.normals, piece.uv
+        scene.add_geometry(_textured(*arrays, piece.material.name, piece.material.texture_srgb), geom_name="piece")
     Path(path).write_bytes(export_glb(scene, include_normals=True))
 
 
 def _geometry(mesh: Mesh, faces: np.ndarray, name: str, texture: np.ndarray):
     """Some faces as a trimesh, corners that agree in everything made one vertex."""
-    import trimesh
-
-    arrays = [
-        mesh.vertices[mesh.faces[faces]] * _M_FROM_MM,
-        mesh.corner_normal[faces],
-        mesh.corner_uv[faces],
-        mesh.corner_color_linear[faces],
-    ]
-    corners = np.concatenate([np.asarray(array, float).reshape(3 * len(faces), -1) for array in arrays], axis=1)
+    arrays = mesh.vertices[mesh.faces], mesh.corner_normal, mesh.corner_uv, mesh.corner_color_linear
+    corners = np.concatenate([array[faces].reshape(3 * len(faces), -1).astype(float) for array in arrays], axis=1)
     corners, index = np.unique(corners, axis=0, return_inverse=True)
     position, normal, uv, color = np.split(corners, [3, 6, 8], axis=1)
-    visual = _textured(uv, name, texture)
-    if (color != 1).any():
-        # trimesh writes bytes, whatever it is given
-        visual.vertex_attributes["color"] = codes_of(np.insert(color, 3, 1.0, axis=1))
-    return trimesh.Trimesh(position, index.reshape(-1, 3), vertex_normals=normal, visual=visual, process=False)
+    return _textured(position, index.reshape(-1, 3), normal, uv, name, texture, color)
 
 
-def _part(part: Part):
-    """A part with a texture as a trimesh."""
+def _textured(vertices_mm, faces, normals, uv: np.ndarray, name: str, texture: np.ndarray, color: ArrayLike = 1.0):
+    """A trimesh with a matte texture over coordinates V×2 with v down, which corner colors V×3 multiply."""
     import trimesh
-
-    if part.uv is None or part.material.texture_srgb is None:
-        raise ValueError("a part without a texture")
-    visual = _textured(part.uv, part.material.name, part.material.texture_srgb)
-    position = part.vertices * _M_FROM_MM
-    return trimesh.Trimesh(position, part.faces, vertex_normals=part.normals, visual=visual, process=False)
-
-
-def _textured(uv: np.ndarray, name: str, texture: np.ndarray):
-    """A matte texture over coordinates V×2 with v down."""
     from PIL import Image
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -79,4 +62,8 @@ def _textured(uv: np.ndarray, name: str, texture: np.ndarray):
     material = PBRMaterial(
         name=name, baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
-    return TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    visual = TextureVisuals(uv=np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material=material)
+    if np.any(np.asarray(color) != 1):
+        # trimesh writes bytes, whatever it is given
+        visual.vertex_attributes["color"] = codes_of(np.insert(np.asarray(color), 3, 1.0, axis=1))
+    return trimesh.Trimesh(vertices_mm * _M_FROM_MM, faces, vertex_normals=normals, visual=visual, process=False)

@@ -56,11 +56,10 @@ def _within_limit(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
     kept: dict[Material, Material] = {}
     warnings = []
     for material in dict.fromkeys(part.material for part in parts):
-        kept[material], texture = material, material.texture_srgb
-        if texture is None or max(texture.shape[:2]) <= LARGEST_TEXTURE_PX:
-            continue
-        small = reduced(texture, LARGEST_TEXTURE_PX)
-        kept[material] = replace(material, texture_srgb=small)
-        before, after = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
-        warnings.append(f"the texture of {before} of {material.name} is reduced to {after}")
-    return [replace(part, material=kept[part.material]) for part in parts], warnings
+        texture = material.texture_srgb
+        if texture is not None and max(texture.shape[:2]) > LARGEST_TEXTURE_PX:
+            small = reduced(texture, LARGEST_TEXTURE_PX)
+            kept[material] = replace(material, texture_srgb=small)
+            before, after = (f"{pixels.shape[1]} × {pixels.shape[0]}" for pixels in (texture, small))
+            warnings.append(f"the texture of {before} of {material.name} is reduced to {after}")
+    return [replace(part, material=kept.get(part.material, part.material)) for part in parts], warnings

@@ -7,8 +7,6 @@ texture can be put on. An object with a flat side broad enough for a card shows 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from patchproof.base.strict import Refused, nearest
@@ -24,14 +22,16 @@ def names() -> tuple[str, ...]:
 def build(name: str, seed: int = 0) -> Mesh:
     """One object; the same name and seed give the same arrays."""
     made = parts(name, seed)
-    corners = np.concatenate([part.vertices for part in made])
-    return from_parts(made, float(np.ptp(corners, axis=0).max()))
+    return from_parts(made, _longest(made))
 
 
 def longest_mm(name: str) -> float:
     """The longest extent of one object as it is made, in whole millimeters."""
-    corners = np.concatenate([part.vertices for part in parts(name)])
-    return float(round(np.ptp(corners, axis=0).max()))
+    return float(round(_longest(parts(name))))
+
+
+def _longest(made: list[Part]) -> float:
+    return float(np.ptp(np.concatenate([part.vertices for part in made]), axis=0).max())
 
 
 def parts(name: str, seed: int = 0) -> list[Part]:
@@ -257,17 +257,8 @@ def _hammer(rng) -> list[Part]:
     return made
 
 
-_OBJECTS: dict[str, Callable] = {
-    "mug": _mug,
-    "bottle": _bottle,
-    "traffic_cone": _traffic_cone,
-    "street_sign": _street_sign,
-    "box_truck": _box_truck,
-    "chair": _chair,
-    "table_lamp": _table_lamp,
-    "carton": _carton,
-    "mailbox": _mailbox,
-    "umbrella": _umbrella,
-    "watering_can": _watering_can,
-    "hammer": _hammer,
-}
+_MAKERS = (
+    *(_mug, _bottle, _traffic_cone, _street_sign, _box_truck, _chair, _table_lamp, _carton, _mailbox, _umbrella),
+    *(_watering_can, _hammer),
+)
+_OBJECTS = {make.__name__[1:]: make for make in _MAKERS}

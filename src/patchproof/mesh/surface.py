@@ -102,9 +102,7 @@ def edge_points(triangles: np.ndarray, step_mm: float) -> np.ndarray:
 
 
 def surface_at(triangles: np.ndarray, origin_mm: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Where the line through `origin_mm` along the third of `axes` meets the surface next to it; refused where it
-    misses.
-    """
+    """Where the line through `origin_mm` along the last of `axes` meets the nearest surface; refused if it misses."""
     corners = (triangles - origin_mm) @ axes.T
     near = corners[((corners.min(1) <= 0) & (corners.max(1) >= 0))[:, :2].all(1)]
     h, hit = _cast(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), near)

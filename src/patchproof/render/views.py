@@ -24,7 +24,7 @@ from torch import Tensor
 from patchproof.base.color import LIGHT_OF_CODE
 from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encoded, encoded_by_table, gains
-from patchproof.channel.frame import Frame
+from patchproof.channel.cameras import Frame
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines
@@ -43,7 +43,7 @@ from patchproof.render.pixels import (
 from patchproof.render.raster import rasterize
 from patchproof.render.stage import Stage
 from patchproof.render.texture import look_up
-from patchproof.scene.conditions import Conditions, with_poses_of
+from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import needs_piece
 from patchproof.scene.mesh_scene import MeshScene, needs_mesh
 
@@ -201,7 +201,7 @@ def _covered(piece: PiecePixels | None, nearest: Tensor) -> Tensor:
 
 def relit(views: Views, conditions: Conditions) -> Views:
     """The same views under other light, with another print and camera; poses and backgrounds stay."""
-    conditions, light = with_poses_of(conditions, views.conditions), views.light
+    conditions, light = replace(conditions, pose=views.conditions.pose), views.light
     if light is not None:
         light = _light(needs_mesh(views.stage.scene), views.stage.device, conditions)
     return replace(views, conditions=conditions, light=light)

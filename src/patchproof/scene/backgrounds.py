@@ -48,9 +48,7 @@ _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
 @dataclass(frozen=True)
 class _Part:
-    """Of the pictures: a part's own files from `first`, `files` of them, then its procedural places; and in which share
-    of its views files are seen.
-    """
+    """A part's `files` pictures from `first`, the procedural places after them, and the share of views with files."""
 
     first: int
     files: int
@@ -89,12 +87,14 @@ class Backgrounds:
         return self._reduced[number]
 
     def picture(self, choice: np.ndarray, photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
-        """What lies behind one view of `size_px`: the whole photograph, or its centered square where `size_px` is
-        square.
-        """
+        """What lies behind a view of `size_px`: the whole photograph or, where square, its centered square."""
         levels = self._levels(int(choice[0] * len(self.pictures)))
         height, width = levels[0].shape[:2]
-        x0, y0, crop_w, crop_h = _crop((width, height), choice, photo_px)
+        # a crop with the photograph's aspect
+        largest = min(width / photo_px[0], height / photo_px[1])
+        share = SMALLEST_CROP + (1 - SMALLEST_CROP) * choice[1]
+        crop_w, crop_h = photo_px[0] * largest * share, photo_px[1] * largest * share
+        x0, y0 = choice[2] * (width - crop_w), choice[3] * (height - crop_h)
         if size_px[0] == size_px[1]:
             side = min(crop_w, crop_h)
             x0, y0, crop_w, crop_h = x0 + (crop_w - side) / 2, y0 + (crop_h - side) / 2, side, side
@@ -139,7 +139,10 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
     parts = {}
     for name, rooms in ROOMS.items():
         own = [file for i, file in enumerate(files) if _DEALT[i % len(_DEALT)] == name]
-        share = _share(name, len(own))
+        if name in ("train", "select"):
+            share = 1.0 if len(own) >= ENOUGH else OFTEN * len(own) / (OFTEN * len(own) + len(rooms))
+        else:
+            share = min(1.0, len(own) / RARE)
         parts[name] = _Part(len(pictures), len(own), len(rooms) if share < 1 else 0, share)
         pictures += [*map(_read, own), *(rooms if share < 1 else ())]
     notes = ()
@@ -151,26 +154,8 @@ def _in_parts(files: Sequence[Path]) -> Backgrounds:
     return Backgrounds(tuple(pictures), parts | {"reprint": parts["evaluate"]}, notes)
 
 
-def _share(part: str, files: int) -> float:
-    """In which share of a part's views its own files are seen."""
-    if part in ("train", "select"):
-        return 1.0 if files >= ENOUGH else OFTEN * files / (OFTEN * files + len(ROOMS[part]))
-    return min(1.0, files / RARE)
-
-
 def _read(file: Path) -> np.ndarray:
     from PIL import ImageOps
 
     with opened_picture(file, "a background picture", "remove or replace it") as image:
         return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-
-
-def _crop(
-    picture_px: tuple[int, int], choice: np.ndarray, photo_px: tuple[int, int]
-) -> tuple[float, float, float, float]:
-    """x, y, width, height of a crop with the photograph's aspect."""
-    width, height = picture_px
-    largest = min(width / photo_px[0], height / photo_px[1])
-    share = SMALLEST_CROP + (1 - SMALLEST_CROP) * choice[1]
-    crop_w, crop_h = photo_px[0] * largest * share, photo_px[1] * largest * share
-    return choice[2] * (width - crop_w), choice[3] * (height - crop_h), crop_w, crop_h

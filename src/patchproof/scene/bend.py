@@ -26,7 +26,6 @@ from patchproof.scene.placement import (
     Placement,
     lay_card,
     place_card,
-    placement_warnings,
     pose_of,
     refuse_larger_than_side,
     spun,
@@ -162,9 +161,7 @@ def _tangent(near: np.ndarray, frame: Frame, size_mm) -> tuple[Frame, np.ndarray
 
 
 def _cylinder(near: np.ndarray, tangent: Frame, bends: np.ndarray, size_mm, spin_deg: float) -> Chart:
-    """The cylinder that fits the surface under the piece best, as a chart whose normal goes through the tangent frame's
-    origin.
-    """
+    """The cylinder that fits the surface under the piece best; its normal goes through the tangent frame's origin."""
     values, directions = np.linalg.eigh(bends)
     most = int(np.abs(values).argmax())
     across = directions[0, most] * tangent.right + directions[1, most] * tangent.up
@@ -229,7 +226,6 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
     clear = np.where(np.isfinite(paper), paper, surface.height(*at.T)) - under
     gaps = clear[np.isfinite(clear) & np.isfinite(paper)] - LIFT_MM
     stretches = stretch_at(surface, st, size_mm, _PIECE_NET)
-    gap, overhang = float(gaps.max()), 1 - len(gaps) / int(np.isfinite(paper).sum())
     return Placement(
         family="exponential",
         size_mm=tuple(size_mm),
@@ -238,14 +234,13 @@ def _laid(surface: Smooth, near: np.ndarray, frame: Frame, size_mm, spin_deg: fl
         piece_mm=net(size_mm, _PIECE_NET) * [1, -1] + np.array(size_mm) / 2,
         normals=normals,
         world_from_piece=pose,
-        gap_mm=gap,
+        gap_mm=float(gaps.max()),
         gap_mean_mm=float(gaps.mean()),
         gaps_mm=(clear - LIFT_MM).reshape(GRID, GRID),
-        overhang_share=overhang,
+        overhang_share=1 - len(gaps) / int(np.isfinite(paper).sum()),
         stretch=float(stretches.max()),
         stretches=stretches,
         reason="",
-        warnings=placement_warnings(gap, overhang, size_mm),
     )
 
 
@@ -260,9 +255,7 @@ def _top(surface: Smooth, near: np.ndarray, under: np.ndarray, size_mm) -> float
 
 
 def _spread(surface: Smooth, frame: Frame, size_mm, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """4×4 world from piece of the plane that touches the surface at the piece's middle, and (s, t) of the piece's net;
-    refused where geodesics leave the neighborhood of the piece.
-    """
+    """4×4 world from piece of the plane tangent at its middle, (s, t) of its net; refused where geodesics run away."""
     middle, normal = (a[0] for a in surface.points_and_normals(np.zeros(1), np.zeros(1)))
     right, up = spun(_facing(frame, normal, middle), spin_deg)
     with np.errstate(all="ignore"):

@@ -54,17 +54,9 @@ class Conditions(Rows):
 
 
 def draw(
-    settings: SceneSettings,
-    stream: Stream,
-    n: int,
-    seed: int,
-    start: int = 0,
-    per_session: int = 1,
-    salt: str = "",
+    settings: SceneSettings, stream: Stream, n: int, seed: int, start: int = 0, per_session: int = 1, salt: str = ""
 ) -> Conditions:
-    """Draws `start` to `start + n` of a stream; `per_session` in a row, from the first of all, are one session. Another
-    `salt`, other draws.
-    """
+    """Draws `start` to `start + n` of a stream; `per_session` in a row are one session; another `salt`, other draws."""
     return of_fields(sampled(EFFECTS, settings, stream, n, seed, start, per_session, salt))
 
 
@@ -81,8 +73,15 @@ def sampled(
     """The fields that effects fill in draws `start` to `start + n`; no effect's draws depend on the others."""
     number, end = _STREAMS.index(stream), start + n
     key = (seed, number, zlib.crc32(salt.encode())) if salt else (seed, number)
-    sequence = _unit(stream, _rng(*key), end)
-    shared = np.concatenate([sequence, _rng(*key, 1).random((end, _PRINT_DIMENSIONS))], 1)
+    if stream in _SOBOL:
+        from scipy.stats import qmc
+
+        # the first points do not depend on how many there are
+        points = qmc.Sobol(_DIMENSIONS, rng=np.random.default_rng(key)).random_base2(max(end - 1, 1).bit_length())
+        sequence = points[:end]
+    else:
+        sequence = np.random.default_rng(key).random((end, _DIMENSIONS))
+    shared = np.concatenate([sequence, np.random.default_rng((*key, 1)).random((end, _PRINT_DIMENSIONS))], 1)
     # each view's noise is its own, whatever batch it is rendered in
     views = ((seed * len(_STREAMS) + number) * 1_000_003 + start + np.arange(n)).astype(np.int64)
     # what a session's photographs share is what was drawn for its first
@@ -91,10 +90,11 @@ def sampled(
     for effect in effects:
         count = len(effect.columns)
         if effect.first is None:
-            unit = _rng(*key, zlib.crc32(effect.name.encode())).random((end, count))
+            unit = np.random.default_rng((*key, zlib.crc32(effect.name.encode()))).random((end, count))
         else:
             unit = shared[:, effect.first : effect.first + count]
-        values |= effect.sample(settings, np.where(effect.shared, unit[first], unit[start:]), views)
+        shared_by_session = [effect.anew != "all" and name not in effect.anew for name in effect.columns]
+        values |= effect.sample(settings, np.where(shared_by_session, unit[first], unit[start:]), views)
     return values
 
 
@@ -105,11 +105,11 @@ def fields_of(conditions: Conditions) -> dict[str, np.ndarray]:
 
 def of_fields(values: Mapping[str, np.ndarray]) -> Conditions:
     """The conditions with these fields, in whatever records they are."""
-    records: dict[str, Any] = {
-        record: kind(**{name: value for name, value in values.items() if RECORD_OF[name] == record})
-        for record, kind in RECORDS.items()
-    }
-    return Conditions(**records)
+    fields: dict[str, Any] = {record: {} for record in RECORDS}
+    for name, value in values.items():
+        fields[RECORD_OF[name]][name] = value
+    made: dict[str, Any] = {record: kind(**fields[record]) for record, kind in RECORDS.items()}
+    return Conditions(**made)
 
 
 def with_values(conditions: Conditions, **values: ArrayLike) -> Conditions:
@@ -121,31 +121,8 @@ def with_values(conditions: Conditions, **values: ArrayLike) -> Conditions:
     return of_fields(fields)
 
 
-def with_poses_of(conditions: Conditions, poses: Conditions) -> Conditions:
-    """`conditions` seen from the cameras and before the backgrounds of `poses`, row by row.
-
-    What was rasterized for `poses` serves for the result, too: light, print and camera need no rasterizing.
-    """
-    if len(conditions) != len(poses):
-        raise ValueError(f"{len(conditions)} conditions cannot take the poses of {len(poses)}")
-    return replace(conditions, pose=poses.pose)
-
-
 def without(conditions: Conditions, effect: Effect, facing: Facing) -> Conditions | None:
     """`conditions` with the effect off in all views; None where it is off already."""
     name = RECORD_OF[effect.fields[0]]
     record = effect.off(getattr(conditions, name), facing)
     return None if record is None else replace(conditions, **{name: record})
-
-
-def _rng(*key: int) -> np.random.Generator:
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
-
-
-def _unit(stream: Stream, rng: np.random.Generator, n: int) -> np.ndarray:
-    """n×D points of the unit cube; the first k do not depend on n."""
-    if stream not in _SOBOL:
-        return rng.random((n, _DIMENSIONS))
-    from scipy.stats import qmc
-
-    return qmc.Sobol(_DIMENSIONS, rng=rng).random_base2(max(n - 1, 1).bit_length())[:n]

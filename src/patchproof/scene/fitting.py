@@ -17,15 +17,7 @@ import numpy as np
 from patchproof.base.settings import PatchSettings
 from patchproof.base.strict import Refused, Side
 from patchproof.mesh.mesh import Mesh
-from patchproof.scene.placement import (
-    WARN_OVERHANG_SHARE,
-    Frame,
-    Lay,
-    Placement,
-    gap_limit_mm,
-    patch_frame,
-    side_frame,
-)
+from patchproof.scene.placement import WARN_OVERHANG_SHARE, Frame, Lay, Placement, gap_limit_mm, patch_frame, side_frame
 
 _STEP_SHARE = 0.25  # of the piece's shorter side between places that are tried
 _TRIES_FLAT, _TRIES_BENT = 120, 6  # one takes some 5 and 200 ms
@@ -88,9 +80,7 @@ def _nearest(mesh: Mesh, patch: PatchSettings, lay: Lay) -> str | None:
 def largest(
     size_mm: tuple[float, float], fits: Callable[[tuple[float, float]], object], least_mm: float
 ) -> tuple[float, float] | None:
-    """The largest piece of this shape that fits, in whole millimeters, its shorter side at least `least_mm`; None
-    where not even that does.
-    """
+    """The largest piece of this shape that fits, in whole millimeters; None where none of `least_mm` or more does."""
     low, high = least_mm / min(size_mm), 1.0
     if low > 1 or not fits(_scaled(size_mm, low)):
         return None

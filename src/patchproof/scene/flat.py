@@ -22,8 +22,7 @@ from patchproof.base.resample import between_indices, halvings
 from patchproof.base.settings import SceneSettings
 from patchproof.base.strict import Refused
 from patchproof.scene.conditions import Conditions, Stream
-from patchproof.scene.interface import PieceScene
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene
 from patchproof.sheets.piece import Piece
 
 VIEWS_TRIED = 256  # for figures over a scene's views
@@ -74,10 +73,6 @@ class FlatScene(PieceScene):
         """The share of the views in which a module of the piece's markers is under `PX_PER_MODULE` along its
         foreshortened side.
         """
-        return self._unreadable
-
-    @cached_property
-    def _unreadable(self) -> float:
         scales = self.piece_scales(self.draw("select", VIEWS_TRIED, 0), self.photo_px, shorter=True)
         return float((scales * self.piece.module_mm < PX_PER_MODULE * 0.999).mean())
 
@@ -125,9 +120,7 @@ def photo_from(picture_px: tuple[int, int], photo_px: tuple[int, int]) -> np.nda
 
 
 def size_from_photo(photo_px: tuple[int, int], size_px: tuple[int, int]) -> np.ndarray:
-    """3×3 from the photograph's pixels to a view's: the whole of it, or its centered square where `size_px` is
-    square.
-    """
+    """3×3 from the photograph's pixels to a view's: the whole of it or, where square, its centered square."""
     if size_px[0] == size_px[1]:
         return photo_from(photo_px, size_px)
     return np.diag([size_px[0] / photo_px[0], size_px[1] / photo_px[1], 1.0])

@@ -30,8 +30,7 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
-from patchproof.scene.interface import SceneSource
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
 from patchproof.sheets.markers import MODULES
 from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
@@ -74,15 +73,10 @@ class ImageScene(flat.FlatScene):
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimeters to pixels."""
         to_size = flat.size_from_photo(self.photo_px, size_px)
-        side, photo = min(self.photo_px), np.array(self.photo_px)
-        piece_mm = np.array(self.piece.size_mm)
+        side, photo, pose = min(self.photo_px), np.array(self.photo_px), conditions.pose
+        piece_mm, scales = np.array(self.piece.size_mm), px_per_mm(self.settings, self.piece, conditions)
         matrices = []
-        for scale, roll, place in zip(
-            px_per_mm(self.settings, self.piece, conditions),
-            conditions.pose.roll_deg,
-            conditions.pose.background[:, 2:4],
-            strict=True,
-        ):
+        for scale, roll, place in zip(scales, pose.roll_deg, pose.background[:, 2:4], strict=True):
             room = side - turned_extent(piece_mm * scale, roll)
             middle = (photo - side) / 2 + side / 2 + (place - 0.5) * room
             matrices.append(to_size @ flat.turned(roll, scale, middle - piece_mm / 2, piece_mm / 2))
@@ -127,20 +121,15 @@ def build(source: SceneSource) -> ImageScene:
 
 def px_per_mm(settings: SceneSettings, piece: Piece, conditions: Conditions) -> np.ndarray:
     """N scales at `photo_px`: the piece's longer side takes the drawn share of the picture's shorter one."""
-    return _shares(settings, conditions) * min(settings.camera.photo_px) / max(piece.size_mm)
-
-
-def labels_of(folder: Path, table: Path) -> list[str]:
-    """The different labels, in small letters, of the images in `folder` that the CSV `table` names."""
-    found = list(dict.fromkeys(label for name, label in label_rows(table) if is_file(folder / name)))
-    if not found:
-        raise Refused(f"the images that {table.name} names in {folder}", "none of them", "copy them there")
-    return found
+    low, high = settings.view.patch_share
+    shares = low * (high / low) ** conditions.pose.background[:, 1]
+    return shares * min(settings.camera.photo_px) / max(piece.size_mm)
 
 
 def largest_share(roll_deg: tuple[float, float]) -> float:
     """The largest `view.patch_share` at which the piece fits into the square at all angles (in whole thousandths)."""
-    return int(1000 / _widest(roll_deg)) / 1000
+    widest = max(turned_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))  # of a turned square of side 1
+    return int(1000 / widest) / 1000
 
 
 def erase(picture: np.ndarray, seed: int) -> None:
@@ -239,13 +228,3 @@ def _piece(settings: SceneSettings, identity: str) -> Piece:
     piece = lay_out_piece(size_mm, marker_size_mm(needed_mm, size_mm), identity, "design")
     refuse_larger_than_page(load_template(template), piece)
     return piece
-
-
-def _widest(roll_deg: tuple[float, float]) -> float:
-    """How wide a square of side 1 gets when it is turned."""
-    return max(turned_extent(np.ones(2), roll)[0] for roll in np.linspace(*roll_deg))
-
-
-def _shares(settings: SceneSettings, conditions: Conditions) -> np.ndarray:
-    low, high = settings.view.patch_share
-    return low * (high / low) ** conditions.pose.background[:, 1]

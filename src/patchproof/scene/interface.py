@@ -21,7 +21,6 @@ from patchproof.base.settings import SceneSettings, identifying
 from patchproof.base.strict import Refused
 from patchproof.channel.effects import Effect
 from patchproof.scene.conditions import Conditions, Stream, draw
-from patchproof.scene.resolution import design_grid
 from patchproof.sheets.piece import Piece, sheet_id
 
 if TYPE_CHECKING:
@@ -29,6 +28,9 @@ if TYPE_CHECKING:
     from patchproof.scene.texture import Canvas
 
 SCALE_VIEWS = 1024  # for quantiles over the views; as many as the marker rule looks at
+PX_PER_MODULE = 2.5  # a marker is read from about here on: 45 of 48 at 2.7 px with a blur of 0.7 px
+READABLE_SHARE = 0.95  # of the views should show markers at least that large
+_DESIGN_PX = (32, 512)
 
 
 @dataclass(frozen=True)
@@ -256,8 +258,15 @@ class PieceScene(Scene):
         return local_scales(self.piece_homographies(conditions, size_px), middle)
 
     def design_px(self, network_px: int) -> tuple[int, int]:
-        """(width, height) of the design: no more pixels than the closest view at the network's size can show."""
-        return design_grid(self.closest_px_per_mm((network_px, network_px)), self.piece.size_mm)
+        """(width, height) of the design in multiples of 8, one texel per pixel of the closest view before the network.
+
+        Finer grids cost time and bought nothing that can be told from chance: after 60 steps before a network of 224 px
+        the selection loss was 0.73, 0.79 and 0.75 with 0.7, 1 and 1.5 texels per pixel (one seed).
+        """
+        (low, high), piece_mm = _DESIGN_PX, self.piece.size_mm
+        scale = np.clip(self.closest_px_per_mm((network_px, network_px)), low / min(piece_mm), high / max(piece_mm))
+        width, height = (max(8, round(side * scale / 8) * 8) for side in piece_mm)
+        return width, height
 
     def record(self) -> dict[str, Any]:
         """What run.json says of the piece."""

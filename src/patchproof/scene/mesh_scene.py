@@ -98,9 +98,7 @@ class MeshScene(Scene):
         return camera_poses(self, self.middle_mm, conditions.pose)
 
     def camera_from_print(self, conditions: Conditions) -> np.ndarray:
-        """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as large as it was
-        printed.
-        """
+        """N×4×4 from the world, with its piece at the sheet's own size, to cameras that see it as it was printed."""
         return self.camera_from_world(conditions) @ self.printed_from_sheet(conditions)
 
     def printed_from_sheet(self, conditions: Conditions) -> np.ndarray:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from patchproof.base.settings import SceneSettings, SearchSettings, identifying
+from patchproof.base.settings import SceneSettings, SearchSettings
 from patchproof.base.strict import Refused
 from patchproof.scene.bent_scene import BentScene
 from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import MeshScene, load_bare
 from patchproof.scene.patch_scene import At, PatchScene
-from patchproof.sheets.piece import sheet_id
 
 
 @dataclass(frozen=True)
@@ -33,10 +32,8 @@ class OpenScene(MeshScene):
         """The scene with its piece at a place, its views as they were; refused where the piece cannot hang there. It is
         the one of a file that gives this place itself.
         """
-        settings = self.given(at, spin_deg)
-        identity = sheet_id(identifying(settings) | dict(self.known), self.seed)
-        kind = BentScene if settings.patch.bend else PatchScene
-        return kind.on(replace(self, settings=settings, sheet_id=identity))
+        kind = BentScene if self.settings.patch.bend else PatchScene
+        return kind.on(self._identified(self.given(at, spin_deg), self.known))
 
 
 def build(source: SceneSource) -> OpenScene:

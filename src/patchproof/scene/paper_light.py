@@ -88,11 +88,8 @@ def _inside(mm: np.ndarray, rect, grown_mm: float) -> np.ndarray:
 
 def _robust_fit(terms: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients 3×6 and the pixels' weights, which all channels share."""
-    error, coefficients, weight = (
-        np.abs(light.mean(1) - terms @ _start(terms, light.mean(1))),
-        np.zeros((3, 6)),
-        np.ones(len(terms)),
-    )
+    error = np.abs(light.mean(1) - terms @ _start(terms, light.mean(1)))
+    coefficients, weight = np.zeros((3, 6)), np.ones(len(terms))
     for _ in range(20):
         spread = max(1.4826 * float(np.median(error)), 1e-3)
         weight = np.maximum(1 - (error / (4.685 * spread)) ** 2, 0) ** 2

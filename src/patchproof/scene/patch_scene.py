@@ -15,10 +15,17 @@ from patchproof.base import geometry
 from patchproof.base.strict import Refused, Side
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.fitting import advice
-from patchproof.scene.interface import SCALE_VIEWS, PieceScene, Scene, SceneSource, refuse_without_place
+from patchproof.scene.interface import (
+    PX_PER_MODULE,
+    READABLE_SHARE,
+    SCALE_VIEWS,
+    PieceScene,
+    Scene,
+    SceneSource,
+    refuse_without_place,
+)
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.sheets.markers import MODULES
 from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
@@ -78,8 +85,7 @@ class PatchScene(PieceScene, MeshScene):
         return self.placement.is_flat and not (self.camera is not None and self.camera.bends)
 
     def _laid_out(self) -> Self:
-        piece, placement, unreadable, notes = _hang(self, self.LAY)
-        return replace(self, piece=piece, placement=placement, unreadable=unreadable, notes=notes)
+        return self.on(self)
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimeters to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
@@ -142,9 +148,7 @@ def needs_patch(scene: Scene, expected: str = "a scene with a patch on a mesh") 
 
 
 def _hang(scene: MeshScene, lay: Lay) -> tuple[Piece, Placement, float, tuple[str, ...]]:
-    """The piece with markers as large as the views need, where it lies, the share of views in which they are too small,
-    and what a reader should know.
-    """
+    """The piece with markers as large as views need, its placement, the share of views that ask for larger, notes."""
     settings, mesh, patch = scene.settings, scene.mesh, scene.settings.patch
     try:
         placement = lay(mesh, patch_frame(mesh, patch), patch.size_mm, patch.spin_deg)
@@ -153,17 +157,18 @@ def _hang(scene: MeshScene, lay: Lay) -> tuple[Piece, Placement, float, tuple[st
     scales = _smallest_scales(scene, placement)
     if not len(scales):
         raise Refused("views from which the patch can be seen", "none", "turn azimuth_deg towards the patch")
-    needed_mm = MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE)
-    marker_mm = marker_size_mm(float(needed_mm), patch.size_mm)
+    needed_mm = float(MODULES * PX_PER_MODULE / np.quantile(scales, 1 - READABLE_SHARE))
+    marker_mm = marker_size_mm(needed_mm, patch.size_mm)
     piece = lay_out_piece(patch.size_mm, marker_mm, scene.sheet_id, "design", patch.bend)
     refuse_larger_than_page(load_template(settings.sheet.template), piece)  # before hours of optimizing
     unreadable = float((scales * piece.module_mm < PX_PER_MODULE * 0.999).mean())
-    notes = (
-        *mesh.warnings,
-        *scene.backgrounds.notes,
-        *placement.warnings,
-        *_unreadable_warning(unreadable, marker_mm, float(needed_mm)),
-    )
+    notes = (*mesh.warnings, *scene.backgrounds.notes, *placement.warnings)
+    if unreadable > 1 - READABLE_SHARE:
+        notes += (
+            f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {unreadable:.0%} of the "
+            f"views: view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
+            f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
+        )
     return piece, placement, unreadable, notes
 
 
@@ -178,13 +183,3 @@ def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     planes = np.stack([geometry.plane_homography(matrix, pose, card.world_from_piece) for pose in poses])
     mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
     return mean * np.sqrt(np.cos(np.radians(tilt_deg)))
-
-
-def _unreadable_warning(share: float, marker_mm: float, needed_mm: float) -> tuple[str, ...]:
-    if share <= 1 - READABLE_SHARE:
-        return ()
-    return (
-        f"markers of {marker_mm:.1f} mm, the largest that fit, will be unreadable in {share:.0%} of the views: "
-        f"view.distance_mm and camera.photo_px ask for {needed_mm:.1f} mm, and those for a piece of "
-        f"{smallest_piece_mm(needed_mm)} mm or more; come nearer, or take larger photographs",
-    )

@@ -1,4 +1,4 @@
-"""Procedural pictures: textures to dress objects in, backgrounds to put behind them, cards to paste over them.
+"""Procedural pictures: textures to dress objects in, backgrounds to put behind them.
 
 In: a numpy generator. Out: P×P×3 in [0, 1], or uint8 for backgrounds. A photograph's background has detail at all
 scales and regions of different stuff; so have these: noise with the 1/f spectrum of natural pictures, clouds, cells,
@@ -64,19 +64,6 @@ def background(rng: np.random.Generator, px: int = 128) -> np.ndarray:
     picture = picture * (1 + rng.uniform(0, 0.8) * (_gradient(rng, px).mean(2, keepdims=True) - 0.5))  # uneven light
     blur_px = float(rng.choice([0.3, 0.6, 1.0, 2.0, 3.0], p=[0.35, 0.25, 0.2, 0.1, 0.1]))
     return codes_of(cv2.GaussianBlur(picture, (0, 0), blur_px))
-
-
-def card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
-    """P×P×3 float32 in [0, 1]: anything, mostly in a frame of white paper with black blocks on it."""
-    picture = texture(rng, px)
-    if rng.random() < 0.6:
-        margin, cell = int(rng.integers(4, 9)), int(rng.integers(2, 4))
-        blocks = rng.random((px // cell + 1, px // cell + 1)) < rng.uniform(0.2, 0.6)
-        blocks = blocks.repeat(cell, 0).repeat(cell, 1)[:px, :px, None]
-        frame = np.where(blocks, 0.08, 0.95).repeat(3, 2)
-        frame[margin:-margin, margin:-margin] = picture[margin:-margin, margin:-margin]
-        picture = frame
-    return picture.astype(np.float32)
 
 
 def color(rng: np.random.Generator) -> np.ndarray:

@@ -84,10 +84,9 @@ class PhotoScene(flat.FlatScene):
 
     def without(self, part: Part) -> Self | None:
         """The scene with photographs that light their paper evenly, or without their own blur or noise."""
-        even, photos = np.array([1.0, 0, 0, 0, 0, 0]), self.photos
+        photos, even = self.photos, [1.0, 0, 0, 0, 0, 0]
         if part == EVEN_LIGHT:
-            coefficients = (photo.light.coefficients * even for photo in photos)
-            lights = [replace(photo.light, coefficients=each) for photo, each in zip(photos, coefficients, strict=True)]
+            lights = [replace(photo.light, coefficients=photo.light.coefficients * even) for photo in photos]
         elif part == OWN_NOISE and any(photo.light.noise for photo in photos):
             lights = [replace(photo.light, noise=0.0) for photo in photos]
         elif part == OWN_BLUR and any(photo.blur_px for photo in photos):
@@ -179,9 +178,8 @@ def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int])
 
 
 def _files(folder: Path) -> list[Path]:
-    return (
-        sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and is_file(p)) if is_folder(folder) else []
-    )
+    inside = folder.iterdir() if is_folder(folder) else ()
+    return sorted(path for path in inside if path.suffix.lower() in SUFFIXES and is_file(path))
 
 
 def _digest(folder: Path) -> str:

@@ -52,20 +52,18 @@ class Placement:
     stretch: float  # largest relative change of length on the surface against the sheet
     stretches: np.ndarray  # N×N by rows from the top: the same at each point of the piece
     reason: str
-    warnings: tuple[str, ...] = ()
 
     def world(self, points_mm: np.ndarray) -> np.ndarray:
         """World millimeters N×3 of piece points N×2; bilinear between a bent piece's vertices."""
         frame = self.world_from_piece
         if self.is_flat:
             return points_mm @ frame[:3, :2].T + frame[:3, 3]
+        from scipy.interpolate import interpn
+
         xs, ys = (np.unique(self.piece_mm[:, i]) for i in range(2))
         grid = self.vertices_mm.reshape(len(ys), len(xs), 3)
-        column, u = _cells(xs, points_mm[:, 0])
-        row, v = _cells(ys, points_mm[:, 1])
-        upper = grid[row, column] * (1 - u) + grid[row, column + 1] * u
-        lower = grid[row + 1, column] * (1 - u) + grid[row + 1, column + 1] * u
-        return upper * (1 - v) + lower * v
+        at = points_mm[:, ::-1]  # None extrapolates, which scipy's stubs do not know
+        return interpn((ys, xs), grid, at, bounds_error=False, fill_value=None)  # pyright: ignore[reportArgumentType]
 
     @property
     def is_flat(self) -> bool:
@@ -81,6 +79,17 @@ class Placement:
     def center_mm(self) -> np.ndarray:
         """The middle of the piece in the world."""
         return self.world(np.array([self.size_mm]) / 2)[0]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should hear about its gap and its overhang."""
+        notes = []
+        if self.gap_mm > gap_limit_mm(self.size_mm):
+            share = f"{self.gap_mm / min(self.size_mm):.0%} of its shorter edge"
+            notes.append(f"the piece stands up to {self.gap_mm:.0f} mm ({share}) off the surface")
+        if self.overhang_share > WARN_OVERHANG_SHARE:
+            notes.append(f"{self.overhang_share:.0%} of the piece overhangs the object")
+        return tuple(notes)
 
 
 @dataclass(frozen=True)
@@ -146,9 +155,7 @@ def place_card(mesh: Mesh, frame: Frame, size_mm: tuple[float, float], spin_deg:
 
 
 def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reach_mm: float = np.inf) -> Placement:
-    """`place_card` on triangles F×3×3, however large the card; surface farther than `reach_mm` from the frame's plane
-    does not count.
-    """
+    """`place_card` of any size on triangles F×3×3; surface over `reach_mm` from the frame's plane does not count."""
     width, height = size_mm
     right, up = spun(frame, spin_deg)
     chart = Chart(frame.origin_mm, np.stack([right, up, frame.normal]), 0.0, np.array([1.0, 0.0]))
@@ -163,7 +170,7 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
     gaps = top - surface[hit]
     pose = pose_of(right, up, frame.normal, frame.origin_mm + frame.normal * (top + LIFT_MM), size_mm)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    gap, overhang = float(gaps.max()), float(1 - hit.mean())
+    gap_mm = float(gaps.max())
     return Placement(
         family="card",
         size_mm=(width, height),
@@ -172,14 +179,13 @@ def lay_card(triangles: np.ndarray, frame: Frame, size_mm, spin_deg: float, reac
         piece_mm=corners,
         normals=np.tile(frame.normal, (4, 1)),
         world_from_piece=pose,
-        gap_mm=gap,
+        gap_mm=gap_mm,
         gap_mean_mm=float(gaps.mean()),
         gaps_mm=(top - surface).reshape(GRID, GRID),
-        overhang_share=overhang,
+        overhang_share=float(1 - hit.mean()),
         stretch=0.0,
         stretches=np.zeros((2, 2)),
-        reason=f"a flat card stands at most {gap:.1f} mm off the surface",
-        warnings=placement_warnings(gap, overhang, size_mm),
+        reason=f"a flat card stands at most {gap_mm:.1f} mm off the surface",
     )
 
 
@@ -197,12 +203,6 @@ def spun(frame: Frame, spin_deg: float) -> tuple[np.ndarray, np.ndarray]:
     return c * frame.right - s * frame.up, s * frame.right + c * frame.up
 
 
-def _cells(knots: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cell of sorted knots that each value lies in (the nearest one outside), and where in it, N×1."""
-    cell = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-    return cell, ((at - knots[cell]) / (knots[cell + 1] - knots[cell]))[:, None]
-
-
 def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, extent_mm) -> None:
     """A card may not reach beyond the object's outline; 0.5 % of slack for rounded figures."""
     across, along = turned_extent(size_mm, spin_deg)
@@ -215,17 +215,6 @@ def refuse_larger_than_side(size_mm: tuple[float, float], spin_deg: float, exten
 def gap_limit_mm(size_mm) -> float:
     """How far a piece may stand off the surface without a warning."""
     return WARN_GAP_SHARE * min(size_mm)
-
-
-def placement_warnings(gap: float, overhang: float, size_mm) -> tuple[str, ...]:
-    """What a user should hear about a gap in mm and an overhang as a share."""
-    notes = []
-    if gap > gap_limit_mm(size_mm):
-        share = f"{gap / min(size_mm):.0%} of its shorter edge"
-        notes.append(f"the piece stands up to {gap:.0f} mm ({share}) off the surface")
-    if overhang > WARN_OVERHANG_SHARE:
-        notes.append(f"{overhang:.0%} of the piece overhangs the object")
-    return tuple(notes)
 
 
 def _nearest_surface(mesh: Mesh, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,6 @@ from patchproof.base.strict import Refused, Side
 from patchproof.mesh.surface import Chart, crop, heights, net
 from patchproof.scene.bend import lay_for
 from patchproof.scene.fitting import laid_well
-from patchproof.scene.mesh_scene import camera_poses
 from patchproof.scene.open_scene import OpenScene
 from patchproof.scene.patch_scene import At
 from patchproof.scene.placement import (
@@ -94,9 +93,7 @@ class Ground:
         return (0.0, 45.0) if np.isclose(width, height) else (0.0, 90.0, 45.0, 135.0)
 
     def _middle_of(self, side: Side) -> Spot | None:
-        """The middle of a side that views face, where a piece hangs that is given no other place; however far it stands
-        off there, unless that is limited.
-        """
+        """The middle of a side that views face, where a piece hangs by default; how far off, only `gap_mm` limits."""
         frame, patch = self._frame_at(side), self.scene.settings.patch
         if self._facing(frame.origin_mm[None], frame.normal[None])[0] < _FACING_SHARE:
             return None
@@ -105,7 +102,7 @@ class Ground:
 
     def _facing(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """M shares of the views that face the points M×3."""
-        eyes = _eyes(self.scene)
+        eyes = camera_centers(self.scene.camera_from_world(self.scene.draw("train", _VIEWS)))
         cosines = [((eye - points) * normals).sum(1) / np.linalg.norm(eye - points, axis=1) for eye in eyes]
         return (np.array(cosines) > _FACING_COSINE).mean(0)
 
@@ -118,7 +115,8 @@ class Ground:
         middle = self._leveled(frame, spin_deg)
         if middle is None:
             return None
-        at_mm = _rounded(middle)
+        x, y, z = (round(value, 1) + 0.0 for value in middle.tolist())  # what a person would write down
+        at_mm = (x, y, z)
         there = self._frame_at(at_mm)
         if there.normal @ frame.normal < _SAME_SIDE:
             return None
@@ -208,18 +206,6 @@ class Ground:
             return False
         paper = laid.world(net(self.size_mm, _NET) * [1, -1] + np.array(self.size_mm) / 2)
         return bool(self._forbidden[below][KDTree(points[below]).query(paper)[1]].any())
-
-
-def _eyes(scene: OpenScene) -> np.ndarray:
-    """N×3: where cameras of the scene stand."""
-    poses = camera_poses(scene, scene.middle_mm, scene.draw("train", _VIEWS).pose)
-    return camera_centers(poses)
-
-
-def _rounded(point_mm: np.ndarray) -> tuple[float, float, float]:
-    """To 0.1 mm: what a person would write down."""
-    x, y, z = (round(float(value), 1) + 0.0 for value in point_mm)
-    return x, y, z
 
 
 def _spread(

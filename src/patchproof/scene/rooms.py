@@ -42,9 +42,8 @@ def _room(rng: np.random.Generator, px: int) -> np.ndarray:
     for _ in range(int(rng.integers(2, 12))):
         _put_box(rng, picture, depth, ray, slope, aim)
     light = rng.normal(size=3).astype(np.float32) * rng.uniform(0, 0.35) / 3
-    picture *= np.clip(1 + np.ascontiguousarray(np.clip(ray * np.minimum(depth, 5), -5, 5).T) @ light, 0.25, 1.8)[
-        :, None
-    ]
+    lit = 1 + np.ascontiguousarray(np.clip(ray * np.minimum(depth, 5), -5, 5).T) @ light
+    picture *= np.clip(lit, 0.25, 1.8)[:, None]
     picture = np.clip(picture, 0, 1).reshape(px, px, 3)
     return codes_of(cv2.GaussianBlur(picture, (0, 0), float(rng.choice([0.5, 0.8, 1.2, 2.5]))))
 

@@ -17,16 +17,6 @@ from patchproof.scene.interface import Scene, SceneSource
 if TYPE_CHECKING:
     import trimesh
 
-# the module of each kind, whose `build` makes a scene of a `SceneSource`
-KINDS = {
-    "card": "patch_scene",
-    "bent": "bent_scene",
-    "open": "open_scene",
-    "texture": "texture_scene",
-    "photographs": "photo_scene",
-    "images": "image_scene",
-}
-
 
 def load_scene(path: str | Path, seed: int | None = None, steps: int | None = None) -> Scene:
     """The scene of a file; `seed` and the `steps` of its optimization replace the file's own."""
@@ -61,18 +51,18 @@ def build_scene(
 ) -> Scene:
     """The scene of settings whose paths are relative to `base`; `printed_id` is the sheet id of its print, if any."""
     seed = settings.optimize.seed if seed is None else seed
-    module = import_module(f"patchproof.scene.{KINDS[kind_of(settings)]}")
+    module = import_module(f"patchproof.scene.{module_of(settings)}")
     return module.build(SceneSource(settings, base, seed, printed_id, given_glb))
 
 
-def kind_of(settings: SceneSettings) -> str:
-    """Which of `KINDS` the settings state."""
+def module_of(settings: SceneSettings) -> str:
+    """The module of this room whose `build` makes a scene of the kind that the settings state."""
     if settings.object.photos is not None:
-        return "photographs"
+        return "photo_scene"
     if settings.object.images is not None:
-        return "images"
+        return "image_scene"
     if settings.patch.kind != "patch":
-        return "texture"
+        return "texture_scene"
     if settings.patch.place == "auto":
-        return "open"
-    return "bent" if settings.patch.bend else "card"
+        return "open_scene"
+    return "bent_scene" if settings.patch.bend else "patch_scene"

@@ -83,9 +83,7 @@ def _tape(
 
 
 def profile(triangles: np.ndarray, step: float, first: int) -> np.ndarray:
-    """The highest z over the line x = 0 of triangles F×3×3, at y = step × (first, first + 1, ...); NaN where there is
-    none.
-    """
+    """The highest z of triangles F×3×3 over x = 0, at y = step × (first, first + 1, ...); NaN where there is none."""
     corners = triangles + np.array([1e-9, 0.0, 0.0])  # a corner on the plane would belong to no side
     beyond = corners[..., 0] > 0
     a = corners[beyond.any(1) & ~beyond.all(1)]

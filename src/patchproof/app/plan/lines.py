@@ -5,7 +5,7 @@ from __future__ import annotations
 from patchproof.app.plan.errors import TermError
 from patchproof.app.plan.plan import Geometry, Markers, Plan, Resolution, Surface
 from patchproof.optimizer.places import place_lines
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE
 
 
 def geometry_lines(plan: Geometry) -> list[str]:

@@ -34,9 +34,8 @@ from patchproof.optimizer.places import Place, choose_place
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import PROMISE_VIEWS
 from patchproof.scene.bent_scene import other_surface
-from patchproof.scene.interface import PieceScene, needs_piece
+from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene, needs_piece
 from patchproof.scene.open_scene import OpenScene
-from patchproof.scene.resolution import PX_PER_MODULE, READABLE_SHARE
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.markers import MODULES
 from patchproof.sheets.piece import SMALLEST_MARKER_MM
