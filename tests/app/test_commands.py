@@ -22,7 +22,7 @@ from patchproof.base.strict import Refused, validated
 from patchproof.base.version import __version__
 from patchproof.optimizer import run as run_module
 from patchproof.optimizer.run import load_run, optimize_scene
-from patchproof.reprints.several_runs import sheet_of_several
+from patchproof.reprints.run_sheet import sheet_of_several
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.raster import page_count

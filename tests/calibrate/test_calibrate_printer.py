@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,7 @@ from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.strict import Refused
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
-from patchproof.calibrate.chart import calibrate_chart, combine, map_of, print_variation, printer_of, prints_of
+from patchproof.calibrate.chart import calibrate_chart, combine, print_variation, printer_of, prints_of
 from patchproof.calibrate.chart_photo import read_chart
 from patchproof.calibrate.color_ladder import (
     FLAT,
@@ -33,6 +34,7 @@ from patchproof.calibrate.color_ladder import (
     fit_white_black,
     kinds_of_maps,
 )
+from patchproof.calibrate.printer_files import shown_colors
 from patchproof.channel.camera import encoded
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer, vary
@@ -62,7 +64,7 @@ def chart(count: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def priors():
-    return {name: map_of(load_printer(name)) for name in ("coated", "uncoated")}
+    return {name: partial(shown_colors, load_printer(name)) for name in ("coated", "uncoated")}
 
 
 # ------------------------------------------------------------------------------------------------ the ladder
@@ -277,7 +279,7 @@ def test_a_printer_is_calibrated_stored_and_loaded(shots, tmp_path, capsys):
     assert [row["rung"] for row in mine.provenance["ladder"]] == [rung.name for rung in kinds_of_maps({"x": None})]
     assert len(mine.provenance["photographs"]) == 2 and "no camera file" in mine.provenance["model_of"]
     np.testing.assert_allclose(mine.lut[-1, -1, -1], 1, atol=1e-6)
-    assert difference(map_of(mine)(UNSEEN), shown(printer, UNSEEN)).mean() < 2
+    assert difference(shown_colors(mine, UNSEEN), shown(printer, UNSEEN)).mean() < 2
     with pytest.raises(Refused, match="which exists"):
         cli.app(command, standalone_mode=False)
 
@@ -313,7 +315,7 @@ def test_readings_are_combined_without_the_one_that_is_off():
 
 
 def test_print_to_print_variation_is_found():
-    light = torch.tensor(linear_from_srgb(map_of(load_printer("coated"))(chart(72))))
+    light = torch.tensor(linear_from_srgb(shown_colors(load_printer("coated"), chart(72))))
     draws = np.random.default_rng(5).uniform(-1, 1, (12, 3)) * [0.04, 0.05, 0.004]
     prints = [vary(light, torch.tensor(draw)).numpy() for draw in draws]
     found = print_variation(prints)
@@ -458,7 +460,7 @@ def test_an_rgb_profile_is_baked_with_both_intents(tmp_path):
     for perceptual, word in ((False, "relative"), (True, "perceptual")):
         printer = icc.bake(path, "rgb", "none", "test", perceptual)
         assert printer.provenance["profile_colors"] == "RGB" and printer.provenance["intents"].startswith(word)
-        assert difference(map_of(printer)(UNSEEN), UNSEEN).mean() < 0.3  # what it prints is sRGB, in 8 bits
+        assert difference(shown_colors(printer, UNSEEN), UNSEEN).mean() < 0.3  # what it prints is sRGB, in 8 bits
 
 
 def test_damaged_profiles_never_end_in_anything_but_a_sentence(tmp_path):

@@ -26,9 +26,8 @@ from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROLS, make_promise
-from patchproof.optimizer.promise_later import promise_run
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.run import load_run, optimize_scene
+from patchproof.optimizer.run import load_run, optimize_scene, promise_run
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene

@@ -16,8 +16,8 @@ from patchproof.evidence.verdict import EACH, MOST_PHOTOS, sessions_needed
 from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import CONTROL_VIEWS, PER_SESSION, SETTLED, _looks, control_claims, make_promise
-from patchproof.optimizer.promise_later import promise_run
 from patchproof.optimizer.responses import Answers
+from patchproof.optimizer.run import promise_run
 from test_optimize import scene_with
 from test_verify_verdict import promise_of
 

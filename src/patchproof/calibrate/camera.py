@@ -4,12 +4,14 @@ In: photographs and a board. Out: `Calibrated`, and three files: NAME.json in th
 NAME.fit.json with all figures (the ladder, deviations, every photograph), NAME.residuals.png. What the photographs
 cannot tell is refused: too few of them, boards that all face the same way (a plane's picture then hardly depends on
 the focal length), a focal length known to no better than 1 %. The print's size does not matter, its proportions do:
-rulers that differ are typed in.
+rulers that differ are typed in. In the picture arrows show a pattern where a lens term is missing, and point every way
+where none is; a photograph that stands out was moved or shows a bent board.
 Left out on purpose: fisheye lenses, and how flat the board is: that shows as a residual, no more.
 """
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +25,6 @@ import numpy as np
 from patchproof.base.output import check_file, write_together
 from patchproof.base.strict import Refused
 from patchproof.calibrate.boards import FEWEST_CORNERS, View, see_boards
-from patchproof.calibrate.camera_picture import residual_picture
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import NUMBERS, Fit, climb, fit_rung
 from patchproof.channel.lens import Camera, check_camera
@@ -75,8 +76,8 @@ def calibrate_camera(
     printed = load_board(board)
     views, left, camera = see_boards(photos, printed, ruler_mm, partial(progress, "find corners"))
     result = solve(views, left, printed, out.stem, camera, partial(progress, "lens models"))
-    residuals = residual_picture(result.views, result.rungs, result.fit)
-    write_together({figures: _text(fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())})
+    residuals = _residual_picture(result.views, result.rungs, result.fit)
+    write_together({figures: _text(_fit_figures(result)), picture: residuals, out: _text(result.camera.model_dump())})
     return result
 
 
@@ -102,7 +103,7 @@ def solve(
     return Calibrated(made, rungs, fit, tuple(views), left, board)
 
 
-def fit_figures(result: Calibrated) -> dict:
+def _fit_figures(result: Calibrated) -> dict:
     """All figures as plain data; lengths in px of `image_px`, null where a rung found no fit."""
     fit = result.fit
     figure = lambda value: round(value, 5) if np.isfinite(value) else None  # noqa: E731
@@ -229,6 +230,37 @@ def _camera(fit: Fit, name: str, size_px: tuple[int, int], instrument: str, unce
 def _uncertainty(fit: Fit) -> str:
     parts = ", ".join(f"{n} {s:.2g}" for n, s in zip(NUMBERS, fit.sd, strict=True) if s > 0)
     return f"standard deviations {parts}; {fit.rms_px:.2g} px rms are left; a board that is not flat is not in it"
+
+
+def _residual_picture(views: Sequence[View], rungs: Sequence[Rung], fit: Fit) -> bytes:
+    """A PNG of three panels: residuals over the picture, RMS of each photograph, held-out error of each rung."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    where, photos, ladder = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 1))
+    places, residuals = np.concatenate([view.px for view in views]), np.concatenate(fit.residuals_px)
+    (width, height), lengths = views[0].size_px, np.linalg.norm(residuals, axis=1)
+    times = 0.02 * width / max(float(np.median(lengths)), 1e-6)
+    style = {"angles": "xy", "scale_units": "xy", "scale": 1 / times, "width": 0.0025, "cmap": "viridis"}
+    where.quiver(*places.T, *residuals.T, lengths, **style)
+    where.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=f"residuals, {times:.0f} times as long")
+    photos.bar(range(1, len(views) + 1), fit.photo_rms_px, color="#4477aa")
+    photos.set(xlabel="photograph, in the order of names", ylabel="rms [px]", title=f"{fit.rms_px:.3f} px in all")
+    rungs = [rung for rung in rungs if np.isfinite(rung.error)]
+    names, errors = [rung.name for rung in rungs], [rung.error for rung in rungs]
+    # bars are the standard error of the difference from the best rung
+    ladder.errorbar(range(len(rungs)), errors, [rung.standard_error for rung in rungs], fmt="o-", color="#4477aa")
+    chosen = names.index(fit.rung)
+    ladder.plot(chosen, errors[chosen], "o", markersize=12, fillstyle="none", color="#cc3311")
+    if max(errors) > 10 * min(errors):
+        ladder.set_yscale("log")
+    ladder.set_xticks(range(len(rungs)), [name.replace(" p1 p2", "\np1 p2") for name in names], fontsize=8)
+    ladder.set(ylabel="held-out error [px]", title=f"chosen: {fit.rung}")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def _text(data: dict) -> bytes:

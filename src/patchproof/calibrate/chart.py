@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from patchproof.base.input import is_file, is_folder
 from patchproof.base.strict import Refused
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
-from patchproof.calibrate.printer_files import printer_from_table
+from patchproof.calibrate.printer_files import printer_from_table, shown_colors
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, vary
 from patchproof.photo.cannot import CannotJudge
@@ -129,17 +130,7 @@ def model_of(camera: Camera | None) -> str:
 
 def known_printers() -> dict[str, Map]:
     """The shipped printers as maps of N×3 sRGB."""
-    return {name: map_of(load_printer(name)) for name in PRIORS}
-
-
-def map_of(printer: Printer) -> Map:
-    """A printer as a map of N×3 sRGB sent to sRGB seen."""
-
-    def show(colors: np.ndarray) -> np.ndarray:
-        sent = torch.tensor(np.asarray(colors, float).T[None, :, :, None])
-        return printer.apply(sent)[0, :, :, 0].T.numpy()
-
-    return show
+    return {name: partial(shown_colors, load_printer(name)) for name in PRIORS}
 
 
 def printer_of(name: str, predict: Map, provenance: Mapping[str, Any]) -> Printer:

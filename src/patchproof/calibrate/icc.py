@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from patchproof.base.color import ciede2000, codes_of, lab_from_srgb
 from patchproof.base.input import is_file
 from patchproof.base.strict import Refused
-from patchproof.calibrate.printer_files import printer_from_table
+from patchproof.calibrate.printer_files import printer_from_table, shown_colors
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
 
 MAX_BYTES = 32 * 2**20  # the largest printer profiles in use are a few MB
@@ -130,7 +129,6 @@ def _table_error(printer: Printer, show: Callable[[np.ndarray], np.ndarray]) -> 
     """How far the interpolated table is from the chain itself on random colors."""
     sent = np.random.default_rng(0).integers(0, 256, (_CHECKED_COLORS, 3), dtype=np.uint8)
     exact = lab_from_srgb(show(sent) / 255)
-    shown = printer.apply(torch.tensor(sent / 255).T[None, :, :, None])[0, :, :, 0].T.numpy()
-    error = ciede2000(exact, lab_from_srgb(shown))
+    error = ciede2000(exact, lab_from_srgb(shown_colors(printer, sent / 255)))
     figures = {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()}
     return {"colors": _CHECKED_COLORS, **{key: round(float(value), 3) for key, value in figures.items()}}

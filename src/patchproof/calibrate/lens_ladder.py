@@ -87,11 +87,8 @@ def climb(
             start = fits[name] = replace(fit, sd=np.maximum(fit.sd, spread))
         progress(number + 1, len(RUNGS))
     if not np.isfinite(errors).all(1).any():
-        raise Refused(
-            "photographs of a board that a lens model fits",
-            "none that does",
-            "photograph the board, glued to something flat, from more directions",
-        )
+        do = "photograph the board, glued to something flat, from more directions"
+        raise Refused("photographs of a board that a lens model fits", "none that does", do)
     rungs = compared(list(RUNGS), errors)
     return rungs, fits[rungs[simplest(rungs)].name]
 

@@ -48,11 +48,8 @@ def resumed(out: Path, problem: Problem) -> State:
         with safe_open(path, framework="pt", device=str(problem.device)) as file:
             note = _Note.model_validate_json((file.metadata() or {})["state"])
             if note.sheet_id != problem.scene.sheet_id:
-                raise Refused(
-                    "the checkpoint of this scene and seed",
-                    f"one of another in {out}",
-                    "resume with the same scene file and seed, or start anew in another folder",
-                )
+                do = "resume with the same scene file and seed, or start anew in another folder"
+                raise Refused("the checkpoint of this scene and seed", f"one of another in {out}", do)
             design, best = _tensor(file, "design", begin.design), _tensor(file, "best", begin.design)
             mean = tuple(_tensor(file, f"mean{n}", level) for n, level in enumerate(begin.mean))
             square = tuple(_tensor(file, f"square{n}", level) for n, level in enumerate(begin.square))

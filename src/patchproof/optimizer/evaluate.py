@@ -66,9 +66,7 @@ def evaluate_run(
         if found := [part[claim.name] for part in shown if claim.name in part]:
             ap50 = {kind: average_precision([f for part in found for f in part[kind]], n) for kind in found[0]}
             result["models"][claim.name]["ap50"] = ap50
-    write_whole(
-        run.folder / "evaluate.json", lambda path: path.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
-    )
+    write_whole(run.folder / "evaluate.json", json.dumps(result, indent=1) + "\n")
     return result
 
 

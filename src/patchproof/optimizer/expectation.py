@@ -111,23 +111,20 @@ def expectation(problem: Problem, selection: Conditions) -> Iterator[Expectation
     conditions of its selection set.
     """
     conditions = training_conditions(problem.scene)
-    worker = _Worker(problem, conditions, selection)
-    with sharing(worker.answer, problem.jobs, in_turn=True) as (workers, share):
+    cache = ViewCache(problem, conditions)  # each process keeps the views that it has rendered
+    selected = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
+
+    def answer(task: _TrainTask | _SelectTask) -> _ViewsAnswer | tuple[float, float]:
+        printed = torch.as_tensor(task.printed, device=problem.device)
+        if isinstance(task, _TrainTask):
+            return _views_answer(problem, printed, cache.views(task.pose, task.conditions), task.pictures)
+        views = selected(task.first)
+        with torch.no_grad():
+            loss, _, rate = score(problem, expose(views, problem.subject.showing(printed)), views.conditions)
+        return float(loss), rate
+
+    with sharing(answer, problem.jobs, in_turn=True) as (workers, share):
         yield Expectation(problem, conditions, len(selection), lambda tasks: workers.map(share, tasks))
-
-
-class _Worker:
-    """What each process keeps between steps: the views that it has rendered."""
-
-    def __init__(self, problem: Problem, conditions: Conditions, selection: Conditions):
-        self._problem, self._cache = problem, ViewCache(problem, conditions)
-        self._selected = lru_cache(lambda first: training_views(problem, selection[first : first + SELECT_CHUNK]))
-
-    def answer(self, task: _TrainTask | _SelectTask) -> _ViewsAnswer | tuple[float, float]:
-        printed = torch.as_tensor(task.printed, device=self._problem.device)
-        if isinstance(task, _SelectTask):
-            return _loss_and_rate(self._problem, printed, self._selected(task.first))
-        return _views_answer(self._problem, printed, self._cache.views(task.pose, task.conditions), task.pictures)
 
 
 def gradient_in_views(problem: Problem, design: Tensor, views: Sequence[Views]) -> Answer:
@@ -182,9 +179,3 @@ def _views_answer(problem: Problem, printed: Tensor, views: Views, pictures: boo
     (gradient,) = torch.autograd.grad(loss, printed)
     kept = photos.detach().cpu().numpy() if pictures else None
     return _ViewsAnswer(len(photos), float(loss.detach()), confidence, rate, gradient.cpu().numpy(), kept)
-
-
-@torch.no_grad()
-def _loss_and_rate(problem: Problem, printed: Tensor, views: Views) -> tuple[float, float]:
-    loss, _, rate = score(problem, expose(views, problem.subject.showing(printed)), views.conditions)
-    return float(loss), rate

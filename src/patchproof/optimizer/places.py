@@ -122,7 +122,7 @@ def choose_place(
     order = sorted(range(len(finalists)), key=lambda i: float(drafts[i].mean()))
     candidates = [_candidate(finalists[i], float(drafts[i].mean())) for i in order]
     candidates += [_candidate(trial) for trial in trials if trial not in finalists]
-    search.end()
+    on_pass(search.passes, search.passes)  # no more will come
     return Place(
         sheet_id=scene.sheet_id,
         front=scene.settings.patch.side,
@@ -159,11 +159,9 @@ class _Search:
     """A search under way, which counts its networks' passes."""
 
     def __init__(self, scene: OpenScene, stated, on_pass: Callable[[int, int], None]):
-        self.passes, self._budget = 0, PASSES
-        self._scene, self._on_pass = scene, on_pass
+        self.passes, self._scene, self._stated, self._on_pass = 0, scene, stated, on_pass
         self._first: Problem | None = None
         self._bare: float | None = None
-        self._stated = stated
 
     def screened(self, spots: Sequence[Spot]) -> list[_Trial]:
         """The spots where the piece can hang, with what gray costs there and its gradient promises."""
@@ -182,17 +180,13 @@ class _Search:
         many steps as the budget has left.
         """
         held_out = self._scene.draw("select", HELD_OUT_VIEWS)
-        left = self._budget - self.passes - (len(trials) + 1) * HELD_OUT_VIEWS
+        left = PASSES - self.passes - (len(trials) + 1) * HELD_OUT_VIEWS
         steps = max(1, left // (len(trials) * 2 * DRAFT_VIEWS))
         conditions = self._scene.draw("train", steps * DRAFT_VIEWS, start=SCREEN_VIEWS)
         bare = self._losses(trials[0].problem, None, held_out)
         problems = [trial.problem for trial in trials]
         drafts = self._shared(partial(_drafted, conditions, held_out), problems, 2 * len(conditions) + len(held_out))
         return [losses - bare for losses in drafts]
-
-    def end(self) -> None:
-        """Say that no more will come."""
-        self._on_pass(self.passes, self.passes)
 
     def _hung(self, spots: Sequence[Spot]) -> list[tuple[Spot, Problem]]:
         """The spots' problems; where the piece can hang at none of them, the last refusal is the user's."""
@@ -224,7 +218,7 @@ class _Search:
 
     def _count(self, passes: int) -> None:
         self.passes += passes
-        self._on_pass(self.passes, self._budget)
+        self._on_pass(self.passes, PASSES)
 
 
 def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:

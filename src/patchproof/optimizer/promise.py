@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -91,8 +90,8 @@ def _until_known(
     unsettled, looks = list(shown), [0, len(conditions)] if half_width is None else _looks(len(conditions), per_session)
     with asking(problem, shown, conditions) as asked:
         for first, last in pairwise(looks):
-            on_part = partial(_counted, on_views, first, len(conditions))
-            answers = asked(unsettled, np.arange(first, last), _with_controls(last - first, per_session), on_part)
+            rows, beside = np.arange(first, last), _with_controls(last - first, per_session)
+            answers = asked(unsettled, rows, beside, lambda done, _, n=first: on_views(n + done, len(conditions)))
             compared = joined([compared, answers]) if compared else answers
             if half_width is None or last == len(conditions):
                 break
@@ -141,10 +140,6 @@ def fewest_passes() -> int:
     """Pictures that a network sees in a promise that stops as early as it may."""
     views = _looks(PROMISE_VIEWS, PER_SESSION)[1]
     return views + len(CONTROLS) * int(_with_controls(views, PER_SESSION).sum())
-
-
-def _counted(on_views: Callable[[int, int], None], before: int, total: int, done: int, _: int) -> None:
-    on_views(before + done, total)
 
 
 def _outermost_mm(problem: Problem) -> tuple[tuple[float, float, float], ...]:
@@ -211,9 +206,8 @@ def control_claims(answers: Mapping[str, Answers], model: int, per_session: int 
 def _condition_claims(problem: Problem, conditions: Conditions, recognized: np.ndarray) -> tuple[ConditionClaim, ...]:
     """What a photograph could show of each condition; null where the patch's face is turned away or there is none."""
     n = len(conditions)
-    shows: dict[str, np.ndarray] = dict.fromkeys(
-        ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast"), np.full(n, np.nan)
-    )
+    names = ("px_per_mm", "tilt_deg", "azimuth_deg", "contrast")
+    shows: dict[str, np.ndarray] = dict.fromkeys(names, np.full(n, np.nan))
     if problem.scene.HAS_PIECE:
         scene = needs_piece(problem.scene)
         scale, tilt = scene.scales_and_tilts(conditions, scene.photo_px).T

@@ -46,7 +46,6 @@ _GIVEN = "given.glb"  # the mesh of a scene that was made in Python
 _RESULTS = (DESIGN_FILE, OBJECT_FILE, TEXTURE_FILES, MASK_FILE)
 OWN = (CHECKPOINT, _LOG, RUN_FILE, _VIEWS, _GIVEN, "place.*", *_RESULTS, "evaluate.json", ".*.part")
 
-NotNegativeInt = Annotated[int, Field(ge=0)]
 # Steps and promised views of a first look, whose interval is some four times as wide, and of a print that counts: three
 # times the default's steps, in half as wide an interval (`bench effort`).
 DRAFT, THOROUGH = (40, 40), (720, 1600)
@@ -103,7 +102,8 @@ def optimize_scene(
     on_scene(scene)
     problem = set_problem(scene, device, models, loss, jobs)
     if not resume:
-        _clear(out)
+        for path in (path for name in OWN[:-1] for path in out.glob(name)):  # all that the new one needs is read
+            path.unlink()
     make_folder(out)
     if keep_place is not None:
         keep_place()
@@ -153,8 +153,28 @@ def finish_run(
     if scene.given_glb is not None:
         write_whole(out / _GIVEN, scene.given_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
-    write_whole(out / RUN_FILE, lambda path: path.write_text(json.dumps(details, indent=1) + "\n", encoding="utf-8"))
+    write_whole(out / RUN_FILE, json.dumps(details, indent=1) + "\n")
     return Run(out, scene, design, promise, details)
+
+
+def promise_run(
+    run_folder: str | Path,
+    *,
+    views: int | None = None,
+    device: str = "cpu",
+    jobs: int = 1,
+    on_promise: Callable[[int, int], None] = lambda done, total: None,
+) -> Run:
+    """Promise a run's design anew, from so many views (by default as many as `optimize` takes), with its controls: to
+    the byte the run that `optimize` would have left. A sheet keeps its promise until it is written again.
+    """
+    check_promise(views)
+    run = load_run(run_folder)
+    problem = set_problem(run.scene, device, jobs=jobs)
+    promise = promise_of(problem, run.design, tuple(run.promise.controls), views, on_promise)
+    details = run.details | {"promise": promise.model_dump(mode="json")}
+    write_whole(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
+    return replace(run, promise=promise, details=details)
 
 
 def load_run(folder: str | Path) -> Run:
@@ -191,36 +211,31 @@ class _Record(BaseModel):
     settings: SceneSettings
     promise: Promise
     scene_folder: str
-    seed: NotNegativeInt
+    seed: Annotated[int, Field(ge=0)]
     sheet_id: str
     printer: dict[str, Any]
     imported: _Imported | None = None
 
 
-def _clear(out: Path) -> None:
-    """Remove an earlier run, now that everything the new one needs has been read."""
-    for name in OWN[:-1]:
-        for path in out.glob(name):
-            path.unlink()
-
-
 def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, int], None]) -> np.ndarray:
     """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
-    settings = problem.scene.settings.optimize
-    total = settings.steps
-    _cut_log(out / _LOG, state.number)
-    largest = None
-    with open(out / _LOG, "a", encoding="utf-8") as log:
+    settings, largest, path = problem.scene.settings.optimize, None, out / _LOG
+    # without the lines after the step that it goes on from
+    write_whole(path, b"".join(path.read_bytes().splitlines(keepends=True)[: state.number] if is_file(path) else []))
+    with open(path, "a", encoding="utf-8") as log:
         for step in steps(problem, state):
             state = step.state
-            log.write(json.dumps(_log_line(step)) + "\n")
+            names = ["loss", "confidence", "rate", "gradient"]
+            names += [] if step.select_loss is None else ["select_loss", "select_rate"]
+            line = {"step": state.number} | {name: getattr(step, name) for name in names}
+            log.write(json.dumps(line) + "\n")
             log.flush()
-            if state.number == total and step.pictures is not None:
+            if state.number == settings.steps and step.pictures is not None:
                 write_png(out / _VIEWS, side_by_side(step.pictures))
             if saves(settings, state.number):  # after the views, which a run that goes on from the last step lacks
                 save_checkpoint(state, problem, out)
             largest = max(step.gradient, largest or 0.0)
-            on_step(step, total)
+            on_step(step, settings.steps)
     _doubt(float((state.best - start(problem).design).abs().max()), largest)
     return problem.subject.pixels(state.best)
 
@@ -249,25 +264,6 @@ def promise_of(
     conditions = problem.scene.draw("promise", most, per_session=PER_SESSION)
     promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION, enough)
     return promise.changed(draft=most < PROMISE_VIEWS)
-
-
-def _log_line(step: Step) -> dict[str, Any]:
-    line = {
-        "step": step.state.number,
-        "loss": step.loss,
-        "confidence": step.confidence,
-        "rate": step.rate,
-        "gradient": step.gradient,
-    }
-    if step.select_loss is not None:
-        line |= {"select_loss": step.select_loss, "select_rate": step.select_rate}
-    return line
-
-
-def _cut_log(path: Path, number: int) -> None:
-    """Drop log lines after the step that the run goes on from."""
-    lines = path.read_bytes().splitlines(keepends=True)[:number] if is_file(path) else []
-    write_whole(path, b"".join(lines))
 
 
 def _details(problem: Problem, promise: Promise, out: Path) -> dict[str, Any]:

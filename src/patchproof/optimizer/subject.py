@@ -42,7 +42,7 @@ class Grid:
 
 
 class Subject(Protocol):
-    """What the loop, the promise and studies ask of what is optimized."""
+    """What the loop, the promise and studies ask of what is optimized; what is not printed is shown as it is."""
 
     LOOK: ClassVar[str]  # what turns a design into what is shown
 
@@ -80,15 +80,15 @@ class Subject(Protocol):
 
     def printed(self, design: Tensor) -> Tensor:
         """What all pictures of an optimized design have in common, so that a step makes it once; differentiable."""
-        ...
+        return design
 
     def showing(self, printed: Tensor) -> Shown:
         """What photographs show of that; differentiable."""
-        ...
+        return self.shown(printed)
 
     def printed_by(self, printer: Printer) -> Self:
         """The same subject as another printer prints it."""
-        ...
+        return self
 
     @property
     def grid(self) -> Grid:

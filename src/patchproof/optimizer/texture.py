@@ -26,7 +26,7 @@ from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import pyramid
 from patchproof.optimizer.pixels import as_pixels, from_pixels
-from patchproof.optimizer.subject import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Grid, read_png, write_png
+from patchproof.optimizer.subject import MASK_FILE, OBJECT_FILE, TEXTURE_FILES, Grid, Subject, read_png, write_png
 from patchproof.render.designs import LearnedTextures
 from patchproof.render.pixels import ObjectTextures
 from patchproof.scene.interface import Scene
@@ -35,7 +35,7 @@ from patchproof.sheets.piece import CELLS, control_design
 
 
 @dataclass(frozen=True, eq=False)
-class Texture:
+class Texture(Subject):
     """Designs are 3×1×M in [0, 1]: the texels that may change, texture by texture, by rows."""
 
     # Larger steps suit the networks that train and no other: of a letter box for three networks, a fourth recognized
@@ -121,18 +121,6 @@ class Texture:
     def shown(self, design: Tensor, kind: str = "design") -> ObjectTextures:
         """The object's textures with a design; differentiable."""
         return self.surface.shown(design)
-
-    def printed(self, design: Tensor) -> Tensor:
-        """The design itself: nothing is printed."""
-        return design
-
-    def showing(self, printed: Tensor) -> ObjectTextures:
-        """The object's textures with it."""
-        return self.shown(printed)
-
-    def printed_by(self, printer: Printer) -> Texture:
-        """The texture itself: nothing is printed."""
-        return self
 
     def save(self, pixels: np.ndarray, folder: Path) -> None:
         """Write the object with its new textures, each of them, and below each other the masks, white where a texture

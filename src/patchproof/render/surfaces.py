@@ -92,27 +92,14 @@ def light_texels(textures_srgb: Sequence[Tensor], reduced: bool, atlas: Layout |
 def object_surface(mesh: Mesh, device: torch.device) -> ObjectSurface:
     """The mesh with its textures."""
     base = np.array([material.base_color_linear for material in mesh.materials], np.float32)
-    textures = tuple(_texture(material.texture_srgb).to(device) for material in mesh.materials)
-
-    def on(array) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array), device=device)
-
-    return ObjectSurface(
-        on(mesh.vertices),
-        on(mesh.faces),
-        on(
-            np.concatenate(
-                [mesh.corner_uv, mesh.corner_color_linear * base[mesh.face_material][:, None], mesh.corner_normal], 2
-            )
-        ),
-        on(mesh.face_material),
-        textures,
-        edges_of(mesh, device),
-    )
-
-
-def _texture(texture_srgb: np.ndarray | None) -> Tensor:
-    return torch.ones(1, 1, 3) if texture_srgb is None else torch.tensor(texture_srgb, dtype=torch.float32) / 255
+    srgb = [material.texture_srgb for material in mesh.materials]
+    textures = (torch.ones(1, 1, 3) if t is None else torch.tensor(t, dtype=torch.float32) / 255 for t in srgb)
+    color = mesh.corner_color_linear * base[mesh.face_material][:, None]
+    corners = np.concatenate([mesh.corner_uv, color, mesh.corner_normal], 2)
+    arrays = mesh.vertices, mesh.faces, corners, mesh.face_material
+    vertices, faces, corners, material = (torch.as_tensor(np.ascontiguousarray(a), device=device) for a in arrays)
+    textures = tuple(texture.to(device) for texture in textures)
+    return ObjectSurface(vertices, faces, corners, material, textures, edges_of(mesh, device))
 
 
 def piece_surface(scene: PieceScene, device: torch.device) -> PieceSurface:

@@ -224,14 +224,9 @@ def apart(views: Views, sizes: Sequence[int]) -> list[Views]:
     pixels, parts = views.frame_px[0] * views.frame_px[1], []
     for first, last in pairwise(accumulate(sizes, initial=0)):
         some, numbers = slice(first, last), range(first, last)
-        own = replace(views, conditions=views.conditions[some], background=views.background[some])
-        own = replace(
-            own,
-            **{
-                name: None if part is None else part.part(numbers, pixels)
-                for name, part in (("object", views.object), ("piece", views.piece), ("outlines", views.outlines))
-            },
-        )
+        whole = {"object": views.object, "piece": views.piece, "outlines": views.outlines}
+        seen = {name: None if part is None else part.part(numbers, pixels) for name, part in whole.items()}
+        own = replace(views, conditions=views.conditions[some], background=views.background[some], **seen)
         parts.append(relit(own, own.conditions))
     return parts
 

@@ -154,11 +154,8 @@ def sheet_scene(pdf_path: str | Path, run: Run) -> tuple[Manifest, Scene]:
     own = run.scene.settings.sheet.template
     scene = run.scene.with_template(manifest.settings.get("sheet", {}).get("template", own))
     if manifest.sheet_id != scene.sheet_id:
-        raise Refused(
-            f"a sheet of this run ({scene.sheet_id})",
-            f"sheet {manifest.sheet_id}",
-            "name the run that it was made from",
-        )
+        expected, do = f"a sheet of this run ({scene.sheet_id})", "name the run that it was made from"
+        raise Refused(expected, f"sheet {manifest.sheet_id}", do)
     return manifest, scene
 
 

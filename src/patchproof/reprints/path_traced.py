@@ -9,7 +9,8 @@ out alike.
 
 Left out on purpose: colored light, transparency, scenes made of pictures.
 
-Source: Jakob et al., Mitsuba 3 renderer, 2022.
+Sources: Jakob et al., Mitsuba 3 renderer, 2022; Veach and Guibas, Optimally Combining Sampling Techniques for Monte
+Carlo Rendering, SIGGRAPH 1995, for why the surrounding light is sampled by the surface alone.
 """
 
 from __future__ import annotations
@@ -27,14 +28,13 @@ from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
 from patchproof.base.strict import Refused
 from patchproof.channel.camera import develop
 from patchproof.channel.cameras import Frame
-from patchproof.channel.effects import Print
+from patchproof.channel.effects import Light, Print
 from patchproof.channel.printer import vary
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import Stage
 from patchproof.render.views import backgrounds, lens_frame
-from patchproof.reprints.traced_light import lights
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import needs_piece
 from patchproof.scene.mesh_scene import MeshScene, needs_mesh
@@ -48,6 +48,9 @@ MOST_BOUNCES = 4  # of a path, the light included: paper lit by what paper light
 _SQUARE = 1e-4  # how far a pixel's sides may differ
 # Older ones end the whole process: they cannot compile the minimum that Dr.Jit asks for.
 _FIRST_LLVM = 17
+_FAR = 20.0  # the directional light's distance in lengths of the object
+_SKY_PX = (64, 128)
+_SKY_WEIGHT = 1e-3  # of paths sent to a light on purpose; 0 is refused where there is no other light
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def traced_light(stage: Stage, piece: PiecePicture | None, conditions: Condition
         "type": "scene",
         "integrator": {"type": "path", "max_depth": MOST_BOUNCES, "hide_emitters": True},
         "sensor": _sensor(mi, scene, conditions, frame, box, optics.aperture_mm),
-        **lights(mi, scene, conditions.light, optics.light_radius_deg),
+        **_lights(mi, scene, conditions.light, optics.light_radius_deg),
         **{f"object{i}": part for i, part in enumerate(_object(mi, scene.mesh))},
     }
     if piece is not None:
@@ -176,6 +179,29 @@ def _sensor(mi: ModuleType, scene: MeshScene, conditions: Conditions, frame: Fra
         },
         "sampler": {"type": "multijitter", "sample_count": PASS_SAMPLES},
     }
+
+
+def _lights(mi: ModuleType, scene: MeshScene, light: Light, radius_deg: float) -> dict:
+    """The surroundings, and a disk far away for the directional light.
+
+    An outgoing radiance of 1 is white: paper of reflectance ρ gives ρ·E/π, so that E is π where our light is 1.
+    """
+    # almost no paths are sent to light from all around: those that surfaces scatter find it anyway
+    sky = mi.Bitmap(np.full((*_SKY_PX, 3), light.ambient[0], np.float32))
+    emitters = {"sky": {"type": "envmap", "bitmap": sky, "sampling_weight": _SKY_WEIGHT}}
+    if light.directional[0] > 0:
+        frame, middle = scene.frame, scene.middle_mm
+        toward = geometry.orbit(light.light_azimuth_deg, light.light_elevation_deg, frame.normal, frame.up)[0]
+        far, angle = _FAR * scene.length_mm, np.radians(radius_deg)
+        up = np.eye(3)[np.abs(toward).argmin()]  # any that is not along the light
+        place = mi.ScalarTransform4f().look_at((middle + far * toward).tolist(), middle.tolist(), up.tolist())
+        radiance = {"type": "rgb", "value": [float(light.directional[0] / np.sin(angle) ** 2)] * 3}
+        emitters["sun"] = {
+            "type": "disk",
+            "to_world": place @ mi.ScalarTransform4f().scale(float(far * np.tan(angle))),
+            "emitter": {"type": "area", "radiance": radiance},
+        }
+    return emitters
 
 
 def _piece(mi: ModuleType, scene: MeshScene, picture: PiecePicture, conditions: Conditions):

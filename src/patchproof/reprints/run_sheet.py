@@ -1,13 +1,14 @@
 """A run's sheets: the design's own page and those of its controls, each with the marker ids that tell it from the
 others.
 
-In: a finished run. Out: SHEET.pdf and SHEET.json. The piece is the same on every template that has room for it, but for
-the ids of its markers. The last page of a template with `plan_page` says where the piece goes and how to photograph it.
-Pages that need no run: see `sheets.blank`.
+In: finished runs. Out: SHEET.pdf and SHEET.json, or one page with the designs of several and a manifest for each. The
+piece is the same on every template that has room for it, but for the ids of its markers. The last page of a template
+with `plan_page` says where the piece goes and how to photograph it. Pages that need no run: see `sheets.blank`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.piece import control_design, with_ids
 from patchproof.sheets.plan_page import Hung, PlanPage, edges_mm
 from patchproof.sheets.rects import size_text
+from patchproof.sheets.several import write_several
 from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet
 
@@ -37,6 +39,18 @@ def sheet_of(
     if control == "blank":
         content = replace(content, design_srgb8=None)
     return write_sheet(pdf_path, page, content, plan, copies)
+
+
+def sheet_of_several(
+    runs: Sequence[Run], pdf_path: str | Path, *, template: str | None = None, control: str | None = None
+) -> list[Manifest]:
+    """Write one page with the designs of several runs, and a manifest for each; on the first run's template unless
+    another is named.
+    """
+    name = template or runs[0].scene.settings.sheet.template
+    page, made = load_template(name), [content_of(run, name, control) for run in runs]
+    plans = [plan_of(scene, page, content) for content, scene in made] if page.plan_page else []
+    return write_several(pdf_path, page, [content for content, _ in made], plans)
 
 
 def content_of(run: Run, template: str | None, control: str | None) -> tuple[PrintedPiece, PieceScene]:
@@ -60,10 +74,11 @@ def plan_of(scene: PieceScene, template: Template, content: PrintedPiece) -> Pla
     """
     hung, sections, imported = None, [], content.settings.get("imported")
     if scene.HAS_OBJECT:
-        patch = needs_patch(scene)
+        patch, own = needs_patch(scene), scene.settings.patch
         hung = hang(patch, template)
+        facing = f"the object's {own.side} side" if own.at_mm is None else "the place where the piece goes"
         placed = [
-            _seen(patch) + (_edges(hung) if patch.placement.is_flat else _wrapped(patch)),
+            f"Seen as you face {facing}. {_edges(hung) if patch.placement.is_flat else _wrapped(patch)}",
             f"The piece is {size_text(scene.piece.size_mm)} mm; {scene.lies()['reason']}.",
         ]
         if template.tiles is not None:
@@ -79,13 +94,6 @@ def plan_of(scene: PieceScene, template: Template, content: PrintedPiece) -> Pla
     if content.promise is not None:
         sections += shot_sections(content.promise, scene.settings)
     return PlanPage(hung, tuple(sections)) if sections else None
-
-
-def _seen(scene: PatchScene) -> str:
-    """From where the picture is."""
-    patch = scene.settings.patch
-    facing = f"the object's {patch.side} side" if patch.at_mm is None else "the place where the piece goes"
-    return f"Seen as you face {facing}. "
 
 
 def _edges(hung: Hung) -> str:

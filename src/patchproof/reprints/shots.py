@@ -53,22 +53,16 @@ class ShotPlan:
 
 def plan_shots(promise: Promise) -> ShotPlan:
     """The counts for a promise; the control that is hardest to beat decides."""
-    sign = promise.target.goal.sign
     best = promise.best_control
-    rates = (promise.rate, promise.controls[best].rate)
-    better, worse = rates[::sign]
+    better, worse = (promise.rate, promise.controls[best].rate)[:: promise.target.goal.sign]
+    parts = [(way, evenly(*way)) for way in WAYS]
     return ShotPlan(
-        ways=tuple(_way(promise, *way) for way in WAYS),
+        ways=tuple(Way(*way, promise.spread.counts(p), kept_chance(promise, p)) for way, p in parts),
         sessions=sessions_needed(promise),
         control=best,
         paired=fewest(lambda n: paired_power(better, worse, n) >= POWER),
         unpaired=fewest(lambda n: unpaired_power(better, worse, n) >= POWER),
     )
-
-
-def _way(promise: Promise, photos: int, sessions: int) -> Way:
-    parts = evenly(photos, sessions)
-    return Way(photos, sessions, promise.spread.counts(parts), kept_chance(promise, parts))
 
 
 def fewest(enough: Callable[[int], bool]) -> int | None:

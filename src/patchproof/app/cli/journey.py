@@ -108,7 +108,7 @@ def promise(
 ) -> None:
     """Promise a finished run's rate anew: the full promise of a draft, or one of more views."""
     from patchproof.base.settings import behind
-    from patchproof.optimizer.promise_later import promise_run
+    from patchproof.optimizer.run import promise_run
     from patchproof.report.summary import promise_lines
 
     with progress() as bar:
@@ -153,8 +153,7 @@ def sheet(
         manifests = [blank_page(out, template=template, control=control)]
     else:
         from patchproof.optimizer.run import load_run
-        from patchproof.reprints.run_sheet import sheet_of
-        from patchproof.reprints.several_runs import sheet_of_several
+        from patchproof.reprints.run_sheet import sheet_of, sheet_of_several
 
         first, *others = loaded = [load_run(folder) for folder in runs]
         if others:
