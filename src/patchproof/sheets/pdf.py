@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.sheets.fonts import font_name
-from patchproof.sheets.layout import PageLayout
+from patchproof.sheets.layout import PageLayout, font_name
 from patchproof.sheets.page import CUT_LINE_MM
 from patchproof.sheets.piece import marker_rects_mm
 from patchproof.sheets.rects import RectMm, Srgb

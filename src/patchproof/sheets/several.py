@@ -19,7 +19,7 @@ from pathlib import Path
 
 from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.layout import PageLayout, joined
+from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.page import lay_out_parts, piece_name, place_pieces
 from patchproof.sheets.pdf import Printed
@@ -53,7 +53,7 @@ def write_several(
     code = _page_code(identity, designs)
     named = [piece_words(design, placed[i][1], piece_name(i)) for i, design in enumerate(designs)]
     ids, words = _page_ids(designs, template), _words(identity, designs)
-    page = lay_out_parts(template, placed, ids, code, words, joined(named))
+    page = lay_out_parts(template, placed, ids, code, words, named)
     manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
     pictures = [design.pictures(rect) for rect, design in zip(page.cuts_mm, designs, strict=True)]
     pages = [Printed(page, tuple(chain(*pictures)))]

@@ -16,12 +16,13 @@ from patchproof.base.strict import Refused, Strict
 from patchproof.sheets.content import PrintedPiece, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
-from patchproof.sheets.pages import pages_of
+from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
 from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardTemplate, Template
+from patchproof.sheets.tiles import tile_pages
 
 
 def write_sheet(
@@ -32,7 +33,14 @@ def write_sheet(
     A template with tiles makes a page for each. `plan` becomes the last page; `copies` repeats the page with the piece.
     """
     pdf_path = pdf_name(pdf_path)
-    pages, manifest = pages_of(template, content, copies)
+    if template.tiles is None:
+        page = lay_out_page(template, content)
+        pages = [Printed(page, content.pictures(page.cuts_mm[0]))] * copies
+        manifest = content.manifest(page, template, page.cuts_mm[0])
+    elif copies > 1:
+        raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
+    else:
+        pages, manifest = tile_pages(template, template.tiles, content)
     if plan is not None:
         pages.append(lay_out_plan(plan, template, content.sheet_id))
         manifest = manifest.changed(plan_page=len(pages))
