@@ -76,9 +76,8 @@ def manifest_paths(pdf_path: Path, designs: int) -> list[Path]:
 
 def save_sheets(pdf_path: Path, pages: Sequence[Printed], manifests: dict[Path, Manifest]) -> None:
     """Write the PDF and its manifests, which it carries too: one as sheet.json, several as sheet_1.json..."""
-    texts = {path: dump_manifest(manifest) for path, manifest in manifests.items()}
-    first = next(iter(manifests.values()))
+    texts, first = [dump_manifest(manifest) for manifest in manifests.values()], next(iter(manifests.values()))
     names = [ATTACHMENT] if len(texts) == 1 else [numbered(ATTACHMENT, i) for i in range(len(texts))]
     title = f"patchproof sheet {' '.join(m.sheet_id for m in manifests.values())} {first.kind}"
-    pdf = pages_pdf(pages, title, dict(zip(names, texts.values(), strict=True)))
-    write_together({pdf_path: pdf} | {path: text.encode() for path, text in texts.items()})
+    pdf = pages_pdf(pages, title, dict(zip(names, texts, strict=True)))
+    write_together({pdf_path: pdf} | dict(zip(manifests, map(str.encode, texts), strict=True)))
