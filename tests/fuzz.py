@@ -572,9 +572,9 @@ TEMPLATES = ("a4", "blank_a4", "chart_a4", "charuco_a4", "a4_tiles")
 def template_toml(rng: Rng, folder: Path) -> Read:
     from patchproof.base.strict import shipped
     from patchproof.sheets.blank import blank_page
-    from patchproof.sheets.pages import refuse_larger_than_page
     from patchproof.sheets.piece import lay_out_piece
     from patchproof.sheets.template import load_template
+    from patchproof.sheets.tiles import refuse_larger_than_page
 
     name = str(rng.choice(TEMPLATES))
     text = shipped("print_templates", f"{name}.toml").read_text(encoding="utf-8")

@@ -15,9 +15,8 @@ from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Geometry, PhotoEntry
 from patchproof.photo.quality import FrameLight
 from patchproof.photo.read import not_looked_at, read_photo
-from patchproof.report.photo_table import photos_csv
-from patchproof.report.summary import verdict_lines
-from patchproof.report.words import remarks
+from patchproof.report.words import remarks, verdict_lines
+from patchproof.report.write import photos_csv
 from test_verify_run import shot, verified
 
 SIZE = (800, 600)

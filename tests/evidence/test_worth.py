@@ -8,7 +8,7 @@ from synthetic_photos import promised_conditions
 from typer.testing import CliRunner
 
 from patchproof.app.cli import app
-from patchproof.report.summary import promise_lines
+from patchproof.report.words import promise_lines
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Promise
 from patchproof.sheets.piece import lay_out_piece

@@ -11,8 +11,7 @@ from patchproof.base.settings import SceneSettings, behind
 from patchproof.evidence.results import Control
 from patchproof.evidence.verdict import EACH, judge, next_step, photos_line, sessions_needed
 from patchproof.evidence.worth import worth_of
-from patchproof.report.summary import promise_lines, verdict_lines
-from patchproof.report.words import headline_of
+from patchproof.report.words import headline_of, promise_lines, verdict_lines
 from patchproof.report.write import render
 from test_report import some_report
 from test_verify_verdict import promise_of

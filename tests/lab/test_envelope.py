@@ -29,7 +29,7 @@ from patchproof.base.claims import Estimate, paired_difference
 from patchproof.base.strict import Refused
 from patchproof.optimizer.run import optimize_scene
 from patchproof.render.photograph import photograph
-from patchproof.report.drawing import drawn as drawing_of
+from patchproof.report.images import drawn as drawing_of
 from patchproof.scene.conditions import with_values
 
 

@@ -21,10 +21,8 @@ from synthetic_photos import make_manifest
 from patchproof.base.claims import Estimate
 from patchproof.evidence.results import KEYS, Control, LedgerShare, Origin, PhotoEntry, Prediction, Report, Summary
 from patchproof.report.images import delta_map, save_pictures
-from patchproof.report.photo_table import photos_csv
-from patchproof.report.results import Results, write_results
-from patchproof.report.tables import Drawing, Table
-from patchproof.report.write import write_report
+from patchproof.report.tables import Drawing, Results, Table, write_results
+from patchproof.report.write import photos_csv, write_report
 from test_verify_run import promise
 
 

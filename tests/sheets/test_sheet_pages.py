@@ -25,14 +25,13 @@ from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.page import largest_piece_mm
-from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import lay_out_piece, marker_image
 from patchproof.sheets.plan_page import PlanPage
 from patchproof.sheets.raster import attached_manifest, page_pixels, piece_pixels
 from patchproof.sheets.several import write_several
 from patchproof.sheets.shop import check_sheet
 from patchproof.sheets.template import load_template, template_names
-from patchproof.sheets.tiles import plan_tiles
+from patchproof.sheets.tiles import plan_tiles, refuse_larger_than_page
 from patchproof.sheets.write import write_sheet
 from test_sheet_write import DPI, ID, PX_PER_MM, detect, sample_design
 from test_worth import promise_of
@@ -208,7 +207,7 @@ def test_a_scan_of_the_first_page_is_a_page_check(tiled):
 )
 def test_seams_are_even_and_spare_the_markers_and_their_white(piece_mm, marker_mm, bends):
     template, piece = load_template("a4_tiles"), lay_out_piece(piece_mm, marker_mm, ID, "design", bends)
-    tiles = plan_tiles(template.tiles, piece)
+    tiles = plan_tiles(template, piece)
     area = sum(t.part_mm[2] * t.part_mm[3] for t in tiles)
     assert area == pytest.approx(piece.size_mm[0] * piece.size_mm[1], rel=1e-6)
     for axis in (0, 1):
@@ -224,17 +223,17 @@ def test_seams_are_even_and_spare_the_markers_and_their_white(piece_mm, marker_m
 
 def test_markers_too_large_for_tiles_are_refused():
     """Corners of 136 × 9/7 + 1 = 175.9 mm go on tiles of 177 mm, those of 137 mm markers are 177.1 mm wide."""
-    grid = load_template("a4_tiles").tiles
-    assert plan_tiles(grid, lay_out_piece((700, 700), 136, ID, "design"))
+    template = load_template("a4_tiles")
+    assert plan_tiles(template, lay_out_piece((700, 700), 136, ID, "design"))
     with pytest.raises(Refused, match="can be cut into tiles without cutting a marker, got markers of 137 mm on tiles"):
-        plan_tiles(grid, lay_out_piece((700, 700), 137, ID, "design"))
+        plan_tiles(template, lay_out_piece((700, 700), 137, ID, "design"))
 
 
 def test_a_piece_with_more_markers_than_ids_is_refused_before_it_is_optimized():
     template = load_template("a4_tiles")
     for marker_mm, markers, fits in ((10, 36, True), (8, 44, False)):
         piece = lay_out_piece((1000, 1000), marker_mm, ID, "design")
-        assert len(piece.markers) == markers and len(plan_tiles(template.tiles, piece)) == 24
+        assert len(piece.markers) == markers and len(plan_tiles(template, piece)) == 24
         if fits:
             refuse_larger_than_page(template, piece)  # 36 + 4 + 5 × 24 = 160
         else:

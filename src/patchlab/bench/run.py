@@ -15,7 +15,7 @@ from patchlab.bench.draw import drawing
 from patchlab.bench.measure import describe, machine
 from patchproof.base.output import new_folder
 from patchproof.base.strict import Refused, nearest
-from patchproof.report.results import Results, write_results
+from patchproof.report.tables import Results, write_results
 
 Bench = Callable[[bool, OnStage], Iterator[Chart]]
 BENCHES = ("render", "train", "effort", "printer", "detect", "evidence", "peers")  # modules with a `charts`

@@ -28,8 +28,7 @@ from patchproof.base.input import read_json
 from patchproof.base.output import check_folder, make_folder, write_whole
 from patchproof.base.strict import Refused, Strict, nearest, read_toml, validated
 from patchproof.base.workers import open_workers, result_of, threads
-from patchproof.report.results import Results, write_json, write_results
-from patchproof.report.tables import Drawing, Table
+from patchproof.report.tables import Drawing, Results, Table, write_json, write_results
 
 # by name the module whose STUDY it is; the first line of its docstring says what it is about
 STUDIES: dict[str, str] = {

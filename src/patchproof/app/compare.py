@@ -25,8 +25,7 @@ from patchproof.optimizer.evaluate import answers_of, forget, refuse_unnamed
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
 from patchproof.optimizer.responses import Answers
 from patchproof.optimizer.run import Run, load_run
-from patchproof.report.results import Results, write_results
-from patchproof.report.tables import Drawing, Table, Value
+from patchproof.report.tables import Drawing, Results, Table, Value, write_results
 from patchproof.scene.interface import Scene, needs_piece
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from patchproof.app.verify import verify_photos
 from patchproof.base.output import new_folder
 from patchproof.base.settings import behind
 from patchproof.optimizer.run import optimize_scene
-from patchproof.report.summary import promise_lines, verdict_lines
+from patchproof.report.words import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint
 from patchproof.reprints.run_sheet import sheet_of
 

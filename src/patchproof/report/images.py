@@ -1,19 +1,24 @@
-"""Pictures for a page without files: arrays as data URIs, color differences as a map with a fixed scale.
+"""Pictures for a page without files: arrays as data URIs, color differences as a map with a fixed scale, figures.
 
-In: uint8 sRGB H×W×3 or float cells. Out: JPEG or PNG bytes, and `data:` URIs. The scale of the map is the same in all
-reports, so that two reports can be laid side by side.
+In: uint8 sRGB H×W×3, float cells, or what draws with matplotlib. Out: the bytes of files, the same for the same input,
+and `data:` URIs. The scale of the map is the same in all reports, so that two reports can be laid side by side.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+import io
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from patchproof.base.output import image_bytes, make_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DELTA_TOP = 20.0  # ΔE00 at the map's dark end; 2 is just visible side by side, 20 another color
 KINDS = ("photo", "promised", "seen", "fitted", "delta_e00")
@@ -32,18 +37,15 @@ def png(pixels: np.ndarray) -> bytes:
     return image_bytes(pixels, "PNG", {"optimize": True})
 
 
-def encoded(kinds: Mapping[str, np.ndarray]) -> dict[str, bytes]:
-    """A photograph's pictures by kind as JPEG, its `delta_e00` cells (NaN = not measured) as the PNG of a map."""
-    return {kind: png(delta_map(a)) if kind == "delta_e00" else jpeg(a) for kind, a in sorted(kinds.items())}
-
-
 def save_pictures(folder: Path, file: str, kinds: Mapping[str, np.ndarray]) -> None:
-    """Write the pictures of the photograph `file` as FILE.KIND.jpg or .png into `folder`, in place of earlier ones."""
+    """Write a photograph's pictures by kind as FILE.KIND.jpg into `folder`, in place of earlier ones; its `delta_e00`
+    cells (NaN = not measured) as the .png of a map.
+    """
     make_folder(folder)
     for path in _paths(folder, file):
         path.unlink(missing_ok=True)
-    for kind, content in encoded(kinds).items():
-        suffix = "png" if content.startswith(_PNG) else "jpg"
+    for kind, pixels in kinds.items():
+        suffix, content = ("png", png(delta_map(pixels))) if kind == "delta_e00" else ("jpg", jpeg(pixels))
         (folder / f"{stem_of(file)}.{kind}.{suffix}").write_bytes(content)
 
 
@@ -82,3 +84,16 @@ def delta_map(delta_e00: np.ndarray, longer_px: int = 192) -> np.ndarray:
     colors[np.isnan(delta_e00), 3] = 0
     zoom = max(1, longer_px // max(delta_e00.shape))
     return np.repeat(np.repeat(colors, zoom, axis=0), zoom, axis=1)
+
+
+def drawn(draw: Callable[[Figure], None], size_in: tuple[float, float], kind: str, **options: Any) -> bytes:
+    """A figure as the bytes of a "png" or "svg"; `options` are those of matplotlib's `savefig`."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    # text stays text in the page's own font; ids follow from a fixed salt, so that reports have the same bytes
+    with matplotlib.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "patchproof"}):
+        figure, buffer = Figure(figsize=size_in, layout="constrained"), io.BytesIO()
+        draw(figure)
+        figure.savefig(buffer, format=kind, **options)
+    return buffer.getvalue()

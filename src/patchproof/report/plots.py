@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from patchproof.report.drawing import drawn
+from patchproof.report.images import drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

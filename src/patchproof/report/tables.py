@@ -1,24 +1,30 @@
 """Tables and figures of studies and benchmarks: what is handed over to be written, and how a figure reads.
 
-In: rows of plain values and `Estimate`s, drawings for matplotlib. Out: CSV text with numbers in full, cells of a page
-as people read them, PNG bytes. The same input gives the same bytes.
+In: rows of plain values and `Estimate`s, drawings for matplotlib, what failed, and the settings to repeat it. Out:
+NAME.json, a CSV per table with numbers in full, a PNG per figure, and one HTML page that needs nothing from outside of
+itself, each written whole; or lines for a terminal. The same input gives the same bytes.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from patchproof.base.claims import Estimate
-from patchproof.report.drawing import drawn
+from patchproof.base.output import write_whole
+from patchproof.report.images import data_uri, drawn
+from patchproof.report.page import page, versions_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_LIBRARIES = ("patchproof", "torch", "numpy")
 Value = str | int | float | bool | None | Estimate
 
 
@@ -44,19 +50,69 @@ class Drawing:
     about: str = ""
 
 
+@dataclass(frozen=True)
+class Results:
+    """A page's content. `program` and `kind` ("patchlab", "study") head it, `extent` says how much was done,
+    `failed` are sentences by what they are about; `more` stands in the JSON alone.
+    """
+
+    kind: str
+    name: str
+    about: str
+    extent: str
+    settings: Mapping[str, Any]
+    tables: Sequence[Table]
+    figures: Sequence[Drawing]
+    failed: Mapping[str, str]
+    more: Mapping[str, Any]
+    program: str = "patchproof"
+
+
+def write_results(folder: Path, results: Results) -> None:
+    """Write all of it into the folder."""
+    versions = versions_of(_LIBRARIES)
+    bare = {"dpi": 130, "metadata": {"Software": None}}  # without date or version
+    pictures = [(figure, drawn(figure.draw, figure.size_in, "png", **bare)) for figure in results.figures]
+    for table in results.tables:
+        write_whole(folder / f"{results.name}_{table.name}.csv", csv_text(table))
+    for figure, content in pictures:
+        write_whole(folder / f"{results.name}_{figure.name}.png", content)
+    text = page(
+        "results.html.j2",
+        results=results,
+        pictures=[(figure, data_uri(content)) for figure, content in pictures],
+        settings=json.dumps(results.settings, indent=1, ensure_ascii=False),
+        versions=versions,
+        shown=shown,
+    )
+    write_whole(folder / f"{results.name}.html", text)
+    data = {
+        results.kind: results.name,
+        "settings": results.settings,
+        "versions": versions,
+        "tables": {table.name: asdict(table) for table in results.tables},
+        **results.more,
+        "failed": results.failed,
+    }
+    write_json(folder / f"{results.name}.json", data)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """The data as a JSON file, written whole."""
+    write_whole(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
 def csv_text(table: Table) -> str:
     """The table with numbers in full; an `Estimate`'s column becomes four (value, _low, _high, _n)."""
-    wide = [any(isinstance(row[i], Estimate) for row in table.rows) for i in range(len(table.head))]
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    parts = ("", "_low", "_high", "_n")
-    writer.writerow(
-        name + part for name, is_wide in zip(table.head, wide, strict=True) for part in (parts if is_wide else ("",))
-    )
-    for row in table.rows:
-        writer.writerow(
-            part for value, is_wide in zip(row, wide, strict=True) for part in (_four(value) if is_wide else (value,))
-        )
+    buffer, columns = io.StringIO(), []
+    for name, *values in zip(table.head, *table.rows, strict=True):
+        if any(isinstance(value, Estimate) for value in values):
+            columns.append([name, *(value.value if isinstance(value, Estimate) else value for value in values)])
+            for part in ("low", "high", "n"):
+                columns.append([f"{name}_{part}", *(getattr(value, part, None) for value in values)])
+        else:
+            columns.append([name, *values])
+    csv.writer(buffer, lineterminator="\n").writerows(zip(*columns, strict=True))
     return buffer.getvalue()
 
 
@@ -87,14 +143,3 @@ def text_lines(table: Table) -> list[str]:
         ).rstrip()
         for row in rows
     ]
-
-
-def png(drawing: Drawing) -> bytes:
-    """The drawing as a PNG file's bytes, without date or version."""
-    return drawn(drawing.draw, drawing.size_in, "png", dpi=130, metadata={"Software": None})
-
-
-def _four(value: Value) -> tuple[Value, ...]:
-    if isinstance(value, Estimate):
-        return value.value, value.low, value.high, value.n
-    return value, None, None, None

@@ -1,7 +1,8 @@
-"""What a verification comes to, in words, for terminal and page alike.
+"""What a promise, an evaluation or a verification comes to, in words: for terminal and page alike.
 
-In: a report's summary as plain data. Out: a headline that says whether the patch helps, which is what somebody
-came for, a sentence with the figures behind it, and whether the promise held.
+In: a promise, an evaluation or a report; of a verification's summary plain data. Out: lines for the terminal, which say
+what a person wants to know before opening any file; a headline that says whether the patch helps, which is what
+somebody came for, a sentence with the figures behind it, and whether the promise held.
 """
 
 from __future__ import annotations
@@ -73,3 +74,94 @@ def meaning_of(model: Mapping[str, Any]) -> str:
         f"{model['name']} is a detector: recognized is what it finds in a box of score {model['least_score']:g} or "
         "more that overlaps the object's own by half."
     )
+
+
+def promise_lines(promise: Any, background: str = "") -> list[str]:
+    """The promised rate, what stood behind the object, and how it compares with each control."""
+    (low, high), target, (first, *others) = promise.interval, promise.target, promise.models
+    meaning = meaning_of(first.model_dump())
+    return [
+        promise.headline,
+        f'promise ({target.goal} "{target.label}"): recognized in {promise.rate:.1%} of {promise.n} unseen conditions '
+        f"in {promise.sessions} sessions "
+        f"[{low:.1%}, {high:.1%}] by {first.name}{background and f', before {background}'}",
+        *(f"  also {m.name}: {m.rate:.1%} [{m.interval[0]:.1%}, {m.interval[1]:.1%}]" for m in others),
+        *([meaning] if meaning else []),
+        *_control_lines({kind: claim.model_dump() for kind, claim in promise.controls.items()}),
+    ]
+
+
+def imported_lines(imported: Mapping[str, Any]) -> list[str]:
+    """What became of a picture that was made elsewhere."""
+    width, height = imported["picture_px"]
+    return [
+        f"{imported['file']}: {width} × {height} pixels, printed at {imported['dpi']:.0f} dpi; {imported['printer']} "
+        f"misses its colors by {imported['delta_e00']:.1f} ΔE00 in the mean, {imported['out_of_gamut']:.0%} of them "
+        "visibly",
+        *(f"  {note}" for note in imported["notes"]),
+    ]
+
+
+def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
+    """Each network's rate and controls."""
+    lines = []
+    for name, rates in result["models"].items():
+        low, high = rates["interval"]
+        lines.append(f"{name}: recognized in {rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]")
+        lines += _control_lines(rates["controls"])
+        if "ap50" in rates:
+            lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
+    return lines
+
+
+def verdict_lines(report: Any) -> list[str]:
+    """What the patch is worth, the verdict, and the counts behind them."""
+    summary = report.summary
+    plain = summary.model_dump()
+    lines = [f"{headline_of(plain)}. {worth_sentence(plain)}"]
+    lines.append(f"verdict: {summary.verdict} (effect: {summary.effect}). {summary.reason}".strip())
+    lines += [summary.next_step] if summary.next_step else []
+    if summary.background:
+        hint = f", a draft of {summary.draft_views} views and no more than a hint" if summary.draft_views else ""
+        lines.append(f"promised before {summary.background}{hint}")
+    lines.append(f"photographs: {summary.photos}, judged {summary.judged}, measured {summary.measured}")
+    if summary.sessions:
+        lines.append(f"sessions: {len(summary.sessions)} ({summary.sessions_known_from})")
+    if summary.rate is not None:
+        lines.append("recognized: {:.1%} [{:.1%}, {:.1%}]".format(summary.rate, *summary.interval))
+    if summary.prediction_interval is not None:
+        lines.append("promised: {} to {} of {}".format(*summary.prediction_interval, summary.judged))
+    if (forecast := summary.forecast) is not None:
+        head = f"expected at the measured views: {forecast.expected:.1f} of {forecast.photos}"
+        lines.append(f"{head} [{forecast.interval[0]}, {forecast.interval[1]}], recognized {forecast.recognized}")
+    if summary.estimated is not None:
+        lines += _estimated_lines(summary.estimated)
+    if summary.culprit is not None:
+        share = summary.ledger[summary.culprit].share
+        lines.append(f"costs the most: {summary.culprit.replace('_', ' ')} ({100 * share:.0f} points of confidence)")
+    rows = remarks([photo.model_dump() for photo in report.photos])
+    lines += [f"  {code}: {count} ({files}): {advice}" for code, advice, count, files in rows]
+    return lines + [f"  left out: {sentence}" for sentence in summary.left_out]
+
+
+def _estimated_lines(estimated: Any) -> list[str]:
+    """The effect as estimated from the photographs themselves, by control."""
+    if not estimated.controls:
+        return [
+            f"effect not estimated: {estimated.agree:.0%} of {estimated.photos} photographs say of the design put "
+            "back into them what they say themselves"
+        ]
+    head = f"estimated by putting controls into {estimated.photos} photographs ({estimated.agree:.0%} agree):"
+    return [head, *_control_lines({control.name: control.model_dump() for control in estimated.controls})]
+
+
+def _control_lines(controls: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    rows = []
+    for kind, claim in controls.items():
+        low, high = (100 * bound for bound in claim["difference_interval"])
+        seen = f" of {claim['n']}" if claim.get("n") else ""
+        rows.append(
+            f"  {kind:>6}: {claim['rate']:6.1%}{seen}   "
+            f"difference {100 * claim['difference']:+.1f} points [{low:+.1f}, {high:+.1f}]"
+        )
+    return rows

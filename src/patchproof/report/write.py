@@ -1,12 +1,15 @@
-"""Write a report: report.json as it is, report.csv for spreadsheets, report.html for people.
+"""Write a report: report.json as it is, report.csv for spreadsheets and statistics, report.html for people.
 
 In: the report and its manifest as plain data, and the pictures that lie in the report's folder. Out: files there. The
-page needs nothing from outside of itself: styles are inline, pictures are data URIs, there is no script. The same
-input gives the same bytes.
+page needs nothing from outside of itself: styles are inline, pictures are data URIs, there is no script. In the table
+the nine entries of a homography and the predictions of every network have columns of their own; what was not measured
+is an empty cell. The same input gives the same bytes.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +18,6 @@ from typing import Any
 from patchproof.base.output import make_folder, write_whole
 from patchproof.report.images import DELTA_TOP, data_uri, saved_pictures
 from patchproof.report.page import page
-from patchproof.report.photo_table import photos_csv
 from patchproof.report.plots import ledger_plot, recognition_plot, scale_plot
 from patchproof.report.words import VERDICTS, headline_of, meaning_of, remarks, worth_sentence
 
@@ -25,6 +27,7 @@ _EFFECTS = {
     "not_tested": "Whether the patch itself makes a difference was not tested: there were no control photographs.",
     "estimated": "There were no control photographs. What they would have shown was estimated from these.",
 }
+_FIRST = ("file", "status", "code", "figure", "threshold", "advice")
 _PLOTS = (("tilt_deg", "tilt in degrees"), ("px_per_mm", "pixels per millimeter"))
 
 
@@ -39,13 +42,9 @@ def write_report(
     out = Path(out_dir)
     make_folder(out)
     pictures = {photo["file"]: saved_pictures(out / "pictures", photo["file"]) for photo in report["photos"]}
-    texts = {
-        "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
-        "report.csv": photos_csv(report["photos"]),
-        "report.html": render(report, manifest, pictures, ledger),
-    }
-    for name, text in texts.items():
-        write_whole(out / name, text)
+    write_whole(out / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+    write_whole(out / "report.csv", photos_csv(report["photos"]))
+    write_whole(out / "report.html", render(report, manifest, pictures, ledger))
     return out / "report.html"
 
 
@@ -62,7 +61,7 @@ def render(
             (recognition_plot(judged, primary, name, label, promise["conditions"]), f"chart of recognition by {label}")
             for name, label in _PLOTS
         ]
-    pictures = [encoded.get(photo["file"], {}) for photo in photos]
+    estimated = summary["effect"] == "not_tested" and (summary["estimated"] or {}).get("controls")
     return page(
         "page.html.j2",
         report=report,
@@ -75,7 +74,7 @@ def render(
         meaning=meaning_of(promise["models"][0]) if promise else "",
         word=(summary["worth"] or {}).get("word", "not_shown"),
         verdict=VERDICTS[summary["verdict"]],
-        effect=_EFFECTS["estimated" if _is_estimated(summary) else summary["effect"]],
+        effect=_EFFECTS["estimated" if estimated else summary["effect"]],
         bars=_bars(summary, promise, report["controls"]),
         controls=report["controls"],
         ledger=ledger,
@@ -83,19 +82,17 @@ def render(
         plots=[(svg, about) for svg, about in plots if svg],
         sized=any(photo["scale_x"] is not None for photo in photos),
         cards=[
-            {"photo": photo, "pictures": {kind: data_uri(content) for kind, content in kinds.items()}}
-            for photo, kinds in zip(photos, pictures, strict=True)
+            {
+                "photo": photo,
+                "pictures": {kind: data_uri(file) for kind, file in encoded.get(photo["file"], {}).items()},
+            }
+            for photo in photos
         ],
         remarks=remarks(photos),
         delta_top=DELTA_TOP,
         settings=json.dumps(manifest["settings"], indent=1, ensure_ascii=False),
         origin=report["origin"],
     )
-
-
-def _is_estimated(summary: Mapping) -> bool:
-    estimated = summary["estimated"]
-    return summary["effect"] == "not_tested" and estimated is not None and bool(estimated["controls"])
 
 
 def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]) -> list[dict]:
@@ -110,8 +107,7 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
     if summary["prediction_interval"] and judged:
         allowed = [count / judged for count in summary["prediction_interval"]]
         rows.append((f"Allowed for {judged} photographs", None, allowed, "allowed"))
-    if summary["forecast"]:
-        forecast = summary["forecast"]
+    if forecast := summary["forecast"]:
         n = forecast["photos"]
         allowed = [count / n for count in forecast["interval"]]
         rows.append((f"Expected of {n} at their views", forecast["expected"] / n, allowed, "promised"))
@@ -121,3 +117,32 @@ def _bars(summary: Mapping, promise: Mapping | None, controls: Sequence[Mapping]
     for name, claim in (promise["controls"] if promise else {}).items():
         rows.append((f"Promised control: {name}", claim["rate"], claim["interval"], "control"))
     return [dict(zip(("name", "rate", "interval", "kind"), row, strict=True)) for row in rows]
+
+
+def photos_csv(photos: Sequence[Mapping[str, Any]]) -> str:
+    """The rows with a head; only the head's first columns where there are no photographs."""
+    rows = [_flat(photo) for photo in photos]
+    head = list(dict.fromkeys((*_FIRST, *(name for row in rows for name in row))))
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, head, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return buffer.getvalue()
+
+
+def _flat(photo: Mapping[str, Any]) -> dict[str, Any]:
+    row = {}
+    for name, value in photo.items():
+        if name == "homography_px_from_mm":
+            numbers = [None] * 9 if value is None else [number for line in value for number in line]
+            row |= {f"{name}_{i // 3}{i % 3}": number for i, number in enumerate(numbers)}
+        elif name == "predictions":
+            row |= {f"{model} {key}": _plain(v) for model, prediction in value.items() for key, v in prediction.items()}
+        else:
+            row[name] = _plain(value)
+    return row
+
+
+def _plain(value: Any) -> Any:
+    """The value; text that a spreadsheet would take for a formula gets an apostrophe."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

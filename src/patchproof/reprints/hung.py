@@ -30,9 +30,9 @@ from patchproof.scene.conditions import Conditions
 from patchproof.scene.mesh_scene import needs_mesh
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import Frame, patch_frame
-from patchproof.sheets.pages import tiles_of
 from patchproof.sheets.plan_page import Hung, Span
 from patchproof.sheets.template import Template
+from patchproof.sheets.tiles import plan_tiles
 
 if TYPE_CHECKING:
     from patchproof.scene.tape import Tape
@@ -56,7 +56,7 @@ def hang(scene: PatchScene, template: Template) -> Hung:
     outline = flat(placement.world(rect_border((0, 0, *placement.size_mm), 16)))  # bent paper has bent edges
     half = np.maximum(np.abs([low, high, outline.min(0), outline.max(0)]).max(0) * ROOM, 1.0)
     seams, names = [], []
-    for tile in tiles_of(template, scene.piece):
+    for tile in plan_tiles(template, scene.piece):
         corners = flat(placement.world(rect_corners(tile.part_mm)))
         seams += [(tuple(corners[1]), tuple(corners[2])), (tuple(corners[2]), tuple(corners[3]))]
         names.append((tuple(corners.mean(0)), tile.name))

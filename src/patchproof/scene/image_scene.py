@@ -32,9 +32,9 @@ from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
 from patchproof.sheets.markers import MODULES
-from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm
 from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import refuse_larger_than_page
 
 SPLIT_FROM = 2
 FEW = 20  # images, of which half say little of others

@@ -27,9 +27,9 @@ from patchproof.scene.interface import (
 from patchproof.scene.mesh_scene import MeshScene, camera_poses, load_bare
 from patchproof.scene.placement import Lay, Placement, patch_frame, place_card
 from patchproof.sheets.markers import MODULES
-from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, lay_out_piece, marker_size_mm, smallest_piece_mm
 from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import refuse_larger_than_page
 
 if TYPE_CHECKING:
     from patchproof.scene.tape import Tape

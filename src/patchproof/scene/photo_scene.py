@@ -40,9 +40,9 @@ from patchproof.scene.paper_light import PaperLight, paper_light
 from patchproof.sheets.blank import blank_piece
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY
-from patchproof.sheets.pages import refuse_larger_than_page
 from patchproof.sheets.piece import Piece, with_ids
 from patchproof.sheets.template import load_template
+from patchproof.sheets.tiles import refuse_larger_than_page
 
 LEAST_PHOTOS = 6
 _MOST_BLUR = 0.4  # modules of Gaussian sigma: up to here it is measured within a tenth, then too small

@@ -79,14 +79,8 @@ def _lay_out(template: BoardTemplate, identity: str) -> PageLayout:
     if len(white) > 1000:
         raise Refused("at most 1000 markers on a board", f"{len(white)}", "make the board's squares fewer")
     corners = [marker_corner(square, side, grid.marker_mm, grid.corner_mm) for square in white]
-    words = {
-        "sheet_id": identity,
-        "dictionary": DICTIONARY,
-        "columns": f"{grid.columns}",
-        "rows": f"{grid.rows}",
-        "square": f"{grid.square_mm:g}",
-        "marker": f"{grid.marker_mm:g}",
-    }
+    words = {"sheet_id": identity, "dictionary": DICTIONARY, "columns": f"{grid.columns}", "rows": f"{grid.rows}"}
+    words |= {"square": f"{grid.square_mm:g}", "marker": f"{grid.marker_mm:g}"}
     page = PageLayout(
         page_mm=template.page_mm,
         markers=tuple(marker_at(i, corner, grid.marker_mm) for i, corner in enumerate(corners)),

@@ -74,12 +74,10 @@ class PrintedPiece:
     def manifest(self, page: PageLayout, template: Template, cut_mm: RectMm, design_page: int = 1) -> Manifest:
         """The manifest of its page, and of its design within the cut line."""
         manifest = page_manifest(page, template, cut_mm, self.sheet_id, self.kind, self.settings)
-        pixels = self.design_srgb8
-        if pixels is None:
-            return manifest.changed(promise=self.promise)
-        size_px = (pixels.shape[1], pixels.shape[0])
-        sha256, png = design_sha256(pixels), png_base64(pixels)
-        design = Design(sha256=sha256, rect_mm=cut_mm, size_px=size_px, page=design_page, png=png)
+        design, pixels = None, self.design_srgb8
+        if pixels is not None:
+            sha256, size_px, png = design_sha256(pixels), pixels.shape[1::-1], png_base64(pixels)
+            design = Design(sha256=sha256, rect_mm=cut_mm, size_px=size_px, page=design_page, png=png)
         return manifest.changed(design=design, promise=self.promise)
 
 

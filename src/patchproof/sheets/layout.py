@@ -1,23 +1,24 @@
 """A page as plain geometry, and the proof that its parts lie apart.
 
 Every part also leaves a `Box`, the rectangle that is its own, white borders included; `prove_apart` shows that all
-boxes lie within the margins and that no two overlap, or refuses. All in page millimeters.
+boxes lie within the margins and that no two overlap, or refuses. All in page millimeters. The typeface is Bitstream
+Vera, which travels with reportlab and may be embedded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, combinations
+from itertools import combinations
 
 from patchproof.base.strict import Refused
-from patchproof.sheets.fonts import CAP_HEIGHT, DESCENT, text_width_mm
 from patchproof.sheets.piece import PieceMarker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet
 from patchproof.sheets.template import Rulers, TextLine
 
 TICK_MM = 0.15
 SLACK_MM = 1e-3  # that parts may touch by
+CAP_HEIGHT = 0.76  # of the size; Vera's ascenders and digits reach this high
+DESCENT = 0.24  # of the size; below the baseline
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,6 @@ class Parts:
     lines: tuple[Line, ...] = ()
     texts: tuple[TextLine, ...] = ()
     boxes: tuple[Box, ...] = ()
-
-
-def joined(parts: Sequence[Parts]) -> Parts:
-    """All of them as one."""
-    return Parts(*(tuple(chain(*every)) for every in zip(*((p.lines, p.texts, p.boxes) for p in parts), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -88,6 +84,24 @@ def prove_apart(boxes: tuple[Box, ...], page_mm: tuple[float, float], margin_mm:
         related = a.name == b.inside or b.name == a.inside
         if not related and meet(a.rect_mm, b.rect_mm, SLACK_MM):
             raise Refused("parts that lie apart", f"{a.name} over {b.name}", "move one of them in the template")
+
+
+def font_name(bold: bool) -> str:
+    """The registered name of Vera or Vera Bold."""
+    from reportlab.pdfbase import pdfmetrics
+    from reportlab.pdfbase.ttfonts import TTFont
+
+    name = "VeraBd" if bold else "Vera"
+    if name not in pdfmetrics.getRegisteredFontNames():
+        pdfmetrics.registerFont(TTFont(name, f"{name}.ttf"))
+    return name
+
+
+def text_width_mm(text: str, size_mm: float, bold: bool) -> float:
+    """How far a line of text runs."""
+    from reportlab.pdfbase import pdfmetrics
+
+    return pdfmetrics.stringWidth(text, font_name(bold), size_mm)
 
 
 def text_box(line: TextLine) -> Box:

@@ -54,8 +54,8 @@ def lay_out_page(template: Template, content: PrintedPiece) -> PageLayout:
     """The page of one piece; refused where that is too large."""
     placed, fixed = place_pieces(template, [content.piece]), len(content.piece.markers)
     ids = marker_ids(content.sheet_id, content.kind, fixed + len(template.marker.corners_mm))[fixed:]
-    more = piece_words(content, placed[0][1], piece_name(0))
-    return lay_out_parts(template, placed, ids, content.code, content.words, more)
+    own_words = [piece_words(content, placed[0][1], piece_name(0))]
+    return lay_out_parts(template, placed, ids, content.code, content.words, own_words)
 
 
 def lay_out_parts(
@@ -64,10 +64,10 @@ def lay_out_parts(
     ids: Sequence[int],
     qr_text: str,
     words: dict[str, str],
-    more: Parts | None = None,
+    more: Sequence[Parts] = (),
 ) -> PageLayout:
     """A page with any number of pieces at their top-left corners; `ids` are for the page's own markers."""
-    more, size = more or Parts(), template.marker.size_mm
+    size = template.marker.size_mm
     own = [marker_at(i, at, size) for i, at in zip(ids, template.marker.corners_mm, strict=True)]
     quiet = [quiet_box(marker_rect(m), size / MODULES, template.page_mm, template.margin_mm) for m in own]
     chart = [(rounded(rect), srgb) for rect, srgb in chart_swatches(template.chart)]
@@ -76,13 +76,13 @@ def lay_out_parts(
         cuts_mm=tuple(rounded((*corner, *piece.size_mm)) for piece, corner in placed),
         markers=(*(moved_marker(m, corner) for piece, corner in placed for m in piece.markers), *own),
         swatches=tuple(chart),
-        ticks=more.lines,
-        texts=more.texts,
+        ticks=tuple(line for parts in more for line in parts.lines),
+        texts=tuple(text for parts in more for text in parts.texts),
         boxes=(
             *(box for i, (piece, corner) in enumerate(placed) for box in _piece_boxes(piece, corner, i)),
             *(Box(f"chart swatch {i}", rect) for i, (rect, _) in enumerate(chart, 1)),
             *(Box(f"page marker {i}", rect) for i, rect in enumerate(quiet, 1)),
-            *more.boxes,
+            *(box for parts in more for box in parts.boxes),
         ),
     )
     return furnished(template, page, qr_text, words)

@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.sheets.fonts import font_name
-from patchproof.sheets.layout import PageLayout
+from patchproof.sheets.layout import PageLayout, font_name
 from patchproof.sheets.page import CUT_LINE_MM
 from patchproof.sheets.piece import marker_rects_mm
-from patchproof.sheets.rects import RectMm, Srgb
+from patchproof.sheets.rects import RectMm, Srgb, grown
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
@@ -108,11 +107,11 @@ def _draw(canvas: Canvas, page: Printed) -> None:
         canvas.setLineWidth(line.width_mm)
         canvas.line(x0, height - y0, x1, height - y1)
     canvas.setStrokeGray(0.45)
-    half = CUT_LINE_MM / 2  # just outside of what is cut out
-    for x, y, w, h in layout.cuts_mm:
+    for rect in layout.cuts_mm:
+        x, y, w, h = grown(rect, CUT_LINE_MM / 2)  # just outside of what is cut out
         canvas.setLineWidth(CUT_LINE_MM)
         canvas.setDash(2.0, 1.5)
-        canvas.rect(x - half, height - y - h - half, w + 2 * half, h + 2 * half)
+        canvas.rect(x, height - y - h, w, h)
         canvas.setDash()
     for line in layout.texts:
         canvas.setFillGray(line.gray)
@@ -157,9 +156,8 @@ def _finished(drawn: bytes, attachments: dict[str, str]) -> bytes:
             about = {"filename": name, "mime_type": "application/json", "description": _ATTACHED}
             attached: Any = pikepdf.AttachedFileSpec  # its stub lacks the relationship
             pdf.attachments[name] = attached(pdf, text.encode(), relationship=Name.Data, **about)
-        for key in ("/CreationDate", "/ModDate", "/Author", "/Subject", "/Keywords", "/Creator"):
-            if key in pdf.docinfo:
-                del pdf.docinfo[key]
+        for key in {"/CreationDate", "/ModDate", "/Author", "/Subject", "/Keywords", "/Creator"} & set(pdf.docinfo):
+            del pdf.docinfo[key]
         _drop_unused_font(pdf)
         buffer = io.BytesIO()
         pdf.save(buffer, deterministic_id=True, compress_streams=True)
@@ -173,12 +171,8 @@ def _drop_unused_font(pdf: Any) -> None:
     fonts = pdf.pages[0].obj.Resources.Font  # one dictionary that all pages share
     loose = [name for name, font in fonts.items() if "/FontDescriptor" not in font]
     for page in pdf.pages:
-        content = [
-            instruction
-            for instruction in pikepdf.parse_content_stream(page)
-            if not (str(instruction.operator) == "Tf" and str(instruction.operands[0]) in loose)
-        ]
+        content = pikepdf.parse_content_stream(page)
+        content = [i for i in content if str(i.operator) != "Tf" or str(i.operands[0]) not in loose]
         page.Contents = pdf.make_stream(pikepdf.unparse_content_stream(content))
-        for name in loose:
-            if name in page.obj.Resources.Font:
-                del page.obj.Resources.Font[name]
+    for name in loose:
+        del fonts[name]

@@ -9,8 +9,7 @@ distance; higher ones would reach into the markers' white, half of which is wort
 from __future__ import annotations
 
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.fonts import CAP_HEIGHT, text_width_mm
-from patchproof.sheets.layout import Box, Line, Parts
+from patchproof.sheets.layout import CAP_HEIGHT, Box, Line, Parts, text_width_mm
 from patchproof.sheets.piece import SCISSORS_MM
 from patchproof.sheets.rects import PointMm, RectMm
 from patchproof.sheets.template import TextLine

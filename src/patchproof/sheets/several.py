@@ -19,7 +19,7 @@ from pathlib import Path
 
 from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.layout import PageLayout, joined
+from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, design_sha256
 from patchproof.sheets.page import lay_out_parts, piece_name, place_pieces
 from patchproof.sheets.pdf import Printed
@@ -52,11 +52,12 @@ def write_several(
     identity = sheet_id({"sheets": [[design.sheet_id, design.kind] for design in designs]}, 0)
     code = _page_code(identity, designs)
     named = [piece_words(design, placed[i][1], piece_name(i)) for i, design in enumerate(designs)]
-    ids, words = _page_ids(designs, template), _words(identity, designs)
-    page = lay_out_parts(template, placed, ids, code, words, joined(named))
+    sizes = " and ".join(sorted({size_text(design.piece.size_mm) for design in designs}))
+    fix = "Put each piece on its object as its own plan page shows"
+    words = {"sheet_id": identity, "kind": f"{len(designs)} designs", "design": sizes, "piece": sizes, "fix": fix}
+    page = lay_out_parts(template, placed, _page_ids(designs, template), code, words, named)
     manifests = [_manifest(template, page, design, placed[i][1], i, code) for i, design in enumerate(designs)]
-    pictures = [design.pictures(rect) for rect, design in zip(page.cuts_mm, designs, strict=True)]
-    pages = [Printed(page, tuple(chain(*pictures)))]
+    pages = [Printed(page, tuple(chain(*map(PrintedPiece.pictures, designs, page.cuts_mm))))]
     for i, plan in enumerate(plans):
         if plan is not None:
             pages.append(lay_out_plan(plan, template, designs[i].sheet_id))
@@ -77,16 +78,6 @@ def _page_code(identity: str, designs: Sequence[PrintedPiece]) -> str:
     """The page's id, and 16 digits of a SHA-256 over those of its designs."""
     hashes = [design_sha256(design.design_srgb8) for design in designs if design.design_srgb8 is not None]
     return f"patchproof:{identity}:{hashlib.sha256(''.join(hashes).encode()).hexdigest()[:16]}"
-
-
-def _words(identity: str, designs: Sequence[PrintedPiece]) -> dict[str, str]:
-    return {
-        "sheet_id": identity,
-        "kind": f"{len(designs)} designs",
-        "design": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
-        "piece": " and ".join(sorted({size_text(design.piece.size_mm) for design in designs})),
-        "fix": "Put each piece on its object as its own plan page shows",
-    }
 
 
 def _manifest(

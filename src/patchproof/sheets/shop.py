@@ -9,6 +9,7 @@ file leaves to the printer, as it should; and PDF/X, which asks for one intended
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,9 @@ def check_sheet(manifest: Manifest) -> list[str]:
         return [*lines, "Cut nothing: lay the page flat, and photograph all of it in even light without shine."]
     lines += _cutting(manifest)
     if manifest.plan_page is not None:
-        piece = "the piece" if manifest.page_code is None else f"the piece of sheet {manifest.sheet_id}"
-        lines.append(
-            f"Page {manifest.plan_page} is for people, on any paper: where {piece} goes and how to photograph it."
-        )
+        whose = "" if manifest.page_code is None else f" of sheet {manifest.sheet_id}"
+        page = f"Page {manifest.plan_page} is for people, on any paper"
+        lines.append(f"{page}: where the piece{whose} goes and how to photograph it.")
     if manifest.design is None:
         lines.append("The piece carries no design: between its markers it stays white paper.")
     return lines
@@ -160,20 +160,16 @@ def _placed(page) -> Iterator[tuple[str, tuple[float, float]]]:
         elif word == "cm":
             matrix = pikepdf.Matrix(*(float(v) for v in operands)) @ matrix
         elif word == "Do":
-            yield (
-                str(operands[0]),
-                ((matrix.a**2 + matrix.b**2) ** 0.5 * _MM, (matrix.c**2 + matrix.d**2) ** 0.5 * _MM),
-            )
+            yield str(operands[0]), (_MM * math.hypot(matrix.a, matrix.b), _MM * math.hypot(matrix.c, matrix.d))
 
 
 def _packing(image) -> str:
-    filters = image.get("/Filter", [])
-    names = {str(f) for f in (filters if _is_array(filters) else [filters])}
+    names = {str(name) for name in image.Filter.wrap_in_array()} if "/Filter" in image else set()
     return "lossless" if names <= _LOSSLESS else f"PROBLEM: lossy ({', '.join(sorted(names - _LOSSLESS))})"
 
 
 def _color(space: Any) -> str:
-    if space is None or not _is_array(space) or str(space[0]) != "/ICCBased":
+    if space is None or str(space.wrap_in_array()[0]) != "/ICCBased":
         return "PROBLEM: no ICC profile"
     return f"ICC profile {_profile_name(space[1])}"
 
@@ -194,12 +190,6 @@ def _profile_name(stream) -> str:
         return ImageCms.getProfileDescription(profile).strip()
     except (ImageCms.PyCMSError, OSError):
         return "PROBLEM: broken"
-
-
-def _is_array(value: Any) -> bool:
-    import pikepdf
-
-    return isinstance(value, (list, pikepdf.Array))
 
 
 def _size(box) -> str:

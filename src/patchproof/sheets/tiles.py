@@ -1,11 +1,13 @@
 """A piece larger than the page, cut into tiles that are printed on pages of their own and glued together.
 
-In: a template with a [tiles] table and a piece. Out: `Tile`s (which part of the piece, on which page, where) and their
-page layouts. A tile shows its part of the piece; to the right and below, where another tile follows, a flap of 10 mm
-goes on: the piece's picture for one more millimeter, so that no gap shows where scissors slip, then white paper with a
-marker that the next tile will hide. Each tile has five markers of its own, in flaps and trimmed margins, which tell its
-scan or photograph from any other's; when all is glued, the piece's own markers alone are left to be seen.
-Seams are as even as they can be without cutting through a marker of the piece.
+In: a template with a [tiles] table, a piece and its design. Out: pages and a manifest. Page 1 carries the chart, the
+rulers and a plan of the tiles; each tile follows on a page of its own. A tile shows its part of the piece; to the right
+and below, where another tile follows, a flap of 10 mm goes on: the piece's picture for one more millimeter, so that no
+gap shows where scissors slip, then white paper with a marker that the next tile will hide. Each tile has five markers
+of its own, in flaps and trimmed margins, which tell its scan or photograph from any other's; when all is glued, the
+piece's own markers alone are left to be seen. Seams are as even as they can be without cutting through a marker of the
+piece. The design's page is that of the first tile, and `design.rect_mm` and `cut_mm` lie in its millimeters, reaching
+beyond its edges; `tiles` carries every other page there.
 """
 
 from __future__ import annotations
@@ -17,17 +19,29 @@ from itertools import pairwise
 
 from patchproof.base.strict import Refused
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.fonts import text_width_mm
-from patchproof.sheets.layout import Box, Line, PageLayout, Parts, Window, prove_apart, quiet_box, text_box
+from patchproof.sheets.layout import (
+    Box,
+    Line,
+    PageLayout,
+    Parts,
+    Window,
+    prove_apart,
+    quiet_box,
+    text_box,
+    text_width_mm,
+)
+from patchproof.sheets.manifest import Manifest, Tile
 from patchproof.sheets.markers import MODULES
-from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES
-from patchproof.sheets.piece import Piece, PieceMarker, marker_at, marker_rect, moved_marker
+from patchproof.sheets.page import CUT_LINE_MM, MOST_TILES, lay_out_parts, piece_zone_mm, place_pieces
+from patchproof.sheets.pdf import Printed
+from patchproof.sheets.piece import Piece, PieceMarker, marker_at, marker_ids, marker_rect, moved_marker, printed
 from patchproof.sheets.piece_words import piece_words
-from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, size_text
+from patchproof.sheets.rects import PointMm, RectMm, grown, holds, meet, moved, size_text
 from patchproof.sheets.template import Template, TextLine, TileGrid, template_names
 
 BLEED_MM = 1.0  # of the piece's picture on a flap
 MARKERS = 5  # of a tile's own: whichever corner is hidden, four are left that surround most of it
+FIRST_TILE_PAGE = 2
 
 
 @dataclass(frozen=True)
@@ -50,9 +64,17 @@ class TilePlan:
         """The part on its page."""
         return (*self.corner_mm, *self.part_mm[2:])
 
+    def extended(self, by_mm: float) -> RectMm:
+        """The part on its page, and that much more of its flaps."""
+        x, y, w, h = self.page_rect_mm
+        return x, y, w + (by_mm if self.right else 0), h + (by_mm if self.below else 0)
 
-def plan_tiles(grid: TileGrid, piece: Piece) -> list[TilePlan]:
-    """The tiles row by row; refused where there are more than marker ids last for."""
+
+def plan_tiles(template: Template, piece: Piece) -> list[TilePlan]:
+    """The tiles row by row, none where the piece stays whole; refused where there are more than marker ids last for."""
+    grid = template.tiles
+    if grid is None:
+        return []
     xs, ys = (_seams(piece, axis, most_mm) for axis, most_mm in enumerate(grid.zone_mm[2:]))
     columns, rows = len(xs) - 1, len(ys) - 1
     if columns * rows > MOST_TILES:
@@ -75,14 +97,51 @@ def plan_tiles(grid: TileGrid, piece: Piece) -> list[TilePlan]:
     ]
 
 
-def lay_out_tile(
+def tile_pages(template: Template, grid: TileGrid, content: PrintedPiece) -> tuple[list[Printed], Manifest]:
+    """Page 1 and the tiles' pages, proved apart each; `grid` is the template's own."""
+    piece, sheet_id = content.piece, content.sheet_id
+    tiles, fixed = plan_tiles(template, piece), len(piece.markers)
+    own = fixed + len(template.marker.corners_mm)
+    ids = marker_ids(sheet_id, content.kind, own + MARKERS * len(tiles))
+    more, small = _tile_map(piece, tiles, piece_zone_mm(template))
+    words = content.words | {"tiles": str(len(tiles))}
+    first = lay_out_parts(template, [], ids[fixed:own], content.code, words, [more])
+    layouts = [
+        _lay_out_tile(template, grid, content, tile, ids[own + MARKERS * i : own + MARKERS * (i + 1)])
+        for i, tile in enumerate(tiles)
+    ]
+    # pale: so light that names can be read on it, and that nobody cuts it out
+    pages = [Printed(first, tuple((rect, 255 - (255 - design) // 3) for rect, design in content.pictures(small)))]
+    markers, entries, cut_mm = [], [], (0.0, 0.0, *piece.size_mm)
+    for number, (tile, page) in enumerate(zip(tiles, layouts, strict=True), FIRST_TILE_PAGE):
+        by = dx, dy = tile.page_from_piece_mm
+        pages.append(Printed(page, windowed=content.pictures(moved(cut_mm, by))))
+        markers += [printed(marker, number) for marker in _shown_markers(tile, piece)]
+        shift = (1.0, 0.0, round(dx, 6)), (0.0, 1.0, round(dy, 6))
+        entries.append(Tile(page=number, page_from_design_mm=shift, cut_mm=tile.page_rect_mm))
+    for number, page in enumerate((first, *layouts), FIRST_TILE_PAGE - 1):
+        markers += [printed(marker, number) for marker in page.markers]
+    whole = moved(cut_mm, tiles[0].page_from_piece_mm)
+    manifest = content.manifest(first, template, whole, FIRST_TILE_PAGE)
+    return pages, manifest.changed(markers=tuple(markers), tiles=tuple(entries))
+
+
+def refuse_larger_than_page(template: Template, piece: Piece) -> None:
+    """Refuse a piece of which no sheet could be made: too large, or with more markers than there are ids."""
+    if template.tiles is None:
+        place_pieces(template, [piece])
+    own = len(template.marker.corners_mm) + MARKERS * len(plan_tiles(template, piece))
+    marker_ids("", "design", len(piece.markers) + own)
+
+
+def _lay_out_tile(
     template: Template, grid: TileGrid, content: PrintedPiece, tile: TilePlan, ids: Sequence[int]
 ) -> PageLayout:
     """One tile's page, proved apart and within the margins; its own markers are the layout's, the piece's lie in
     the window.
     """
     by, part, page_mm, margin_mm = tile.page_from_piece_mm, tile.page_rect_mm, template.page_mm, template.margin_mm
-    window, cut = _extended(tile, BLEED_MM), _extended(tile, grid.overlap_mm)
+    window, cut = tile.extended(BLEED_MM), tile.extended(grid.overlap_mm)
     own = [marker_at(i, at, grid.marker_mm) for i, at in zip(ids, _places(grid, part), strict=True)]
     quiet = [quiet_box(marker_rect(marker), grid.marker_mm / MODULES, page_mm, margin_mm) for marker in own]
     texts, own_words = _words(template, grid, tile, content.sheet_id), _within(window, piece_words(content, by))
@@ -112,13 +171,7 @@ def _within(window: RectMm, words: Parts) -> Parts:
     return Parts(tuple(lines), tuple(shown))
 
 
-def _extended(tile: TilePlan, by_mm: float) -> RectMm:
-    """The tile's part on its page, and that much more of its flaps."""
-    x, y, w, h = tile.page_rect_mm
-    return x, y, w + (by_mm if tile.right else 0), h + (by_mm if tile.below else 0)
-
-
-def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[Parts, RectMm]:
+def _tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[Parts, RectMm]:
     """The assembled piece drawn small in a zone: outline, seams and names, and where its picture goes."""
     x, y, w, h = grown(zone_mm, -6.0)
     scale = min(w / piece.size_mm[0], h / piece.size_mm[1])
@@ -141,12 +194,14 @@ def tile_map(piece: Piece, tiles: Sequence[TilePlan], zone_mm: RectMm) -> tuple[
     return Parts(tuple(lines), tuple(texts), (Box("plan of the tiles", whole),)), whole
 
 
-def own_markers(tile: TilePlan, piece: Piece) -> list[PieceMarker]:
+def _shown_markers(tile: TilePlan, piece: Piece) -> list[PieceMarker]:
     """The piece's markers whose middle the tile shows, in page millimeters."""
-    (x, y, w, h), markers = tile.page_rect_mm, [moved_marker(m, tile.page_from_piece_mm) for m in piece.markers]
-    rects = [marker_rect(marker) for marker in markers]
-    middles = [(left + wide / 2, top + high / 2) for left, top, wide, high in rects]
-    return [m for m, (mx, my) in zip(markers, middles, strict=True) if x <= mx < x + w and y <= my < y + h]
+    (x, y, w, h), shown = tile.page_rect_mm, []
+    for marker in (moved_marker(m, tile.page_from_piece_mm) for m in piece.markers):
+        left, top, wide, high = marker_rect(marker)
+        if x <= left + wide / 2 < x + w and y <= top + high / 2 < y + h:
+            shown.append(marker)
+    return shown
 
 
 def _seams(piece: Piece, axis: int, most_mm: float) -> list[float]:

@@ -16,12 +16,13 @@ from patchproof.base.strict import Refused, Strict
 from patchproof.sheets.content import PrintedPiece, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest
-from patchproof.sheets.pages import pages_of
+from patchproof.sheets.page import lay_out_page
 from patchproof.sheets.pdf import ATTACHMENT, Printed, numbered, pages_pdf
 from patchproof.sheets.piece import page_id
 from patchproof.sheets.plan_page import PlanPage, lay_out_plan
 from patchproof.sheets.rects import RectMm
 from patchproof.sheets.template import BoardTemplate, Template
+from patchproof.sheets.tiles import tile_pages
 
 
 def write_sheet(
@@ -32,7 +33,14 @@ def write_sheet(
     A template with tiles makes a page for each. `plan` becomes the last page; `copies` repeats the page with the piece.
     """
     pdf_path = pdf_name(pdf_path)
-    pages, manifest = pages_of(template, content, copies)
+    if template.tiles is None:
+        page = lay_out_page(template, content)
+        pages = [Printed(page, content.pictures(page.cuts_mm[0]))] * copies
+        manifest = content.manifest(page, template, page.cuts_mm[0])
+    elif copies > 1:
+        raise Refused("one copy of a piece in tiles", f"{copies}", "print the file more than once")
+    else:
+        pages, manifest = tile_pages(template, template.tiles, content)
     if plan is not None:
         pages.append(lay_out_plan(plan, template, content.sheet_id))
         manifest = manifest.changed(plan_page=len(pages))
@@ -68,9 +76,8 @@ def manifest_paths(pdf_path: Path, designs: int) -> list[Path]:
 
 def save_sheets(pdf_path: Path, pages: Sequence[Printed], manifests: dict[Path, Manifest]) -> None:
     """Write the PDF and its manifests, which it carries too: one as sheet.json, several as sheet_1.json..."""
-    texts = {path: dump_manifest(manifest) for path, manifest in manifests.items()}
-    first = next(iter(manifests.values()))
+    texts, first = [dump_manifest(manifest) for manifest in manifests.values()], next(iter(manifests.values()))
     names = [ATTACHMENT] if len(texts) == 1 else [numbered(ATTACHMENT, i) for i in range(len(texts))]
     title = f"patchproof sheet {' '.join(m.sheet_id for m in manifests.values())} {first.kind}"
-    pdf = pages_pdf(pages, title, dict(zip(names, texts.values(), strict=True)))
-    write_together({pdf_path: pdf} | {path: text.encode() for path, text in texts.items()})
+    pdf = pages_pdf(pages, title, dict(zip(names, texts, strict=True)))
+    write_together({pdf_path: pdf} | dict(zip(manifests, map(str.encode, texts), strict=True)))

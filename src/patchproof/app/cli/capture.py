@@ -29,7 +29,7 @@ def capture(
 
     from patchproof.app.capture.album import CONTROLS_FOLDER
     from patchproof.app.capture.serve import serve_capture
-    from patchproof.report.summary import verdict_lines
+    from patchproof.report.words import verdict_lines
 
     def show(address: str) -> None:
         segno.make(address, error="l").terminal(compact=True)

@@ -39,7 +39,7 @@ def import_picture(
     from patchproof.base.settings import behind
     from patchproof.optimizer.given import import_folder, import_patch
     from patchproof.optimizer.run import DRAFT
-    from patchproof.report.summary import imported_lines, promise_lines
+    from patchproof.report.words import imported_lines, promise_lines
 
     with progress() as bar:
         options: dict[str, Any] = {"seed": seed, "device": device, "overwrite": overwrite, "jobs": jobs or 1}
@@ -68,7 +68,7 @@ def evaluate(
     """Rates on fresh conditions, with controls, on any classifiers; of several runs side by side."""
     from patchproof.app.compare import compare_runs
     from patchproof.optimizer.evaluate import evaluate_run
-    from patchproof.report.summary import evaluation_lines
+    from patchproof.report.words import evaluation_lines
 
     if (out is None) != (len(runs) == 1):
         raise typer.BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")

@@ -64,7 +64,7 @@ def optimize(
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.base.settings import behind
     from patchproof.optimizer.run import DRAFT, THOROUGH, optimize_scene
-    from patchproof.report.summary import promise_lines
+    from patchproof.report.words import promise_lines
     from patchproof.scene.scene import load_scene
 
     if draft and thorough:
@@ -109,7 +109,7 @@ def promise(
     """Promise a finished run's rate anew: the full promise of a draft, or one of more views."""
     from patchproof.base.settings import behind
     from patchproof.optimizer.run import promise_run
-    from patchproof.report.summary import promise_lines
+    from patchproof.report.words import promise_lines
 
     with progress() as bar:
         made = promise_run(run, views=n, device=device, jobs=jobs or 1, on_promise=partial(bar, "promise"))
@@ -265,7 +265,7 @@ def verify(
 ) -> None:
     """Measure photographs of the print and judge them against the promise."""
     from patchproof.app.verify import verify_photos
-    from patchproof.report.summary import verdict_lines
+    from patchproof.report.words import verdict_lines
 
     with progress() as bar:
         report = verify_photos(
