@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import nn
 
+from patchlab.training.fit import folded
 from patchproof.base.strict import Refused
 from patchproof.classifier import Classifier, load_classifier, zoo
-from patchproof.classifier.builtin import SmallNetwork, folded
+from patchproof.classifier.builtin import SmallNetwork
 from patchproof.classifier.check import check_network
 from patchproof.classifier.load import use_full_precision
 from patchproof.classifier.network import weights_sha256

@@ -7,12 +7,13 @@ step after the other, and printed lines. Rendered pictures can be kept in a fold
 from __future__ import annotations
 
 import argparse
+import copy
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -126,3 +127,14 @@ def _card(rng: np.random.Generator, px: int = 40) -> np.ndarray:
         frame[margin:-margin, margin:-margin] = picture[margin:-margin, margin:-margin]
         picture = frame
     return picture.astype(np.float32)
+
+
+def folded(trained: nn.Module) -> nn.Module:
+    """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
+    plain = copy.deepcopy(trained).eval()
+    for parent in list(plain.modules()):
+        for name, child in list(parent.named_children()):
+            if isinstance(child, nn.Sequential):  # a convolution and its norm, as the built-in networks join them
+                conv_and_norm: list[Any] = list(child.children())
+                parent.register_module(name, torch.nn.utils.fuse_conv_bn_eval(*conv_and_norm))
+    return plain

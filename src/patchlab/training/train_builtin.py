@@ -24,7 +24,7 @@ from torch import Tensor
 from patchlab.training import fit
 from patchlab.training.card import by_class, exported, stored, write_card
 from patchlab.training.pictures import Pictures, augmented, reduced
-from patchproof.classifier.builtin import DEVIATION, INPUT_PX, MEAN, SmallNetwork, folded
+from patchproof.classifier.builtin import DEVIATION, INPUT_PX, MEAN, SmallNetwork
 from patchproof.classifier.zoo import Normalized
 from patchproof.mesh import primitives
 
@@ -65,7 +65,7 @@ def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Picture
     if recipe.network:
         network, count = trained, exported(trained, out / f"{recipe.name}.onnx", recipe.input_px)
     else:
-        network = folded(trained)
+        network = fit.folded(trained)
         count = stored(network, out / f"{recipe.name}.safetensors")
     right = accuracy(network, held_out)
     figures = {

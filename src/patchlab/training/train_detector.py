@@ -23,7 +23,6 @@ from torch import Tensor
 from patchlab.training import fit
 from patchlab.training.card import by_class, stored, write_card
 from patchlab.training.pictures import Pictures, augmented
-from patchproof.classifier.builtin import folded
 from patchproof.classifier.builtin_detector import INPUT_PX, SmallDetector, centers_px
 from patchproof.classifier.detector import iou
 from patchproof.classifier.precision import Finding, average_precision, findings
@@ -135,7 +134,7 @@ def precision(found: Sequence[Sequence[Finding]], shown: Pictures) -> np.ndarray
 
 def write(out: Path, trained: torch.nn.Module, recipe: Recipe, held_out: Pictures, seconds: fit.Seconds) -> None:
     """The weights and what is known about them; the precision is that of the stored weights."""
-    network = folded(trained)
+    network = fit.folded(trained)
     count = stored(network, out / "builtin_detector.safetensors")
     found = found_by_class(network, held_out)
     ap50 = precision(found, held_out)

@@ -8,7 +8,6 @@ before saving, which is faster and leaves nothing that depends on the batch. Wei
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 from collections.abc import Callable
@@ -27,34 +26,35 @@ MEAN, DEVIATION = 0.45, 0.27  # of sRGB photographs, roughly; the first layer le
 HERE = Path(__file__).parent
 
 
-class SmallNetwork(nn.Module):
-    """Five halvings, each a strided convolution and, but for the first, a residual one; then the mean and a line."""
+class Halvings(nn.Module):
+    """Five halvings, each a strided convolution and, but for the first, a residual one."""
 
-    def __init__(self, classes: int, batch_norm: bool = False):
+    def __init__(self, batch_norm: bool):
         super().__init__()
         before = (3, *WIDTHS)
         self.halve = nn.ModuleList(conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
         self.refine = nn.ModuleList(conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
+
+    def features(self, photos_srgb: Tensor) -> list[Tensor]:
+        """What each halving but the first makes of N×3×S×S sRGB in [0, 1]."""
+        x, sizes = torch.relu(self.halve[0]((photos_srgb - MEAN) / DEVIATION)), []
+        for halve, refine in zip(self.halve[1:], self.refine, strict=True):
+            x = torch.relu(halve(x))
+            x = x + torch.relu(refine(x))
+            sizes.append(x)
+        return sizes
+
+
+class SmallNetwork(Halvings):
+    """Halvings, then the mean and a line."""
+
+    def __init__(self, classes: int, batch_norm: bool = False):
+        super().__init__(batch_norm)
         self.classify = nn.Linear(WIDTHS[-1], classes)
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×96×96 sRGB in [0, 1] → N×K logits."""
-        x = torch.relu(self.halve[0]((photos_srgb - MEAN) / DEVIATION))
-        for halve, refine in zip(self.halve[1:], self.refine, strict=True):
-            x = torch.relu(halve(x))
-            x = x + torch.relu(refine(x))
-        return self.classify(x.mean((2, 3)))
-
-
-def folded(trained: nn.Module) -> nn.Module:
-    """The same function without BatchNorm: its scale and shift moved into the convolutions (evaluation statistics)."""
-    plain = copy.deepcopy(trained).eval()
-    for parent in list(plain.modules()):
-        for name, child in list(parent.named_children()):
-            if isinstance(child, nn.Sequential):  # a convolution and its norm, as `conv` joins them
-                conv_and_norm: list[Any] = list(child.children())
-                parent.register_module(name, torch.nn.utils.fuse_conv_bn_eval(*conv_and_norm))
-    return plain
+        return self.classify(self.features(photos_srgb)[-1].mean((2, 3)))
 
 
 def load_builtin(folder: Path = HERE) -> Classifier:

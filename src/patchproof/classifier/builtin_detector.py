@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from patchproof.classifier.builtin import DEVIATION, HERE, MEAN, WIDTHS, conv, stored_network
+from patchproof.classifier.builtin import HERE, WIDTHS, Halvings, conv, stored_network
 from patchproof.classifier.detector import Detector
 
 INPUT_PX, CELL_PX = 128, 16
@@ -21,14 +21,11 @@ HEAD = 96  # channels
 NEAR, FAR = -2.0, 2.5  # logarithms of the nearest and the farthest side, in cells: 2 and 195 pixels
 
 
-class SmallDetector(nn.Module):
+class SmallDetector(Halvings):
     """The built-in classifier's five halvings; cells of 16 pixels look at themselves and at those of 32 around."""
 
     def __init__(self, classes: int, batch_norm: bool = False):
-        super().__init__()
-        before = (3, *WIDTHS)
-        self.halve = nn.ModuleList(conv(a, b, 2, batch_norm) for a, b in zip(before, WIDTHS, strict=False))
-        self.refine = nn.ModuleList(conv(width, width, 1, batch_norm) for width in WIDTHS[1:])
+        super().__init__(batch_norm)
         self.join = nn.ModuleList(conv(width, HEAD, 1, batch_norm) for width in WIDTHS[-2:])
         self.head = nn.ModuleList(conv(HEAD, HEAD, 1, batch_norm) for _ in range(2))
         self.name, self.sides = nn.Conv2d(HEAD, classes, 1), nn.Conv2d(HEAD, 4, 1)
@@ -36,13 +33,8 @@ class SmallDetector(nn.Module):
 
     def forward(self, photos_srgb: Tensor) -> Tensor:
         """N×3×128×128 sRGB in [0, 1] → a candidate for each of 64 cells, N×64×(4+K)."""
-        x = torch.relu(self.halve[0]((photos_srgb - MEAN) / DEVIATION))
-        sizes = []
-        for halve, refine in zip(self.halve[1:], self.refine, strict=True):
-            x = torch.relu(halve(x))
-            x = x + torch.relu(refine(x))
-            sizes.append(x)
-        fine, coarse = (join(size) for join, size in zip(self.join, sizes[-2:], strict=True))
+        sizes = self.features(photos_srgb)[-2:]
+        fine, coarse = (join(size) for join, size in zip(self.join, sizes, strict=True))
         x = torch.relu(fine + nn.functional.interpolate(coarse, scale_factor=2.0))
         for layer in self.head:
             x = x + torch.relu(layer(x))

@@ -12,7 +12,6 @@ Source: Radford et al., Learning Transferable Visual Models From Natural Languag
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +57,8 @@ def load_clip(name: str) -> Classifier:
     else:
         network = open_clip.create_model(known)
         put_into(network, own_weights(path), f"clip:{known}", "check the model's name")
-    view, side_px = network.visual.preprocess_cfg, _side_px(network.visual.image_size)
+    view, size = network.visual.preprocess_cfg, network.visual.image_size
+    side_px = int(size if isinstance(size, int) else min(size))
     if side_px != card.input_px:
         do = f'write "input_px": {side_px} into it'
         raise Refused(f"the input size of clip:{known}", f"{card.input_px} in {path.with_suffix('.json')}", do)
@@ -66,8 +66,3 @@ def load_clip(name: str) -> Classifier:
         prompts = network.eval().encode_text(open_clip.get_tokenizer(known)(list(card.labels)), normalize=True)
     sees = Prompted(network.visual, prompts, network.logit_scale.exp())
     return classifier_of(Normalized(sees, view["mean"], view["std"]), side_px, card.labels, f"clip:{name}")
-
-
-def _side_px(size: Any) -> int:
-    """The shorter side of what the network takes."""
-    return int(size if isinstance(size, int) else min(size))

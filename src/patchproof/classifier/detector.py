@@ -11,7 +11,7 @@ Left out on purpose: suppression. It leaves the best candidate of an object, whi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -33,15 +33,6 @@ class Detector(Classifier):
 
     KIND = "detector"
     LOOKS_AT_BOXES = True
-
-    @property
-    def score_needed(self) -> float:
-        """The score from which on its boxes count."""
-        return self.least_score
-
-    def at_score(self, least_score: float | None) -> Detector:
-        """As in `Classifier.at_score`."""
-        return self if least_score is None else replace(self, least_score=least_score)
 
     def probabilities(self, logits: Tensor) -> Tensor:
         """N×K scores, each label's own."""

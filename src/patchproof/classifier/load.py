@@ -21,7 +21,9 @@ from pathlib import Path
 import torch
 
 from patchproof.base.strict import Refused, expand
+from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.check import check_network, smooth_pictures
+from patchproof.classifier.custom import load_custom
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import fastest
 
@@ -34,8 +36,6 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
         return _trusted(name, device)
     kind, _, rest = expand(name, Path(base)).partition(":")
     if name == "builtin":
-        from patchproof.classifier.builtin import load_builtin
-
         classifier = load_builtin()
     elif name == "builtin-detector":
         from patchproof.classifier.builtin_detector import load_builtin_detector
@@ -44,7 +44,7 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
     elif kind == "file":
         from patchproof.classifier.network_file import load_network
 
-        classifier = load_network(Path(rest), device)
+        classifier = load_network(Path(rest))
     elif kind in ("torchvision", "timm"):
         from patchproof.classifier.zoo import load_timm, load_torchvision
 
@@ -54,8 +54,6 @@ def load_classifier(name: str | Classifier, base: Path, device: torch.device | s
 
         classifier = load_clip(rest)
     elif kind == "module":
-        from patchproof.classifier.custom import load_custom
-
         classifier = load_custom(rest, Path(base))
     elif kind == "python":
         raise Refused("the network itself, which was given in Python", name, "give it again: models=[...]")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -40,18 +40,14 @@ class Classifier:
     input_px: int
     labels: tuple[str, ...]
     network: Callable[[Tensor], Tensor]
+    least_score: float | None = None  # from which on a detector's boxes count; a classifier needs none
 
     KIND: ClassVar[str] = "classifier"
     LOOKS_AT_BOXES: ClassVar[bool] = False  # whether it matters where the object lies
 
-    @property
-    def score_needed(self) -> float | None:
-        """The score from which on a detector's boxes count; None of a classifier, whose best label counts."""
-        return None
-
     def at_score(self, least_score: float | None) -> Classifier:
         """The network with that score in place of its own, if there is one and it needs any."""
-        return self
+        return self if None in (least_score, self.least_score) else replace(self, least_score=least_score)
 
     def logits(
         self,

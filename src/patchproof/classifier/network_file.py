@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import torch
+from typing import NamedTuple
 
 from patchproof.base.input import is_file, read_json
 from patchproof.base.strict import Refused
@@ -33,14 +31,29 @@ EXPORT = (
 )
 
 
-def load_network(path: Path, device: torch.device | str = "cpu") -> Classifier:
+def load_network(path: Path) -> Classifier:
     """The ONNX file and its card as a Classifier; files of other kinds are refused by their name."""
     if path.suffix != ".onnx":
         raise Refused("a network as an ONNX file, file:NAME.onnx", f"{path}", EXPORT)
     stored = network_bytes(path)  # once, so that what is hashed is what is loaded
     card = read_card(path.with_suffix(".json"))
     digest = hashlib.sha256(stored)
-    network = _network(stored, path, digest).to(device)
+
+    def beside() -> bytes:
+        data = network_bytes(path.with_name(f"{path.name}.data"))
+        digest.update(data)
+        return data
+
+    try:
+        network = InBatches(*read_onnx(stored, beside))
+    except Unwanted as error:
+        do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
+        raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
+    except Refused:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        got = f"{path}, whose description cannot be read ({type(error).__name__})"
+        raise Refused("an ONNX file", got, "export it again with torch.onnx.export") from error
     make = Detector if card.kind == Detector.KIND else Classifier
     return make(f"file:{path}", digest.hexdigest(), card.input_px, card.labels, network)
 
@@ -50,9 +63,8 @@ def network_bytes(path: Path) -> bytes:
     if not is_file(path):
         raise Refused("a network", f"no file at {path}", "check the path")
     if path.stat().st_size > MAX_BYTES:
-        raise Refused(
-            f"a network of at most {MAX_BYTES >> 30} GiB", f"{path}, which is larger", "use a smaller network"
-        )
+        expected = f"a network of at most {MAX_BYTES >> 30} GiB"
+        raise Refused(expected, f"{path}, which is larger", "use a smaller network")
     return path.read_bytes()
 
 
@@ -80,23 +92,3 @@ def read_card(path: Path) -> Card:
     if kind not in (Classifier.KIND, Detector.KIND):
         raise Refused(f'kind, "{Classifier.KIND}" or "{Detector.KIND}"', f"{kind!r} in {path}", "write one of these")
     return Card(input_px, tuple(labels), kind)
-
-
-def _network(stored: bytes, path: Path, digest: Any) -> InBatches:
-    """The network as a function of any number of photographs."""
-
-    def beside() -> bytes:
-        data = network_bytes(path.with_name(f"{path.name}.data"))
-        digest.update(data)
-        return data
-
-    try:
-        return InBatches(*read_onnx(stored, beside))
-    except Unwanted as error:
-        do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
-        raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
-    except Refused:
-        raise
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        got = f"{path}, whose description cannot be read ({type(error).__name__})"
-        raise Refused("an ONNX file", got, "export it again with torch.onnx.export") from error

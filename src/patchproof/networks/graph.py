@@ -74,7 +74,9 @@ def compute(steps: Sequence[Step], values: dict[int, Any], like: Tensor) -> None
         arguments = [_filled(argument, values, like) for argument in step.arguments]
         keywords = {name: _filled(argument, values, like) for name, argument in step.keywords.items()}
         if step.several and like.is_meta:
-            _check_split(arguments)
+            tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
+            if any(size > MAX_SPLIT for tensor in tensors for size in tensor.shape):
+                raise ValueError("it splits a tensor of an absurd size")
         results = step.compute(*arguments, **keywords)
         for number, result in zip(step.results, results if step.several else [results], strict=True):
             values[number] = result
@@ -113,11 +115,12 @@ def _mean(values: Tensor, over: list[int] | None, keep: bool = False, **_: Any) 
 
 # On tensors without memory torch computes these in Python, for which it imports its compiler and SymPy: two seconds.
 _ATEN = torch.ops.aten
-_PLAIN = (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div), (_ATEN.relu, _ATEN.hardtanh, _ATEN.hardswish)
+_PLAIN = (
+    *(operator.Tensor for operator in (_ATEN.add, _ATEN.sub, _ATEN.mul, _ATEN.div)),
+    *(operator.default for operator in (_ATEN.relu, _ATEN.relu_, _ATEN.hardtanh, _ATEN.hardtanh_, _ATEN.hardswish)),
+)
 _WEIGHED: dict[Callable[..., Any], Callable[..., Any]] = {
-    **{operator.Tensor: _like_first(operator.Tensor) for operator in _PLAIN[0]},
-    **{operator.default: _like_first(operator.default) for operator in _PLAIN[1]},
-    **{changed: _like_first(changed) for changed in (_ATEN.relu_.default, _ATEN.hardtanh_.default)},
+    **{operator: _like_first(operator) for operator in _PLAIN},
     _ATEN.convolution.default: _convolution,
     _ATEN.mean.dim: _mean,
 }
@@ -136,8 +139,3 @@ def _refuse_absurd(limit: int, tensor: Tensor) -> None:
     """Also what an operator makes on its way (einsum, paddings)."""
     if tensor.numel() > limit or tensor.dim() > MAX_DIMENSIONS:
         raise ValueError(f"it makes a tensor of an absurd size, {quoted(tuple(tensor.shape))}")
-
-
-def _check_split(arguments: list[Any]) -> None:
-    if any(size > MAX_SPLIT for tensor in arguments if isinstance(tensor, Tensor) for size in tensor.shape):
-        raise ValueError("it splits a tensor of an absurd size")

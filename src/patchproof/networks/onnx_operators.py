@@ -124,10 +124,6 @@ def _gemm(a, b, c=None, /, *, alpha=1.0, beta=1.0, transA=0, transB=0):
     return alpha * (a @ b) if c is None else torch.addmm(c, a, b, beta=beta, alpha=alpha)
 
 
-def _einsum(*tensors, equation):
-    return torch.einsum(equation, *tensors)
-
-
 # --- normalization ---
 
 
@@ -135,14 +131,6 @@ def _batch_norm(x, scale, b, mean, var, /, *, epsilon=1e-5, momentum=0.9, traini
     if training_mode:
         raise ValueError("a BatchNormalization in training mode")
     return F.batch_norm(x, mean, var, scale, b, False, 0.0, epsilon)
-
-
-def _layer_norm(x, scale, b=None, /, *, axis=-1, epsilon=1e-5, stash_type=1):
-    return F.layer_norm(x, x.shape[axis:], scale, b, epsilon)
-
-
-def _instance_norm(x, scale, b, /, *, epsilon=1e-5):
-    return F.instance_norm(x, weight=scale, bias=b, eps=epsilon)
 
 
 def _group_norm(x, scale, b, /, *, num_groups, epsilon=1e-5, stash_type=1):
@@ -157,10 +145,6 @@ def _dropout(x, /, ratio=None, training_mode=None, *, seed=None):
 
 
 # --- activations and arithmetic ---
-
-
-def _clip(x, low=None, high=None, /):
-    return x if low is None and high is None else torch.clamp(x, low, high)
 
 
 def _one(compute: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
@@ -196,12 +180,9 @@ def _product(x: Tensor, along: list[int], keepdim: bool) -> Tensor:
 _TABLE: dict[str, Callable[..., Any]] = {
     # of one input
     **{name: _one(getattr(torch, name.lower())) for name in "Abs Ceil Cos Erf Exp Floor Log Neg Reciprocal".split()},
-    **{name: _one(getattr(torch, name.lower())) for name in "Relu Sigmoid Sign Sin Sqrt Tanh".split()},
+    **{name: _one(getattr(torch, name.lower())) for name in "IsNaN Relu Sigmoid Sign Sin Sqrt Tanh".split()},
+    **{name: _one(getattr(F, name.lower())) for name in ("HardSwish", "Mish", "Softplus")},
     "Not": _one(torch.logical_not),
-    "IsNaN": _one(torch.isnan),
-    "HardSwish": _one(F.hardswish),
-    "Mish": _one(F.mish),
-    "Softplus": _one(F.softplus),
     "GlobalAveragePool": _one(lambda x: x.mean(tuple(range(2, x.dim())), keepdim=True)),
     "GlobalMaxPool": _one(lambda x: x.amax(tuple(range(2, x.dim())), keepdim=True)),
     "Elu": lambda x, /, *, alpha=1.0: F.elu(x, alpha),
@@ -212,14 +193,11 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "LogSoftmax": lambda x, /, *, axis=-1: x.log_softmax(axis),
     "Cast": lambda x, /, *, to, saturate=1: x.to(DTYPES[to]),
     # of two or more
-    "Add": _two(torch.add),
-    "Sub": _two(torch.sub),
-    "Mul": _two(torch.mul),
+    **{name: _two(getattr(torch, name.lower())) for name in ("Add", "Sub", "Mul", "MatMul")},
     "Div": _two(lambda a, b: a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")),
     "Mod": lambda a, b, /, *, fmod=0: torch.fmod(a, b) if fmod else torch.remainder(a, b),
     "Pow": _two(lambda x, y: torch.pow(x, y).to(x.dtype)),
     "PRelu": _two(lambda x, slope: torch.where(x < 0, slope * x, x)),
-    "MatMul": _two(torch.matmul),
     "Equal": _two(torch.eq),
     "Greater": _two(torch.gt),
     "GreaterOrEqual": _two(torch.ge),
@@ -228,12 +206,12 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "And": _two(torch.logical_and),
     "Or": _two(torch.logical_or),
     "Where": lambda condition, x, y, /: torch.where(condition, x, y),
-    "Clip": _clip,
+    "Clip": lambda x, low=None, high=None, /: x if low is None and high is None else torch.clamp(x, low, high),
     "Max": _several(torch.maximum),
     "Min": _several(torch.minimum),
     "Sum": _several(torch.add),
     "Gemm": _gemm,
-    "Einsum": _einsum,
+    "Einsum": lambda *tensors, equation: torch.einsum(equation, *tensors),
     # along axes
     "ReduceMean": _along(torch.mean),
     "ReduceSum": _along(torch.sum),
@@ -246,27 +224,31 @@ _TABLE: dict[str, Callable[..., Any]] = {
     "MaxPool": _max_pool,
     "AveragePool": _average_pool,
     "BatchNormalization": _batch_norm,
-    "LayerNormalization": _layer_norm,
+    "LayerNormalization": lambda x, scale, b=None, /, *, axis=-1, epsilon=1e-5, stash_type=1: F.layer_norm(
+        x, x.shape[axis:], scale, b, epsilon
+    ),
     "GroupNormalization": _group_norm,
-    "InstanceNormalization": _instance_norm,
+    "InstanceNormalization": lambda x, scale, b, /, *, epsilon=1e-5: F.instance_norm(
+        x, None, None, scale, b, eps=epsilon
+    ),
     "Dropout": _dropout,
     # shapes
     "Reshape": shapes.reshape,
-    "Flatten": shapes.flatten,
-    "Squeeze": shapes.squeeze,
+    "Flatten": lambda x, /, *, axis=1: x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:])),
+    "Squeeze": lambda x, /, axes=None: x.squeeze() if axes is None else x.squeeze(numbers(axes)),
     "Unsqueeze": shapes.unsqueeze,
-    "Transpose": shapes.transpose,
-    "Concat": shapes.concat,
+    "Transpose": lambda x, /, *, perm=None: x.permute(perm or list(reversed(range(x.dim())))),
+    "Concat": lambda *tensors, axis: torch.cat(tensors, axis),
     "Split": shapes.split,
     "Slice": shapes.cut,
     "Gather": shapes.gather,
     "ScatterND": shapes.scatter_nd,
-    "Expand": shapes.expand,
-    "Tile": shapes.tile,
+    "Expand": lambda x, /, shape: x.expand(torch.broadcast_shapes(x.shape, numbers(shape))),
+    "Tile": lambda x, /, repeats: x.tile(numbers(repeats)),
     "Pad": shapes.pad,
     "Resize": shapes.resize,
-    "Shape": shapes.shape,
+    "Shape": lambda x, /, *, start=0, end=None: torch.tensor(x.shape[start:end], dtype=torch.int64),
     "Range": shapes.counted,
-    "ConstantOfShape": shapes.constant_of_shape,
+    "ConstantOfShape": lambda shape, *, value=None: (torch.zeros(1) if value is None else value).expand(numbers(shape)),
 }
 OPERATORS = {name: Operator(name, compute) for name, compute in _TABLE.items()}

@@ -32,16 +32,6 @@ def reshape(x, /, shape, *, allowzero=0):
     return x.reshape([size if size or allowzero else x.shape[i] for i, size in enumerate(numbers(shape))])
 
 
-def flatten(x, /, *, axis=1):
-    """Two dimensions."""
-    return x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:]))
-
-
-def squeeze(x, /, axes=None):
-    """Without the dimensions of size 1, or without some."""
-    return x.squeeze() if axes is None else x.squeeze(numbers(axes))
-
-
 def unsqueeze(x, /, axes):
     """With dimensions of size 1, counted as they are afterwards."""
     places = numbers(axes)
@@ -50,16 +40,6 @@ def unsqueeze(x, /, axes):
     for place in sorted(axis % (x.dim() + len(places)) for axis in places):
         x = x.unsqueeze(place)
     return x
-
-
-def transpose(x, /, *, perm=None):
-    """The dimensions in another order, by default backward."""
-    return x.permute(perm or list(reversed(range(x.dim()))))
-
-
-def concat(*tensors, axis):
-    """One behind the other."""
-    return torch.cat(tensors, axis)
 
 
 def split(x, /, split=None, *, axis=0, num_outputs=None):
@@ -94,16 +74,6 @@ def scatter_nd(x, indices, updates, /, *, reduction="none"):
     return x.index_put(tuple(indices.unbind(-1)), updates)
 
 
-def expand(x, /, shape):
-    """Repeated along dimensions of size 1, in both directions."""
-    return x.expand(torch.broadcast_shapes(x.shape, numbers(shape)))
-
-
-def tile(x, /, repeats):
-    """Repeated."""
-    return x.tile(numbers(repeats))
-
-
 def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
     """More on all sides, or less where a number is negative."""
     pads, given = numbers(pads), numbers(axes) or range(x.dim())
@@ -118,16 +88,6 @@ def pad(x, /, pads, value=None, axes=None, *, mode="constant"):
 def in_torchs_order(sides: list[tuple[int, int]]) -> list[int]:
     """Paddings before and after of each dimension, the last dimension first."""
     return [pad for side in reversed(sides) for pad in side]
-
-
-def shape(x, /, *, start=0, end=None):
-    """The sizes, always on the CPU."""
-    return torch.tensor(x.shape[start:end], dtype=torch.int64)
-
-
-def constant_of_shape(shape, *, value=None):
-    """One value everywhere; takes no memory."""
-    return (torch.zeros(1) if value is None else value).expand(numbers(shape))
 
 
 def counted(start, limit, delta, *, device):

@@ -8,7 +8,6 @@ whether they compute the same.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
 from functools import reduce
 from typing import Any
 
@@ -39,7 +38,12 @@ def _program(network: torch.nn.Module, nodes: list[Node]) -> Program:
         if node.target is operator.getitem and type(arguments[1]) is list:
             raise TypeError("a list of places means another thing than a tuple")
         keywords = {name: _argument(argument, numbers) for name, argument in node.kwargs.items()}
-        return Step(_function(network, node), arguments, keywords, [numbers[node]], False, [])
+        target: Any = node.target
+        if node.op == "call_module":
+            target = network.get_submodule(target)
+        elif node.op == "call_method":
+            target = getattr(torch.Tensor, target)
+        return Step(target, arguments, keywords, [numbers[node]], False, [])
 
     steps, made = [step(node) for node in computed], _argument(output.args[0], numbers).number
     mark_spent(steps, {*range(len(weights) + 1), made})
@@ -59,10 +63,3 @@ def _argument(argument: Any, numbers: dict[Node, int]) -> Any:
     if named:
         raise TypeError("steps name values in lists only")
     return argument
-
-
-def _function(network: torch.nn.Module, node: Node) -> Callable[..., Any]:
-    target: Any = node.target
-    if node.op == "call_module":
-        return network.get_submodule(target)
-    return getattr(torch.Tensor, target) if node.op == "call_method" else target

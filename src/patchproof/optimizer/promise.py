@@ -180,7 +180,7 @@ def model_claims(
             rate=float(recognized.mean()),
             interval=spread_of(*in_sessions(recognized, per_session, places)).rate,
             confidence=float(confidence.mean()),
-            least_score=classifier.score_needed,
+            least_score=classifier.least_score,
         )
         for classifier, recognized, confidence in rows
     )
