@@ -125,7 +125,7 @@ def view(azimuth_deg=0.0, elevation_deg=0.0, distance_mm=500.0, roll_deg=0.0, si
     return plane_homography(intrinsics(fov_deg, size_px), look_at(eye, [0, 0, 0], roll_deg), world_from_page)
 
 
-def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, light=0.8, jpeg=None, seed=0, fine=2):
+def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, light=0.8, jpeg=None, seed=0, fine=3):
     """uint8 sRGB photo: `fine`² samples per pixel, Gaussian blur, light and noise in linear light, JPEG if asked."""
     width, height = size_px
     raster_from_px = np.diag([PX_PER_MM, PX_PER_MM, 1.0]) @ np.linalg.inv(px_from_mm)

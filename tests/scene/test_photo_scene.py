@@ -25,7 +25,7 @@ from patchproof.sheets.piece import lay_out_piece, sheet_id
 from patchproof.sheets.raster import piece_pixels
 
 SIZE = (800, 600)
-FINE = 2  # samples per pixel and axis
+FINE = 3  # samples per pixel and axis
 DPI = 254
 # azimuth, elevation, distance, roll, blur, exposure
 VIEWS = [

@@ -24,7 +24,7 @@ from pydantic import Field
 
 from patchproof.base.input import is_file, read_json
 from patchproof.base.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
-from patchproof.channel.cameras import Frame
+from patchproof.channel.frame import Frame
 
 if TYPE_CHECKING:
     from torch import Tensor

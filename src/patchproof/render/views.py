@@ -24,7 +24,7 @@ from torch import Tensor
 from patchproof.base.color import LIGHT_OF_CODE
 from patchproof.base.geometry import camera_centers
 from patchproof.channel.camera import encoded, encoded_by_table, gains
-from patchproof.channel.cameras import Frame
+from patchproof.channel.frame import Frame
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.render.fragments import Cameras
 from patchproof.render.outlines import Outlines, outlines

@@ -27,8 +27,8 @@ from patchproof.base import geometry
 from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
 from patchproof.base.strict import Refused
 from patchproof.channel.camera import develop
-from patchproof.channel.cameras import Frame
 from patchproof.channel.effects import Light, Print
+from patchproof.channel.frame import Frame
 from patchproof.channel.printer import vary
 from patchproof.mesh.mesh import Mesh
 from patchproof.render.photograph import PAPER_BACK_LINEAR
