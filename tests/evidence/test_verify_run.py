@@ -132,7 +132,8 @@ def test_another_print_than_promised_is_seen_as_far_as_no_affine_map_explains_it
     delta = ciede2000(*(lab_from_linear(linear_from_srgb(srgb)) for srgb in (promise, hanging)))
     assert delta.mean() == pytest.approx(differs, abs=0.2)
     manifests = [make_manifest(design=np.rint(srgb * 255).astype(np.uint8)) for srgb in (promise, hanging)]
-    srgb = photograph(page_raster(manifests[1], True), view(10, 5, 550, size_px=(800, 600)), (800, 600), 0.5, 0.003)
+    page, from_mm = page_raster(manifests[1], True), view(10, 5, 550, size_px=(800, 600))
+    srgb = photograph(page, from_mm, (800, 600), 0.5, 0.003, fine=4)
     color = measured(srgb, manifest=manifests[0]).entry.color
     assert color.color_fit == "affine12" and color.delta_e00_mean == pytest.approx(shown, abs=0.4)
 
