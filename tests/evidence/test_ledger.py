@@ -238,7 +238,7 @@ def test_no_ledger_where_none_was_asked_for(tmp_path):
 @pytest.mark.parametrize(("sigma", "tolerance"), [(0.5, 0.01), (3.0, 0.03)])
 def test_paper_and_ink_are_found_through_blur(sigma, tolerance):
     surface, homography = surface_of(sheet()), view(5, 5, 400, size_px=SIZE)
-    srgb = photograph(raster(False), homography, SIZE, blur_px=sigma, light=0.75, fine=4)
+    srgb = photograph(raster(False), homography, SIZE, blur_px=sigma, light=0.75, fine=2)
     on_piece = {i: surface.corners_mm[i] for i in surface.piece_ids}
     found = pattern_light(srgb, homography, on_piece, surface.dictionary, 0.9 * sigma)
     assert found.paper == pytest.approx(0.75, abs=tolerance + 0.02) and found.ink == pytest.approx(0, abs=tolerance)
