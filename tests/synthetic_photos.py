@@ -160,7 +160,7 @@ def save(srgb: np.ndarray, path: Path, focal_35mm: int | None = None) -> Path:
     return path
 
 
-def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=2, blur_px=0.6, seed=0):
+def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(1200, 900), fine=3, blur_px=0.6, seed=0):
     """uint8 sRGB photo of the piece rolled round an upright cylinder that touches the page's plane at the design's
     center: each ray of `fine`² per pixel is met with the cylinder, so nothing of the tool's own model is used.
     """
