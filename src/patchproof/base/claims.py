@@ -52,8 +52,10 @@ def difference(a: list[bool], b: list[bool]) -> Estimate | None:
 
 def student_mean(values: Sequence[float] | np.ndarray) -> Estimate:
     """The mean of two values or more with Student's interval."""
+    from scipy.stats import t
+
     n, value = len(values), statistics.fmean(values)
-    half = _student(n - 1) * (statistics.stdev(map(float, values)) / math.sqrt(n))
+    half = float(t.ppf(1 - _TAIL, n - 1)) * (statistics.stdev(map(float, values)) / math.sqrt(n))
     return Estimate(value, value - half, value + half, n)
 
 
@@ -122,14 +124,6 @@ def mcnemar_p(a: list[bool], b: list[bool]) -> float:
     return 1.0 if only_a + only_b == 0 else float(binomtest(only_a, only_a + only_b).pvalue)
 
 
-def _student(freedom: int) -> float:
-    from scipy.stats import t
-
-    return float(t.ppf(1 - _TAIL, freedom))
-
-
 @lru_cache(maxsize=8)
 def _z(confidence: float) -> float:
-    from statistics import NormalDist
-
-    return NormalDist().inv_cdf(0.5 + confidence / 2)
+    return statistics.NormalDist().inv_cdf(0.5 + confidence / 2)

@@ -75,7 +75,7 @@ def lab_from_linear(linear):
         t = (kr * r + kg * g + kb * b) / white
         cubic = _at_least(xp, t, (6 / 29) ** 3) ** (1 / 3)
         f.append(xp.where(t > (6 / 29) ** 3, cubic, t / (3 * (6 / 29) ** 2) + 4 / 29))
-    return _stack(xp, [116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+    return xp.stack([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])], -1)
 
 
 def ciede2000(lab_a, lab_b):
@@ -127,10 +127,6 @@ def _library(array: Any) -> Any:
 
 def _at_least(xp, array, floor: float):
     return np.maximum(array, floor) if xp is np else array.clamp_min(floor)
-
-
-def _stack(xp, parts):
-    return np.stack(parts, -1) if xp is np else xp.stack(parts, -1)
 
 
 LIGHT_OF_CODE = linear_from_srgb(np.arange(256) / 255)  # of 8-bit code values

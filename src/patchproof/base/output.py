@@ -32,7 +32,12 @@ def new_folder(out: str | Path, own: tuple[str, ...], overwrite: bool = False) -
     make_folder(part)
     try:
         yield part
-        _replace(part, out)
+        old = out.with_name(f".{out.name}.old")
+        shutil.rmtree(old, ignore_errors=True)
+        if out.is_dir():
+            out.rename(old)
+        part.rename(out)
+        shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
@@ -134,12 +139,3 @@ def image_pixels(content: bytes) -> np.ndarray:
 
     with Image.open(io.BytesIO(content)) as image:
         return np.asarray(image.convert("RGB"))
-
-
-def _replace(part: Path, out: Path) -> None:
-    old = out.with_name(f".{out.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if out.is_dir():
-        out.rename(old)
-    part.rename(out)
-    shutil.rmtree(old, ignore_errors=True)

@@ -129,12 +129,8 @@ def expand(text: str, base: Path) -> str:
     if match := NETWORK_FILE.fullmatch(text):
         return f"{match[1]}{base / match[2]}"  # an absolute path stays as it is
     prefix, colon, _ = text.partition(":")
-    if (colon and (prefix in {"primitive", "torchvision", "timm", "clip", "module", "python"})) or text in (
-        "builtin",
-        "builtin-detector",
-    ):
-        return text
-    return str(base / text)
+    by_prefix = colon and prefix in {"primitive", "torchvision", "timm", "clip", "module", "python"}
+    return text if by_prefix or text in ("builtin", "builtin-detector") else str(base / text)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -144,10 +140,9 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f'did you mean "{near[0]}"' if near else f"use one of: {', '.join(known)}"
 
 
-def listed(names: Sequence[str], most: int = 3) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+def listed(names: Sequence[str]) -> str:
+    """The first three names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def within(low: float, high: float) -> AfterValidator:
@@ -174,9 +169,8 @@ def _explain(model: type[BaseModel], error: ErrorDetails, where: str) -> Refused
     reason = reason[0].lower() + reason[1:]
     if not key:  # tables that do not go together
         return Refused(f"settings in {where} that go together", "others", reason)
-    return Refused(
-        f'a usable "{key}" in {where}', value, f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
-    )
+    do = f"{key} {reason}" if reason.startswith(("must", "takes")) else reason
+    return Refused(f'a usable "{key}" in {where}', value, do)
 
 
 def _keys_at(model: Any, location: tuple) -> Iterable[str]:

@@ -45,10 +45,12 @@ class WorkerDied(Refused):
 
 
 class Workers:
-    """An open executor with what it needs to start anew; `open_workers` makes and closes it."""
+    """An open executor with what it needs to start anew; `open_workers` makes and closes it. With `one_thread` each
+    task sets its thread's thread count, where others started the workers.
+    """
 
-    def __init__(self, start: Callable[[], Executor], in_flight: int):
-        self._start, self._in_flight = start, in_flight
+    def __init__(self, start: Callable[[], Executor], in_flight: int, one_thread: bool = False):
+        self._start, self._in_flight, self._one_thread = start, in_flight, one_thread
         self._executor = start()
 
     def completed(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[int, Future]]:
@@ -88,10 +90,8 @@ class Workers:
                 return
             finished = futures.wait(running, return_when=futures.FIRST_COMPLETED).done
             broken = any(map(_broke, finished))
-            if broken:
-                finished = futures.wait(
-                    running
-                ).done  # one dead process breaks the pool, and with it all that was in flight
+            if broken:  # one dead process breaks the pool, and with it all that was in flight
+                finished = futures.wait(running).done
             for future in finished:
                 numbered_item = running.pop(future)
                 if _broke(future):
@@ -115,8 +115,9 @@ class Workers:
         yield suspect[0], future
 
     def _submit(self, function, item) -> Future:
+        call = partial(_on_a_thread, function) if self._one_thread else function
         try:
-            return self._executor.submit(function, item)
+            return self._executor.submit(call, item)
         except BrokenExecutor as error:  # a process died while nobody waited
             future: Future = Future()
             future.set_exception(error)
@@ -132,14 +133,15 @@ def open_workers(jobs: int = 1, cluster: str | None = None, apart: bool = False)
     """
     if cluster is None:
         forks = can_fork() and not apart
-        workers = Workers(partial(_processes, jobs, forks), 2 * jobs) if jobs > 1 or apart else Workers(_Here, 1)
+        start = partial(_processes, jobs, forks)
+        workers = Workers(start, 2 * jobs, not forks) if jobs > 1 or apart else Workers(_Here, 1)
         with threads(1) if forks and jobs > 1 else nullcontext(), closing(workers):
             yield workers
         return
     if jobs > 1:
         raise Refused("--jobs or --cluster", "both", "leave one out: a cluster knows how many workers it has")
-    with _client(cluster) as client:
-        yield Workers(lambda: _OneThreadEach(client.get_executor(pure=False)), QUEUED)
+    with closing(_client(cluster)) as client:
+        yield Workers(partial(client.get_executor, pure=False), QUEUED, True)
 
 
 @contextmanager
@@ -223,30 +225,16 @@ class _Here(Executor):
         return future
 
 
-class _OneThreadEach(Executor):
-    """Another executor, each of whose tasks sets its thread's thread count: a cluster's workers are not ours."""
-
-    def __init__(self, executor: Executor):
-        self._executor = executor
-
-    def submit(self, fn, /, *args, **kwargs) -> Future:
-        return self._executor.submit(_on_a_thread, fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        self._executor.shutdown(wait=wait)
-
-
-def _on_a_thread(function, *args, **kwargs):
+def _on_a_thread(function, item):
     with threads(1):
-        return function(*args, **kwargs)
+        return function(item)
 
 
 def _processes(jobs: int, forks: bool, function: Callable[[Any], Any] | None = None) -> Executor:
     import multiprocessing
 
     context = multiprocessing.get_context("fork" if forks else "spawn")
-    executor = _Quietly(jobs, context, _begin, (os.getpid(), function))
-    return executor if forks else _OneThreadEach(executor)
+    return _Quietly(jobs, context, _begin, (os.getpid(), function))
 
 
 class _InTurn(Executor):
@@ -289,31 +277,26 @@ def _begin(parent: int, function: Callable[[Any], Any] | None) -> None:
     _function = function
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1)
-    os._exit(1)
-
-
-@contextmanager
-def _client(address: str) -> Iterator[Any]:
+def _client(address: str) -> Any:
     try:
         from distributed import Client
     except ImportError:
         raise Refused("dask.distributed for --cluster", "none", 'pip install "patchproof[cluster]"') from None
     try:
-        client = Client(address, timeout=_ANSWER_S, set_as_default=False)
+        return Client(address, timeout=_ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         do = "start dask scheduler there, or mend the address"
         raise Refused("a Dask scheduler, such as tcp://host:8786", f"{address} ({reason})", do) from error
-    try:
-        yield client
-    finally:
-        client.close()
 
 
 def _broke(future: Future) -> bool:

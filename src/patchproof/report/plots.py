@@ -109,16 +109,12 @@ def _draw(axes, x, y, promised_x, promised_y, label) -> None:
     axes.scatter(x, y + scatter, s=16, c=[_YES if hit else _NO for hit in y], alpha=0.75, linewidths=0)
     for points, hits, style in ((promised_x, promised_y, ":"), (x, y, "-")):
         if len(points) >= _LEAST_FOR_LINE:
-            axes.plot(*_running_share(points, hits), style, color=_INK, linewidth=1.3)
+            window = np.ones(max(5, len(points) // 4))
+            running = (np.convolve(values, window / len(window), "valid") for values in (points, hits))
+            axes.plot(*running, style, color=_INK, linewidth=1.3)
     axes.set_xlabel(label)
     axes.set_ylim(-0.15, 1.15)
     axes.set_yticks([0, 0.5, 1], ["not recognized", "50 %", "recognized"])
-
-
-def _running_share(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    width = max(5, len(x) // 4)
-    window = np.ones(width) / width
-    return np.convolve(x, window, "valid"), np.convolve(y, window, "valid")
 
 
 def _svg(draw: Callable[[Axes], None]) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
 from patchproof.base.goal import Goal
 from patchproof.base.input import opened_picture, read_json
@@ -216,41 +216,16 @@ class Promise(Strict):
         )
 
 
-class _Loose(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
-
-class _PrinterUsed(_Loose):
-    profile: str = "coated"
-
-
-class _CameraUsed(_Loose):
-    noise: NotNegativeRange = (0.0, 0.0)
-    photo_px: tuple[Count, Count] | None = None
-
-
-class _TargetUsed(_Loose):
-    label: str | int = ""
-    accept: tuple[str | int, ...] = ()
-
-
-class _SheetUsed(_Loose):
-    template: str = ""
-
-
-class _ImportedUsed(_Loose):
-    file: str
-    sha256: str
-
-
-class _Used(_Loose):
-    """What is read of a manifest's settings when its sheet is judged; other keys may say anything."""
-
-    printer: _PrinterUsed | None = None
-    camera: _CameraUsed = _CameraUsed()
-    target: _TargetUsed = _TargetUsed()
-    sheet: _SheetUsed = _SheetUsed()
-    imported: _ImportedUsed | None = None  # of a design that was made elsewhere
+_table: Any = create_model  # its types leave unions out
+# What is read of a manifest's settings when its sheet is judged; other keys may say anything.
+_Used = _table(
+    "_Used",
+    printer=(_table("_Printer", profile=(str, "")) | None, None),
+    camera=(_table("_Camera", noise=(NotNegativeRange, ()), photo_px=(tuple[Count, Count] | None, None)), None),
+    target=(_table("_Target", label=(str | int, ""), accept=(tuple[str | int, ...], ())), None),
+    sheet=(_table("_Sheet", template=(str, "")), None),
+    imported=(_table("_Imported", file=str, sha256=str) | None, None),  # a design that was made elsewhere
+)
 
 
 class Manifest(Strict):

@@ -92,23 +92,14 @@ def furnished(template: Template | BoardTemplate, page: PageLayout, qr_text: str
     """The page with the template's QR code, rulers and words, proved apart and within the margins."""
     side = template.qr.size_mm
     qr = qr_rects_mm(qr_text, template.qr.corner_mm, side)
-    quiet_mm = QR_QUIET * qr[0][3]
-    rulers = ruler_parts(template.ruler)
-    lines = tuple(_filled(line, words) for line in template.text)
+    square = quiet_box((*template.qr.corner_mm, side, side), QR_QUIET * qr[0][3], template.page_mm, template.margin_mm)
+    rulers, lines = ruler_parts(template.ruler), tuple(_filled(line, words) for line in template.text)
     page = replace(
         page,
         qr_mm=qr,
         ticks=(*rulers.lines, *page.ticks),
         texts=(*lines, *rulers.texts, *page.texts),
-        boxes=(
-            *page.boxes,
-            Box(
-                "QR code",
-                quiet_box((*template.qr.corner_mm, side, side), quiet_mm, template.page_mm, template.margin_mm),
-            ),
-            *rulers.boxes,
-            *map(text_box, lines),
-        ),
+        boxes=(*page.boxes, Box("QR code", square), *rulers.boxes, *map(text_box, lines)),
     )
     prove_apart(page.boxes, template.page_mm, template.margin_mm)
     return page
@@ -125,8 +116,12 @@ def qr_rects_mm(text: str, corner_mm: PointMm, size_mm: float) -> tuple[RectMm, 
 
 def place_pieces(template: Template, pieces: Sequence[Piece]) -> list[tuple[Piece, PointMm]]:
     """Pieces with their top-left corners: in rows as full as may be, in the middle of the template's zone."""
+    widest, highest = largest_piece_mm(template)
     for piece in pieces:
-        _refuse_larger(template, piece)
+        if piece.size_mm[0] > widest + 1e-6 or piece.size_mm[1] > highest + 1e-6:
+            most, tiled = size_text((widest, highest)), ", ".join(template_names("tiles"))
+            do = f"choose a larger template, one with tiles ({tiled}), or a smaller patch"
+            raise Refused(f"a piece of at most {most} mm on this page", f"{size_text(piece.size_mm)} mm", do)
     x, y, w, h = piece_zone_mm(template)
     rows: list[list[Piece]] = []
     for piece in pieces:
@@ -150,17 +145,6 @@ def place_pieces(template: Template, pieces: Sequence[Piece]) -> list[tuple[Piec
             left += piece.size_mm[0] + BETWEEN_MM
         top += height + BETWEEN_MM
     return placed
-
-
-def _refuse_larger(template: Template, piece: Piece) -> None:
-    widest, highest = largest_piece_mm(template)
-    if piece.size_mm[0] > widest + 1e-6 or piece.size_mm[1] > highest + 1e-6:
-        tiled = template_names("tiles")
-        raise Refused(
-            f"a piece of at most {size_text((widest, highest))} mm on this page",
-            f"{size_text(piece.size_mm)} mm",
-            f"choose a larger template, one with tiles ({', '.join(tiled)}), or a smaller patch",
-        )
 
 
 def piece_name(number: int) -> str:

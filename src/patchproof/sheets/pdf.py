@@ -46,11 +46,6 @@ class Printed:
     windowed: tuple[tuple[RectMm, np.ndarray], ...] = ()
 
 
-def pages_pdf(pages: Sequence[Printed], title: str, attachments: dict[str, str]) -> bytes:
-    """The finished PDF of pages of any sizes, with manifests attached by their names."""
-    return _finished(_drawn(pages, title), attachments)
-
-
 def srgb_profile() -> bytes:
     """An ICC profile of sRGB without the day it was made."""
     from PIL import ImageCms
@@ -139,12 +134,14 @@ def _fill(canvas: Canvas, rects: Any, srgb: Srgb, height: float) -> None:
     canvas.drawPath(path, stroke=0, fill=1)
 
 
-def _finished(drawn: bytes, attachments: dict[str, str]) -> bytes:
-    """Color spaces, attachments and plain metadata, which reportlab cannot write."""
+def pages_pdf(pages: Sequence[Printed], title: str, attachments: dict[str, str]) -> bytes:
+    """The finished PDF of pages of any sizes, with manifests attached by their names; color spaces, attachments and
+    plain metadata are what reportlab cannot write.
+    """
     import pikepdf
     from pikepdf import Array, Name
 
-    with pikepdf.open(io.BytesIO(drawn)) as pdf:
+    with pikepdf.open(io.BytesIO(_drawn(pages, title))) as pdf:
         icc = pdf.make_stream(srgb_profile(), N=3, Alternate=Name.DeviceRGB)
         space = pdf.make_indirect(Array([Name.ICCBased, icc]))
         for page in pdf.pages:

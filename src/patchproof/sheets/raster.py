@@ -15,8 +15,7 @@ import math
 import os
 import threading
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ import numpy as np
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import LARGEST_JSON, OutOfTime, Result, is_file, left_behind, within_time
 from patchproof.base.strict import Refused, validated
-from patchproof.sheets.manifest import Manifest, Tile
+from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
 
 LARGEST_PX = 20_000  # along a side,
@@ -65,7 +64,7 @@ def piece_pixels(pdf_path: str | Path, manifest: Manifest, dpi: float) -> np.nda
     pixels = np.full((height, width, 3), 255, np.uint8)
     px_per_mm = np.array([width, height]) / manifest.cut_mm[2:]
     for tile in manifest.tiles:
-        start_mm = _piece_from_page(tile, tile.cut_mm[:2])
+        start_mm = np.array(tile.cut_mm[:2]) - np.array(tile.page_from_design_mm)[:, 2]  # in piece millimeters
         # whole pixels that begin on the tile; its picture runs on far enough on its flaps to fill the last one
         first = np.ceil(start_mm * px_per_mm - 1e-6).astype(int)
         last = np.ceil((start_mm + tile.cut_mm[2:]) * px_per_mm - 1e-6).astype(int).clip(max=[width, height])
@@ -81,11 +80,6 @@ def _part_pixels(pdf_path: str | Path, number: int, rect_mm: tuple, size_px: tup
     return _of_page(pdf_path, number, lambda page: _render(page, rect_points, size_px))
 
 
-def _piece_from_page(tile: Tile, point_mm: tuple[float, float]) -> np.ndarray:
-    """A point of a tile's page in piece millimeters."""
-    return np.array(point_mm) - np.array(tile.page_from_design_mm)[:, 2]
-
-
 def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Manifest:
     """The manifest inside a sheet's PDF; of several designs' page that of `sheet_id`, else the first."""
     import pikepdf
@@ -96,7 +90,7 @@ def attached_manifest(pdf_path: str | Path, sheet_id: str | None = None) -> Mani
             names = sorted(set(pdf.attachments) & {ATTACHMENT, *(numbered(ATTACHMENT, i) for i in range(99))})
             texts = [json.loads(_unpacked(pdf.attachments[name].get_file().obj)) for name in names]
     except pikepdf.PdfError as error:
-        raise Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again") from error
+        raise _unreadable(pdf_path) from error
     except Exception as error:  # objects of other kinds than they should be fail in many ways
         raise Refused(f"a PDF with {ATTACHMENT} attached", f"{pdf_path} without", "make the sheet again") from error
     if not texts:
@@ -120,36 +114,28 @@ def _existing(pdf_path: str | Path) -> None:
         raise Refused("a PDF of a sheet", f"no file at {pdf_path}", "check the path")
 
 
-@contextmanager
-def _opened(pdf_path: str | Path) -> Iterator[Any]:
-    """PDFium's handle of a file. Its own calls alone: the package's objects are closed at the end of the process, which
-    a page that is still being drawn does not survive.
-    """
-    import pypdfium2.raw as pdfium
-
-    _existing(pdf_path)
-    pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
-    if not pdf:
-        raise _unreadable(pdf_path)
-    try:
-        yield pdf
-    finally:
-        pdfium.FPDF_CloseDocument(pdf)
-
-
 def _unreadable(pdf_path: str | Path) -> Refused:
     return Refused("a PDF of a sheet", f"{pdf_path}, which cannot be read", "make the sheet again")
 
 
 def _within_time(pdf_path: str | Path, work: Callable[[Any], Result]) -> Result:
-    """What `work` makes of an open PDF; refused where that takes too long: a few lines may draw forms in forms a
-    million times.
+    """What `work` makes of PDFium's handle of a file; refused where that takes too long: a few lines may draw forms in
+    forms a million times. PDFium's own calls alone: the package's objects are closed at the end of the process, which a
+    page that is still being drawn does not survive.
     """
+    import pypdfium2.raw as pdfium
 
     def done() -> Result:
-        with _AT_WORK, _opened(pdf_path) as pdf:
-            return work(pdf)
+        with _AT_WORK:
+            pdf = pdfium.FPDF_LoadDocument(os.fsencode(pdf_path), None)
+            if not pdf:
+                raise _unreadable(pdf_path)
+            try:
+                return work(pdf)
+            finally:
+                pdfium.FPDF_CloseDocument(pdf)
 
+    _existing(pdf_path)
     try:
         return within_time(left_behind, done)
     except OutOfTime as over:
