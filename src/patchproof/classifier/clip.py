@@ -51,9 +51,8 @@ def load_clip(name: str) -> Classifier:
         raise Refused("a model of open_clip", f'"{known}"', do)
     card = read_card(path.with_suffix(".json"))
     if path.suffix == ".json":
-        network = downloaded(
-            f"clip:{model}", lambda: open_clip.create_model(known, published or None, require_pretrained=True)
-        )
+        options = {"pretrained": published or None, "require_pretrained": True}
+        network = downloaded(f"clip:{model}", lambda: open_clip.create_model(known, **options))
     else:
         network = open_clip.create_model(known)
         put_into(network, own_weights(path), f"clip:{known}", "check the model's name")

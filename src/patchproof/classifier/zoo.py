@@ -101,10 +101,8 @@ def load_timm(name: str) -> Classifier:
     else:
         network = timm.create_model(name, **({"num_classes": len(own.card[1])} if own.card else {}))
     view = timm.data.resolve_model_data_config(network)
-    side_px, labels = (own and own.card and own.card[:2]) or (
-        int(view["input_size"][-1]),
-        _timm_labels(timm, network, name),
-    )
+    own_card = own and own.card and own.card[:2]
+    side_px, labels = own_card or (int(view["input_size"][-1]), _timm_labels(timm, network, name))
     return _with(own, network, view["mean"], view["std"], side_px, labels, f"timm:{name}")
 
 
@@ -150,9 +148,8 @@ def own_weights(path: Path) -> Own:
     try:
         tensors = load(stored)
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise Refused(
-            "weights in safetensors", f"{path} that cannot be read ({first_line(error)})", "save it again"
-        ) from error
+        got = f"{path} that cannot be read ({first_line(error)})"
+        raise Refused("weights in safetensors", got, "save it again") from error
     card = path.with_suffix(".json")
     return Own(path, tensors, hashlib.sha256(stored).hexdigest(), read_card(card) if is_file(card) else None)
 
@@ -212,12 +209,10 @@ def library(name: str, kind: str, extra: str = "models") -> Any:
     try:
         return importlib.import_module(name)
     except Exception as error:  # a build for another torch raises RuntimeError, not ImportError
-        missing = isinstance(error, ModuleNotFoundError) and error.name == name
-        got = "none" if missing else f"one that cannot be imported ({error})"
+        got = f"one that cannot be imported ({error})"
         # a CPU torch with the registry's torchvision, built for CUDA: "torchvision::nms does not exist"
         do = "remove torchvision and install it from where torch is from: PyTorch's CPU index has CPU builds of both"
-        if missing:
-            do = (
-                f'run pip install "patchproof[{extra}]", beside a CPU torch after torchvision from PyTorch\'s CPU index'
-            )
+        if isinstance(error, ModuleNotFoundError) and error.name == name:
+            beside = "beside a CPU torch after torchvision from PyTorch's CPU index"
+            got, do = "none", f'run pip install "patchproof[{extra}]", {beside}'
         raise Refused(f"the library {name} for {kind}:NAME", got, do) from error

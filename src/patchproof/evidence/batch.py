@@ -27,7 +27,6 @@ from patchproof.evidence.boxes import in_square
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.classify import Box, Judges, square_of, squares_of
 from patchproof.evidence.journal import Journal, file_sha256
-from patchproof.evidence.ledger import usable
 from patchproof.evidence.measure import MeasuredPhoto, measure
 from patchproof.evidence.reproject import Shot, shot_of
 from patchproof.evidence.results import PhotoEntry, Remark
@@ -37,13 +36,15 @@ from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.exif import of_a_camera
 from patchproof.photo.limits import limited
 from patchproof.photo.quality import FrameLight, shows_nothing
-from patchproof.photo.read import Photo, read_photo
+from patchproof.photo.read import read_photo
 
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
 _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY = "it shows one tone or noise and nothing else: take it again"
+# codes of photographs whose homography can still be believed
+_BELIEVED = (None, "clipped", "blurred", "too_small", "cropped")
 _PART = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 
 # linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
@@ -147,7 +148,7 @@ def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> Measu
 
 def _measured(task: Task, item: Item) -> MeasuredPhoto:
     try:
-        return limited(_measured_in_box, task, item)
+        return limited(_measure, task, item)
     except CannotJudge as cannot:
         return _rejected(item, Remark.of(cannot))
     except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
@@ -156,36 +157,25 @@ def _measured(task: Task, item: Item) -> MeasuredPhoto:
         return _rejected(item, Remark(code="unreadable", advice=advice))
 
 
-def _measured_in_box(task: Task, item: Item) -> MeasuredPhoto:
+def _measure(task: Task, item: Item) -> MeasuredPhoto:
     photo = read_photo(item.path)
-    measured = _measure(task, item, photo)
-    if item.box_px is None:
-        return measured
-    return replace(measured, entry=measured.entry.changed(box=in_square(item.box_px, photo.srgb.shape[1::-1])))
-
-
-def _measure(task: Task, item: Item, photo: Photo) -> MeasuredPhoto:
-    squares = squares_of(photo.srgb, task.sizes_px)
+    squares, size_px = squares_of(photo.srgb, task.sizes_px), photo.srgb.shape[1::-1]
+    box = None if item.box_px is None else in_square(item.box_px, size_px)
     if item.control is not None:
         if shows_nothing(square_of(photo.srgb)[0]):
             return _rejected(item, Remark(code="empty", advice=_EMPTY))
-        return MeasuredPhoto(PhotoEntry(file=item.file, status="judged"), True, squares=squares)
+        return MeasuredPhoto(PhotoEntry(file=item.file, status="judged", box=box), True, squares=squares)
     view = view_of(photo, task.camera)
     wanted = task.scan_dpi, item.with_pictures
     measured = measure(view, item.file, task.surface, task.promised, task.ranges, *wanted)
-    if measured.counted and measured.entry.code is None and _is_part(photo, task):
-        measured = replace(measured, entry=measured.entry.changed(remark=Remark(code="cropped", advice=_PART)))
-    if not item.with_pictures:
-        return replace(measured, pictures={}, squares=squares)
-    geometry = measured.entry.geometry
-    small = _thumbnail(view.srgb, geometry and geometry.homography_px_from_mm, task.surface)
-    return replace(measured, pictures={"photo": small, **measured.pictures}, squares=squares)
-
-
-def _is_part(photo: Photo, task: Task) -> bool:
-    """Whether it is a crop or a screenshot: EXIF or its name says so, or cameras and the promise have other shapes."""
-    height, width = photo.srgb.shape[:2]
-    return photo.part or not of_a_camera((width, height), task.photo_px)
+    entry, pictures = measured.entry, {}
+    # a crop or a screenshot: EXIF or its name says so, or cameras and the promise have other shapes
+    if measured.counted and entry.code is None and (photo.part or not of_a_camera(size_px, task.photo_px)):
+        entry = entry.changed(remark=Remark(code="cropped", advice=_PART))
+    if item.with_pictures:
+        px_from_mm = entry.geometry and entry.geometry.homography_px_from_mm
+        pictures = {"photo": _thumbnail(view.srgb, px_from_mm, task.surface), **measured.pictures}
+    return replace(measured, entry=entry.changed(box=box or entry.box), pictures=pictures, squares=squares)
 
 
 def _thumbnail(srgb: np.ndarray, px_from_mm: ArrayLike | None, surface: Surface) -> np.ndarray:
@@ -216,7 +206,7 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
     """
     path, measured = item
     entry, geometry, light = measured.entry, measured.entry.geometry, measured.light
-    believed = measured.counted and usable(entry.status, entry.code)
+    believed = measured.counted and entry.code in _BELIEVED
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px

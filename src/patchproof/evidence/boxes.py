@@ -60,7 +60,8 @@ def given_boxes(path: str | Path, label: str) -> dict[str, Box]:
         if image_id not in names or count > 1:
             found = f"{count} in {names[image_id]}" if image_id in names else f"one of the unknown image {image_id}"
             raise Refused(f"one box of each photograph in {path}", found, "draw one round the whole object")
-    boxes = {names[each.image_id]: _corners(each.bbox) for each in drawn}
+    corners = {each.image_id: (left, top, left + w, top + h) for each in drawn for left, top, w, h in [each.bbox]}
+    boxes = {names[image_id]: box for image_id, box in corners.items()}
     last = {name: PurePosixPath(name).name for name in boxes}
     alone = Counter(last.values())
     return {last[name]: box for name, box in boxes.items() if alone[last[name]] == 1} | boxes
@@ -88,8 +89,3 @@ def from_square(box: Box, size_px: tuple[int, int]) -> np.ndarray:
     (width, height), side = size_px, min(size_px)
     x0, y0, x1, y1 = box
     return side * rect_corners((x0, y0, x1 - x0, y1 - y0)) + ((width - side) / 2, (height - side) / 2)
-
-
-def _corners(bbox: tuple[float, float, float, float]) -> Box:
-    left, top, width, height = bbox
-    return left, top, left + width, top + height

@@ -51,11 +51,8 @@ def judges_of(models: Sequence[Classifier], manifest: Manifest) -> Judges | None
         raise Refused(f"the promise's own network {promised.name}", ", ".join(named) or "none", f"add {promised.name}")
     primary = named[promised.name]
     if promised.sha256 not in (None, primary.sha256):
-        raise Refused(
-            f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)",
-            "another file under that name",
-            "use the same weights, or make the sheet again",
-        )
+        expected = f"the network {promised.name} that the promise was made for (SHA-256 {promised.sha256[:12]}...)"
+        raise Refused(expected, "another file under that name", "use the same weights, or make the sheet again")
     indices = {model.name: target_indices(model, manifest.promise, manifest.settings) for model in models}
     return Judges(models, indices, primary)
 

@@ -59,7 +59,11 @@ def estimate_effect(
     }
     own = [recognized[shot.file] for shot in shots]
     agree = float(np.mean([a == b for a, b in zip(own, answers["design"], strict=True)]))
-    controls = (_beside(kind, own, answers[kind]) for kind in KINDS) if agree >= LEAST_AGREEING else ()
+    controls = []
+    for kind in KINDS if agree >= LEAST_AGREEING else ():
+        difference, ends = paired_difference(own, answers[kind])
+        rate = float(np.mean(answers[kind]))
+        controls.append(EstimatedControl(name=kind, rate=rate, difference=difference, difference_interval=ends))
     return Estimated(photos=len(own), agree=agree, controls=tuple(controls))
 
 
@@ -69,10 +73,3 @@ def _recognized(shot: Shot, look: np.ndarray, surface: Surface, light: ColorFit,
     model = judges.primary
     square = squares_of(codes, [model.input_px])[model.input_px]
     return predict(model, judges.indices[model.name], square, shot.box).recognized
-
-
-def _beside(kind: str, own: list[bool], control: list[bool]) -> EstimatedControl:
-    difference, interval = paired_difference(own, control)
-    return EstimatedControl(
-        name=kind, rate=float(np.mean(control)), difference=difference, difference_interval=interval
-    )

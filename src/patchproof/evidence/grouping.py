@@ -62,12 +62,11 @@ def _by_time(paths: Sequence[Path]) -> Grouping:
         return Grouping(tuple(paths), (0,) * len(paths), ("",), GUESS)
     session, names, last = [0] * len(paths), [], {}
     for (when, camera), number in sorted(zip(taken, range(len(paths)), strict=True)):
-        before = last.get(camera)
-        if before is None or (when - before[0]).total_seconds() > 60 * PAUSE_MINUTES:
-            before = when, len(names)
+        before, own = last.get(camera, (None, len(names)))
+        if before is None or (when - before).total_seconds() > 60 * PAUSE_MINUTES:
+            own = len(names)
             names.append(f"{when:%Y-%m-%d %H:%M} {camera}".strip())
-        session[number] = before[1]
-        last[camera] = when, before[1]
+        session[number], last[camera] = own, (when, own)
     return Grouping(tuple(paths), tuple(session), tuple(names), TIMES)
 
 
@@ -84,8 +83,6 @@ def _labels(path: Path) -> tuple[str, str]:
     """EXIF's time and camera."""
     from PIL import Image
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with Image.open(path, formats=readable_formats()) as image:
-            exif = image.getexif()
-            return str(exif.get_ifd(_EXIF_IFD).get(_TAKEN)), str(exif.get(_MODEL) or "")
+    with warnings.catch_warnings(action="ignore"), Image.open(path, formats=readable_formats()) as image:
+        exif = image.getexif()
+        return str(exif.get_ifd(_EXIF_IFD).get(_TAKEN)), str(exif.get(_MODEL) or "")

@@ -25,7 +25,6 @@ from patchproof.base.version import __version__
 from patchproof.photo.limits import MOST_BYTES
 
 if TYPE_CHECKING:
-    from patchproof.channel.printer import Printer
     from patchproof.evidence.task import Options
     from patchproof.sheets.manifest import Manifest
 
@@ -68,11 +67,14 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
     A network without a SHA-256 of its own (the user's code) is known by its name alone.
     """
+    printer, digest = options.printer, hashlib.sha256(repr(options.printer.paper).encode())
+    for table in (printer.lut, printer.gamut):
+        digest.update(table.detach().cpu().contiguous().numpy().tobytes())
     settings = {
         "versions": (__version__, cv2.__version__, np.__version__),
         "manifest": manifest.model_dump(mode="json"),
         "models": [(model.name, model.sha256, model.input_px) for model in options.models],
-        "printer": _printer_sha256(options.printer),
+        "printer": digest.hexdigest(),
         "scan_dpi": options.scan_dpi,
         "camera": options.camera and options.camera.model_dump(mode="json"),
         "boxes": dict(options.boxes),
@@ -82,23 +84,13 @@ def settings_key(manifest: Manifest, options: Options) -> str:
 
 def file_sha256(path: Path) -> str | None:
     """SHA-256 of a file's bytes; None where it cannot be read, or is too large to be read as a photograph."""
-    digest = hashlib.sha256()
     try:
-        if path.stat().st_size > MOST_BYTES:
-            return None
-        with open(path, "rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
+        if path.stat().st_size <= MOST_BYTES:
+            with open(path, "rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
-        return None
-    return digest.hexdigest()
-
-
-def _printer_sha256(printer: Printer) -> str:
-    digest = hashlib.sha256(repr(printer.paper).encode())
-    for table in (printer.lut, printer.gamut):
-        digest.update(table.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+        pass
+    return None
 
 
 def _lines(path: Path) -> Iterator[_Line]:

@@ -44,18 +44,6 @@ PRINT_AND_LIGHT = "print_light_and_camera"
 LEAST_PHOTOS = LEAST_CLUSTERS
 LEAST_SHARE = 0.05  # a culprit costs at least as much
 _RESAMPLES = 2000
-_USABLE = (
-    None,
-    "clipped",
-    "blurred",
-    "too_small",
-    "cropped",
-)  # codes of photographs whose homography can still be believed
-
-
-def usable(status: str, code: str | None) -> bool:
-    """Whether the ledger can work with a photograph of that status and code."""
-    return status in ("judged", "measured") and code in _USABLE
 
 
 def ledger_of(
@@ -102,8 +90,7 @@ def _ledger(steps: Sequence[str], values: Sequence[Values], photo: np.ndarray, s
     """The ledger of `values` by photograph, whose own confidences are `photo` (n)."""
     parts = np.array([[*shapley(v), v[(True,) * len(steps)] - own] for v, own in zip(values, photo, strict=True)])
     parts, names = sign * parts, (*steps, PHOTO)
-    means, resampled = parts.mean(0), None
-    intervals = [None] * len(names)
+    means, resampled, intervals = parts.mean(0), None, [None] * len(names)
     if len(parts) >= LEAST_PHOTOS:
         resampled = resampled_means(parts, _RESAMPLES)
         intervals = np.quantile(resampled, (0.025, 0.975), axis=0).T.tolist()

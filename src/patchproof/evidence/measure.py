@@ -156,9 +156,8 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface
 
 def _page_in_view(detected: MarkersInView, surface: Surface) -> Surface:
     """The page that most of the markers belong to which an assembled piece hides; the whole where there is none."""
-    hidden = [
-        len(detected.markers.keys() & page.corners_mm.keys() - surface.corners_mm.keys()) for page in surface.pages
-    ]
+    outside = detected.markers.keys() - surface.corners_mm.keys()
+    hidden = [len(outside & page.corners_mm.keys()) for page in surface.pages]
     return surface.pages[int(np.argmax(hidden))] if any(hidden) else surface
 
 

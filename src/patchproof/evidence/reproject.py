@@ -187,20 +187,16 @@ def squares_with(
     out = {}
     for switches, look in looks.items():
         sharp = _layer(look, shot.px_from_mm, rect_mm, box)
-        for blur, sigma in ((True, shot.blur_px), (False, reference.blur_px)):
+        for blur, sigma, noise in ((True, shot.blur_px, None), (False, reference.blur_px, reference.noise)):
             layer = _blurred(sharp, sigma)
             for light, matrix in lit.items():
-                behind = around[light, blur][box]
-                noise = None if blur else reference.noise
-                picture = coded[light, blur].copy()
-                picture[box] = srgb_from_linear(_covered(layer, matrix, behind, shot.noise, noise))
-                out[(*switches, light, blur)] = picture
+                covered = _covered(layer, matrix, around[light, blur][box], shot.noise, noise)
+                picture = out[(*switches, light, blur)] = coded[light, blur].copy()
+                picture[box] = srgb_from_linear(covered)
     return out
 
 
-def square_with(
-    shot: Shot, look: np.ndarray, rect_mm: tuple[float, float, float, float], light: ColorFit
-) -> np.ndarray:
+def square_with(shot: Shot, look: np.ndarray, rect_mm: Rect, light: ColorFit) -> np.ndarray:
     """The float32 sRGB square W×W×3 with a piece of this look (as in `squares_with`) under the photograph's own light
     and blur, which the inverse of `light` and `shot` know.
     """

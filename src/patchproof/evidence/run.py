@@ -32,7 +32,7 @@ from patchproof.evidence.grouping import Grouping, group
 from patchproof.evidence.journal import Journal, settings_key
 from patchproof.evidence.ledger import ledger_of
 from patchproof.evidence.measure import MeasuredPhoto
-from patchproof.evidence.ranges import matched_rate
+from patchproof.evidence.ranges import matched_rate, promised_side_px
 from patchproof.evidence.reproject import Shot
 from patchproof.evidence.results import Ledger, ModelRate, PhotoEntry, Report, Scale, SessionCount, Summary
 from patchproof.evidence.task import Options, task_of
@@ -64,8 +64,9 @@ def gather_evidence(
     photograph that is (of the first `batch.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where
     it was measured); `progress` is called with (done, all).
     """
-    grouping = group(photos, None if options.controls is None else Path(options.controls))
-    paths, control_paths = grouping.paths, _list_controls(options.controls)
+    apart = None if options.controls is None else Path(options.controls)
+    grouping, control_paths = group(photos, apart), _list_controls(apart)
+    paths = grouping.paths
     judges = judges_of(options.models, manifest)
     task = task_of(manifest, options, judges)
     items = [Item(path, grouping.file(i), with_pictures=i < WITH_PICTURES) for i, path in enumerate(paths)]
@@ -94,7 +95,8 @@ def gather_evidence(
             if forecast is not None:
                 own = [with_forecast(again, forecast, path, photo) for path, photo in zip(paths, own, strict=True)]
     shown: dict[str, dict[str, PhotoEntry]] = {}
-    left_out = _left_out(photos, options.controls)
+    left_out = not_looked_at(Path(photos), apart and apart.resolve())
+    left_out += [f"{printable(apart.name)}: {sentence}" for sentence in not_looked_at(apart)] if apart else []
     for item, result in zip(items, results, strict=True):
         if item.control is not None:
             name, entry, others = item.control, result.entry, shown.setdefault(item.control, {})
@@ -104,17 +106,8 @@ def gather_evidence(
             elif entry.status == "rejected" and entry.remark is not None:
                 left_out.append(f"{name}/{entry.file} does not count: {entry.remark.advice}")
     controls = {name: list(entries.values()) for name, entries in shown.items()}
-    report = report_of(manifest, judges, own, grouping, controls, ledger, options.ruler_mm, task.ranges.side_px)
+    report = report_of(manifest, judges, own, grouping, controls, ledger, options.ruler_mm)
     return report.changed(summary=report.summary.changed(estimated=estimated, left_out=tuple(left_out)))
-
-
-def _left_out(photos: str | Path, controls: str | Path | None) -> list[str]:
-    """What lies beside photographs and controls and is not looked at."""
-    if controls is None:
-        return not_looked_at(Path(photos), None)
-    apart = Path(controls)
-    of_controls = [f"{printable(apart.name)}: {sentence}" for sentence in not_looked_at(apart)]
-    return not_looked_at(Path(photos), apart.resolve()) + of_controls
 
 
 def with_forecast(
@@ -129,11 +122,10 @@ def with_forecast(
     return replace(photo, entry=photo.entry.changed(forecast=chance))
 
 
-def _list_controls(folder: str | Path | None) -> dict[str, list[Path]]:
+def _list_controls(folder: Path | None) -> dict[str, list[Path]]:
     """Photographs by control: the folder's own pictures, or one control for each folder in it."""
     if folder is None:
         return {}
-    folder = Path(folder)
     if not is_folder(folder):
         raise Refused("a folder of control photographs", f"no folder at {folder}", "check the path")
     if own := pictures_in(folder):
@@ -153,13 +145,11 @@ def report_of(
     controls: Mapping[str, Sequence[PhotoEntry]],
     ledger: Ledger | None = None,
     ruler_mm: tuple[float, float] | None = None,
-    side_px: float | None = None,
 ) -> Report:
     """All photographs together; where the promise's network judges, its verdict and the controls' effect."""
     entries, counted = [photo.entry for photo in photos], [photo.entry for photo in photos if photo.counted]
     verdict, matched = Verdict("cannot_tell", None, "The sheet promises nothing."), None
-    compared, rates, rate, interval, sessions, forecast = [], {}, _rate({}), None, (), None
-    do, worth = "", None
+    compared, rates, rate, interval, sessions, forecast, do, worth = [], {}, _rate({}), None, (), None, "", None
     if judges and manifest.promise:
         promise, primary = manifest.promise, judges.primary.name
         rates = {model.name: _rate(_recognized(counted, model.name)) for model in judges.models}
@@ -173,7 +163,7 @@ def report_of(
             spread = promise.spread
             interval = spread.least_rate(*counts, TAIL), spread.most_rate(*counts, TAIL)
         measured = (entry for entry in counted if entry.status == "measured")
-        matched = matched_rate(measured, promise.conditions, side_px)
+        matched = matched_rate(measured, promise.conditions, promised_side_px(manifest))
         expected = [entry for entry in counted if entry.forecast is not None and entry.file in recognized]
         if expected:
             chances = [entry.forecast for entry in expected if entry.forecast is not None]
@@ -221,10 +211,8 @@ def _sessions(
     for number, photo in zip(grouping.session, photos, strict=True):
         if photo.counted and photo.entry.file in recognized:
             hits[number].append(recognized[photo.entry.file])
-    return tuple(
-        SessionCount(name=name, recognized=sum(own), judged=len(own))
-        for name, own in zip(grouping.names, hits, strict=True)
-    )
+    named = zip(grouping.names, hits, strict=True)
+    return tuple(SessionCount(name=name, recognized=sum(own), judged=len(own)) for name, own in named)
 
 
 def _recognized(entries: Iterable[PhotoEntry], network: str) -> dict[str, bool]:

@@ -43,7 +43,7 @@ class Surface:
     page_mm: tuple[float, float] | None  # None where the code lies on another page than the design
     pages: tuple[Surface, ...] = ()  # of a piece in tiles: each uncut page, which carries no piece ids
     bent: bool = False  # whether the piece was made to follow a curved surface
-    outermost_mm: np.ndarray | None = None  # the object's outermost points P×3, where networks look for its box
+    outermost_mm: np.ndarray | None = None  # the object's outermost points P×3, for its box; z into the paper
     fov_deg: float = 45.0  # of the promised photographs, for those whose focal length is not known
 
     @property
@@ -95,7 +95,8 @@ def _assembled(manifest: Manifest) -> Surface:
     for number, cut in cuts.items():
         carried = {i: _carry(to_page[number], c) for i, c in corners.get(number, {}).items()}
         piece |= {i: carried[i] for i, c in corners.get(number, {}).items() if _inside(cut, c)}
-        pages.append(_surface(manifest, carried, frozenset(), _carry_rect(to_page[number], cut)))
+        (x0, y0), _, (x1, y1), _ = _carry(to_page[number], rect_corners(cut)).tolist()
+        pages.append(_surface(manifest, carried, frozenset(), (x0, y0, x1 - x0, y1 - y0)))
     for number in sorted(corners.keys() - cuts.keys()):  # the page with the chart
         points = np.concatenate(list(corners[number].values()))
         x, y, w, h = (float(v) for v in (*points.min(0), *np.ptp(points, axis=0)))
@@ -104,6 +105,7 @@ def _assembled(manifest: Manifest) -> Surface:
 
 
 def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surface:
+    (left, top, *_), outermost = manifest.cut_mm, manifest.promise and manifest.promise.outermost_mm
     return Surface(
         dictionary=manifest.markers[0].dictionary,
         corners_mm=corners,
@@ -113,17 +115,9 @@ def _surface(manifest: Manifest, corners, piece_ids, rect_mm, pages=()) -> Surfa
         page_mm=None if manifest.tiles else manifest.page_mm,
         pages=pages,
         bent=(manifest.settings.get("patch") or {}).get("bend") is True,
-        outermost_mm=_outermost_mm(manifest),
+        outermost_mm=np.array(outermost) + np.array([left, top, 0]) if outermost else None,
         fov_deg=(manifest.settings.get("view") or {}).get("fov_deg", 45.0),
     )
-
-
-def _outermost_mm(manifest: Manifest) -> np.ndarray | None:
-    """The object's outermost points in the page's frame, z into the paper."""
-    if manifest.promise is None or not manifest.promise.outermost_mm:
-        return None
-    left, top, *_ = manifest.cut_mm
-    return np.array(manifest.promise.outermost_mm) + np.array([left, top, 0])
 
 
 def promised_of(manifest: Manifest, surface: Surface, printer: Printer) -> Promised | None:
@@ -146,9 +140,8 @@ def look_of(pixels: np.ndarray, surface: Surface, printer: Printer) -> Promised:
 
 def with_markers(design: np.ndarray, surface: Surface, ink: np.ndarray) -> np.ndarray:
     """Linear light H×W×3 over the piece with the markers that lie on it; `ink` is their black."""
-    on_it = {
-        i: surface.corners_mm[i] for i in sorted(surface.piece_ids) if _inside(surface.rect_mm, surface.corners_mm[i])
-    }
+    on_piece = {i: surface.corners_mm[i] for i in sorted(surface.piece_ids)}
+    on_it = {i: corners for i, corners in on_piece.items() if _inside(surface.rect_mm, corners)}
     if not on_it:
         return design
     finer = max(1, DESIGN_PX // max(design.shape))  # a design of few pixels: markers' modules are smaller
@@ -184,11 +177,6 @@ def _corners_by_page(manifest: Manifest) -> dict[int, dict[int, np.ndarray]]:
 def _inside(rect: Rect, points: np.ndarray) -> bool:
     x, y, w, h = rect
     return bool((points >= [x, y]).all() and (points <= [x + w, y + h]).all())
-
-
-def _carry_rect(matrix: np.ndarray, rect: Rect) -> Rect:
-    (x0, y0), _, (x1, y1), _ = _carry(matrix, rect_corners(rect)).tolist()
-    return x0, y0, x1 - x0, y1 - y0
 
 
 def _carry(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -52,7 +52,8 @@ def judge(recognized: int, photos: Sequence[int], promise: Promise, without_mark
         return Verdict("cannot_tell", None, "No photograph could be judged.")
     spread = promise.spread
     low, high = spread.counts(photos)
-    allowed = f"the promise allows for {low} to {high} in {_sessions(photos)}"
+    sessions = "one session" if len(photos) == 1 else f"{len(photos)} sessions"
+    allowed = f"the promise allows for {low} to {high} in {sessions}"
     lost = _lost(judged, without_markers)
     if lost > MOST_WITHOUT_MARKERS:
         reason = f"{without_markers} readable photographs show no marker ({lost:.0%}, at most 10 % are allowed)."
@@ -79,9 +80,8 @@ def asked_rate(promise: Promise) -> float:
 def kept_chance(promise: Promise, photos: Sequence[int]) -> float:
     """The chance that the promise is called kept by photographs, so many in each session, where it holds."""
     chances = promise.spread.chances(photos)
-    counts = range(len(chances))[
-        :: promise.target.goal.sign
-    ]  # from the worst to the best: once kept, kept from there on
+    # from the worst to the best: once kept, kept from there on
+    counts = range(len(chances))[:: promise.target.goal.sign]
     first = bisect_left(counts, True, key=lambda count: judge(count, photos, promise).verdict == "kept")
     return float(chances[list(counts[first:])].sum())
 
@@ -122,10 +122,6 @@ def places(count: int) -> str:
 
 def _lost(judged: int, without_markers: int) -> float:
     return without_markers / max(judged + without_markers, 1)
-
-
-def _sessions(photos: Sequence[int]) -> str:
-    return "one session" if len(photos) == 1 else f"{len(photos)} sessions"
 
 
 def compare(patch: Mapping[str, bool], name: str, control: Mapping[str, bool], goal: Goal) -> Control:

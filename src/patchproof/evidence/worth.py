@@ -41,8 +41,10 @@ def worth_of(rate: float, interval: tuple[float, float], controls: Sequence[Cont
 
     unbeaten = [row for row in rows if gains(row)[0] <= 0]
     row = min(unbeaten or rows, key=lambda row: (bool(unbeaten) and row[0] != "bare", gains(row)))
-    word = _word(*gains(row), bool(promise.controls) and promise.worth == "better")
-    name, control_rate, difference, ends = row
+    (low, high), (name, control_rate, difference, ends) = gains(row), row
+    word: WorthWord = "helps" if low > 0 else "worse" if high < 0 else "no_better"
+    if word == "no_better" and promise.controls and promise.worth == "better" and high >= LITTLE:
+        word = "not_shown"
     return Worth(
         word=word,
         goal=promise.target.goal,
@@ -52,11 +54,3 @@ def worth_of(rate: float, interval: tuple[float, float], controls: Sequence[Cont
         difference_interval=ends,
         photographed=photographed,
     )
-
-
-def _word(low: float, high: float, promised_better: bool) -> WorthWord:
-    if low > 0:
-        return "helps"
-    if high < 0:
-        return "worse"
-    return "not_shown" if promised_better and high >= LITTLE else "no_better"

@@ -41,15 +41,13 @@ class InBatches(torch.nn.Module):
 
     def forward(self, photos: Tensor, windows: Windows | None = None) -> Tensor:
         """N×3×S×S → N×K logits. The pictures' gradient need hold in `windows` only."""
-        logits = []
-        most = self.most or len(photos)
+        logits, most = [], self.most or len(photos)
         for number, batch in enumerate(photos.split(most)):
             missing = (self.size or 0) - len(batch)
             padded = torch.cat([batch, batch[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else batch
             ordered = padded.contiguous(memory_format=self.order)
-            first, own = number * most, None
-            if windows is not None and missing <= 0:
-                own = windows.part(first, first + len(batch))
+            first = number * most
+            own = windows.part(first, first + len(batch)) if windows is not None and missing <= 0 else None
             logits.append(self._answers(ordered, own)[: len(batch)])
         return torch.cat(logits)
 

@@ -126,8 +126,8 @@ class _Weights:
         if len(self.locations) > 1:
             raise Unwanted("weights in more than one other file")
         self.data = self.data or self.beside()
-        offset, size = (whole(int(where.get(key, default)), 0, len(self.data)) for key, default in
-                        (("offset", 0), ("length", len(self.data))))  # fmt: skip
+        offset = whole(int(where.get("offset", 0)), 0, len(self.data))
+        size = whole(int(where.get("length", len(self.data))), 0, len(self.data))
         part = memoryview(self.data)[offset : offset + size]
         self.taken += len(part)
         if self.taken > len(self.data):
@@ -209,10 +209,9 @@ class _Reader:
         if len(outputs) != 1 and not several:
             raise Unwanted(f"{len(outputs)} results of {name}, where only the first is supported")
         inputs = [self._known(word) for word in node.get("input", [])]
-        if name == "Constant":
-            return []
         if name == "Identity":
             self._name(outputs[0], *inputs)
+        if name in ("Constant", "Identity"):
             return []
         operator, attributes = OPERATORS[name], self._attributes(node)
         if several and len(inputs) == 1:
@@ -239,11 +238,10 @@ class _Reader:
 
     def _attribute(self, attribute: dict[str, Any]) -> Any:
         """A plain number, word or list of numbers, or a tensor."""
-        kinds = attribute.keys() - {"name"}
-        if len(kinds) != 1:
-            raise Unwanted(f"the attribute {quoted(attribute.get('name'))} of {len(kinds)} kinds")
-        kind = kinds.pop()
-        content = attribute[kind]
+        contents = {kind: content for kind, content in attribute.items() if kind != "name"}
+        if len(contents) != 1:
+            raise Unwanted(f"the attribute {quoted(attribute.get('name'))} of {len(contents)} kinds")
+        ((kind, content),) = contents.items()
         if kind == "t":
             return self.tensor(content)
         if isinstance(content, list) and len(content) > MAX_LIST:

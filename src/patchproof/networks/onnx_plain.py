@@ -47,7 +47,6 @@ def _conv(w, b=None, *, auto_pad="NOTSET", dilations=None, group=1, kernel_shape
 
 def _clip(low=None, high=None) -> Way:
     """Where both limits are known; of torch's two kinds of clamp this one's gradient ends at them, as ReLU6's does."""
-    limits = [
-        float(end) for end in (low, high) if isinstance(end, Tensor) and end.is_floating_point() and not end.dim()
-    ]
+    known = (end for end in (low, high) if isinstance(end, Tensor) and end.is_floating_point() and not end.dim())
+    limits = [float(end) for end in known]
     return [(_ATEN.hardtanh.default, limits)] if len(limits) == 2 and limits[0] <= limits[1] else []

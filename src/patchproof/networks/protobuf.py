@@ -91,7 +91,11 @@ class _Reader:
             if kind == INT:
                 return [_signed(content)]
         elif kind == INT:
-            return list(self._packed(content))
+            numbers, at = [], 0
+            while at < len(content):
+                number, at = self._varint(content, at)
+                numbers.append(_signed(number))
+            return numbers
         elif kind == FLOAT:
             if len(content) > 4 * MAX_ITEMS:
                 raise Unwanted(f"more than {MAX_ITEMS} {name}")
@@ -105,12 +109,6 @@ class _Reader:
         elif isinstance(kind, dict):
             return [self.message(content, kind)]
         raise Unwanted(f"{name}, which is not supported" if kind == NEVER else f"{name} of another kind")
-
-    def _packed(self, data: memoryview) -> Iterator[int]:
-        at = 0
-        while at < len(data):
-            number, at = self._varint(data, at)
-            yield _signed(number)
 
 
 def _signed(number: int) -> int:

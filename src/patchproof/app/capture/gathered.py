@@ -88,7 +88,7 @@ class Gathered:
         controls: dict[str, list[PhotoEntry]] = {}
         for path, photo in photos.items():
             controls.setdefault(path.parent.name, []).append(photo.entry)
-        return report_of(self.manifest, self._judges, own, grouping, controls, side_px=self.side_px)
+        return report_of(self.manifest, self._judges, own, grouping, controls)
 
     def _grouping(self) -> Grouping:
         own = sorted(path for path in self._measured if self.control_of(path) is None)
