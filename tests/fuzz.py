@@ -41,7 +41,7 @@ from PIL import Image, ImageCms
 from safetensors.numpy import save as safetensors_bytes
 from watch import MOST_BYTES, SECONDS, TooLong, Watch, limits, peak_bytes, temporary_files_in
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 
 Read = Callable[[], object]
 
@@ -341,10 +341,10 @@ def camera_json(rng: Rng, folder: Path) -> Read:
 
 
 def printer(rng: Rng, folder: Path) -> Read:
-    from patchproof.base.strict import shipped
+    from patchproof.base.packaged import packaged_path
     from patchproof.channel.printer import SIZE, load_printer
 
-    source = shipped("calibration", "printers")
+    source = packaged_path("calibration", "printers")
     head, tables = (source / "coated.json").read_text(), (source / "coated.npz").read_bytes()
     how = rng.integers(3)
     if how == 0:
@@ -570,14 +570,14 @@ TEMPLATES = ("a4", "blank_a4", "chart_a4", "charuco_a4", "a4_tiles")
 
 
 def template_toml(rng: Rng, folder: Path) -> Read:
-    from patchproof.base.strict import shipped
+    from patchproof.base.packaged import packaged_path
     from patchproof.sheets.blank import blank_page
     from patchproof.sheets.piece import lay_out_piece
     from patchproof.sheets.template import load_template
     from patchproof.sheets.tiles import refuse_larger_than_page
 
     name = str(rng.choice(TEMPLATES))
-    text = shipped("print_templates", f"{name}.toml").read_text(encoding="utf-8")
+    text = packaged_path("print_templates", f"{name}.toml").read_text(encoding="utf-8")
     (folder / "t.toml").write_bytes(broken_lines(rng, text))
     if name in ("a4", "a4_tiles"):
         piece = lay_out_piece((150.0, 150.0), 15.0, "FUZZFUZZ00", "design")

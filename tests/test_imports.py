@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "mesh": {"base"},
     "scene": {"base", "sheets", "photo", "channel", "mesh"},
     "render": {"base", "sheets", "channel", "mesh", "scene"},
-    "networks": set(),
+    "networks": {"base"},
     "classifier": {"base", "networks"},
     "optimizer": {"base", "sheets", "photo", "channel", "mesh", "scene", "render", "networks", "classifier"},
     "calibrate": {"base", "sheets", "photo", "channel"},

@@ -14,8 +14,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FOUND = (
-    "from patchproof.base.strict import shipped; import patchproof, sys\n"
-    "print(shipped('calibration', 'printers', 'coated.npz').resolve(), shipped('print_templates', 'a4.toml').resolve())"
+    "from patchproof.base.packaged import packaged_path as at; import patchproof, sys\n"
+    "print(at('calibration', 'printers', 'coated.npz').resolve(), at('print_templates', 'a4.toml').resolve())"
 )
 
 
@@ -72,5 +72,7 @@ def test_an_editable_checkout_finds_its_data(checkout, tmp_path):
     for place in subprocess.check_output([python, "-I", "-c", FOUND], text=True, cwd=tmp_path).split():
         assert Path(place).is_file()
     (checkout / "print_templates" / "new.toml").write_text("x = 1")
-    code = "from patchproof.base.strict import shipped; print(shipped('print_templates', 'new.toml').is_file())"
+    code = (
+        "from patchproof.base.packaged import packaged_path as at; print(at('print_templates', 'new.toml').is_file())"
+    )
     assert subprocess.check_output([python, "-I", "-c", code], text=True, cwd=tmp_path).strip() == "True"

@@ -19,7 +19,7 @@ from patchlab.study.record import hits_of
 from patchlab.study.study import load_study
 from patchproof.base.claims import student_mean
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import read_toml, validated
+from patchproof.base.validation import read_toml, validated
 from patchproof.optimizer.problem import FIGURE_SCALE, FIGURED
 from patchproof.optimizer.run import load_run
 

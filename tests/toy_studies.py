@@ -10,9 +10,10 @@ from pathlib import Path
 from patchlab.study.study import Cell, Study
 from patchproof.base import input as bounds
 from patchproof.base.claims import rate
-from patchproof.base.strict import Refused, Strict
+from patchproof.base.errors import Refused
+from patchproof.base.validation import Strict
 from patchproof.photo import limits
-from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.tables import Drawing, Table
 
 
@@ -101,5 +102,5 @@ def given_up(seconds):
     bounds.SECONDS = 0.2
     try:
         return limits.limited(spin, seconds)
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         return cannot.code

@@ -44,7 +44,7 @@ def harden(
     """Change labeled images so that classifiers recognize them better, and attack them."""
     from patchlab.harden.folder import HardenSettings, harden_images
     from patchlab.study.study import Work
-    from patchproof.base.strict import validated
+    from patchproof.base.validation import validated
 
     given = {
         "images": str(images),

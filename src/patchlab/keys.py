@@ -6,7 +6,7 @@ from typing import get_type_hints
 
 from patchlab.study.study import STUDIES, load_study
 from patchproof.app.keys import Documents, default_text, meanings, tables, toml_text
-from patchproof.base.strict import models_in
+from patchproof.base.validation import models_in
 
 HEAD = """# Keys of studies
 

@@ -1,8 +1,8 @@
 from patchproof.app.compare import compare_runs as compare
 from patchproof.app.verify import verify_photos as verify
+from patchproof.base.errors import Refused as Refused
 from patchproof.base.goal import Goal as Goal
 from patchproof.base.settings import SceneSettings as SceneSettings
-from patchproof.base.strict import Refused as Refused
 from patchproof.base.version import __version__ as __version__
 from patchproof.channel.printer import Printer as Printer
 from patchproof.channel.printer import load_printer as load_printer

@@ -26,8 +26,8 @@ from patchproof.app.begin.sides import (
     side_views,
     turntable,
 )
+from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
-from patchproof.base.strict import Refused
 from patchproof.render.stage import set_stage
 from patchproof.scene.fitting import largest
 from patchproof.scene.placement import gap_limit_mm

@@ -30,13 +30,13 @@ from synthetic_photos import make_manifest, save
 from patchproof.app.capture import album as album_module
 from patchproof.app.capture import app as app_module
 from patchproof.app.capture import serve
-from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, NotTaken
+from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefused
 from patchproof.app.capture.app import capture_app
 from patchproof.app.capture.gathered import Gathered
 from patchproof.app.capture.views import map_views
 from patchproof.app.verify import options_of, verify_photos
 from patchproof.base import input
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
 from patchproof.evidence.results import Geometry, PhotoEntry, Pose
 from patchproof.sheets.manifest import ConditionClaim, dump_manifest, load_manifest
@@ -293,10 +293,10 @@ def test_sizes_and_numbers_end_somewhere(tmp_path, monkeypatch):
     album = Album(tmp_path / "photos")
     with album.incoming("session_01") as incoming:
         incoming.write(b"\xff\xd8\xff" + bytes(MOST_BYTES - 3))
-        with pytest.raises(NotTaken, match="at most 40 MB"):
+        with pytest.raises(UploadRefused, match="at most 40 MB"):
             incoming.write(b"x")
         assert incoming.keep().stat().st_size == MOST_BYTES
-    with album.incoming("session_01") as second, pytest.raises(NotTaken, match="at most 2 photographs"):
+    with album.incoming("session_01") as second, pytest.raises(UploadRefused, match="at most 2 photographs"):
         second.write(b"\x89PNG\r\n\x1a\n1234")
         album.incoming("session_01")
 

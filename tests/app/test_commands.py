@@ -18,7 +18,8 @@ from safetensors import torch as safetensors_torch
 
 from patchlab.study.study import STUDIES, load_study, run_study
 from patchproof.app.cli import console
-from patchproof.base.strict import Refused, validated
+from patchproof.base.errors import Refused
+from patchproof.base.validation import validated
 from patchproof.base.version import __version__
 from patchproof.optimizer import run as run_module
 from patchproof.optimizer.run import load_run, optimize_scene

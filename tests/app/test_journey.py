@@ -13,7 +13,7 @@ from console import command
 from loaded import loaded_by
 
 from patchproof.base import geometry
-from patchproof.base.strict import shipped
+from patchproof.base.packaged import packaged_path
 from patchproof.optimizer import run as run_module
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.raster import attached_manifest
@@ -206,7 +206,7 @@ def test_the_sheet_is_the_same_bytes_when_made_twice(journey, tmp_path):
 
 
 def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
-    small = shipped("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
+    small = packaged_path("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
     assert "177.0, 262.4]" in small
     (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "60.0, 60.0]"), encoding="utf-8")
     pdf, run = tmp_path / "tiles.pdf", journey / "run"
@@ -345,7 +345,7 @@ def test_require_kept_makes_any_other_verdict_exit_with_1(journey, tmp_path):
 
 
 def test_bad_meshes_end_in_one_sentence_or_a_warning(data, tmp_path, capsys):
-    from patchproof.base.strict import Refused
+    from patchproof.base.errors import Refused
     from patchproof.mesh.load_mesh import load_mesh
 
     names = sorted(path.name for path in (data / "meshes" / "bad").iterdir() if path.suffix in {".obj", ".glb", ".stl"})

@@ -13,7 +13,8 @@ import patchlab
 import patchproof
 from patchlab.keys import HEAD, documents
 from patchproof.app.keys import DOCUMENTS, keys_page, meanings, tables
-from patchproof.base.strict import Refused, Strict
+from patchproof.base.errors import Refused
+from patchproof.base.validation import Strict
 from patchproof.sheets.template import QrCode
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -19,8 +19,9 @@ from patchproof.app.plan.errors import measure_terms
 from patchproof.app.plan.lines import geometry_lines, measured_lines
 from patchproof.app.plan.plan import Plan, marker_plan, measured_plan, plan_geometry, resolution_plan, sample_plan
 from patchproof.app.plan.terms import Setup, scene_terms
+from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.channel.effects import EFFECTS, RECORD_OF
 from patchproof.optimizer import loop
 from patchproof.optimizer.pixels import from_pixels

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from patchproof.base import strict
+from patchproof.base import packaged
+from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
+from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings, identifying, load_scene_settings
-from patchproof.base.strict import Refused, Strict, expand, nearest, shipped, validated
+from patchproof.base.validation import Strict, expand, nearest, validated
 from patchproof.sheets.manifest import Target
 
 SCENE = """
@@ -209,15 +211,15 @@ def test_values_in_messages_are_short():
 
 @pytest.mark.parametrize("folder", ["calibration", "print_templates"])
 def test_shipped_data_is_found_in_checkout_and_in_package(tmp_path, monkeypatch, folder):
-    assert shipped(folder).is_dir()
+    assert packaged_path(folder).is_dir()
     for root in (tmp_path / "site" / "patchproof", tmp_path / "checkout" / "src" / "patchproof"):
         root.mkdir(parents=True)
-        monkeypatch.setattr(strict, "__file__", str(root / "base" / "strict.py"))
+        monkeypatch.setattr(packaged, "__file__", str(root / "base" / "packaged.py"))
         with pytest.raises(Refused, match=folder):
-            shipped(folder)
+            packaged_path(folder)
         home = root if "site" in root.parts else root.parents[1]
         (home / folder / "sub").mkdir(parents=True)
-        assert shipped(folder, "sub", "a.json") == home / folder / "sub" / "a.json"
+        assert packaged_path(folder, "sub", "a.json") == home / folder / "sub" / "a.json"
 
 
 def test_numbers_stay_numbers(tmp_path):

@@ -18,7 +18,7 @@ import toy_studies as toy
 
 from patchlab.study.study import Work, carry_out
 from patchproof.base import workers as processes
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.base.workers import can_fork, free_cores, open_workers, result_of, sharing, threads
 
 forks = pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")

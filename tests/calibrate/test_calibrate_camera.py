@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.calibrate.boards import View, corner_places_mm, see_boards
 from patchproof.calibrate.camera import calibrate_camera, solve
 from patchproof.calibrate.ladder import compared, simplest

@@ -19,7 +19,7 @@ from patchlab.bench.chart_page import chart_manifest, printed_page
 from patchlab.bench.inkjets import DRIVERS, draw_inkjet
 from patchproof.app import cli
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.calibrate import chart as chart_module
 from patchproof.calibrate import icc
 from patchproof.calibrate.chart import calibrate_chart, combine, print_variation, printer_of, prints_of
@@ -39,8 +39,8 @@ from patchproof.channel.camera import encoded
 from patchproof.channel.lens import Camera, load_camera
 from patchproof.channel.printer import load_printer, vary
 from patchproof.channel.tone import codes_of_light, light_of_codes
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import Photo, read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.reprints.page_photos import photograph_page
@@ -252,13 +252,13 @@ def test_without_the_flat_field_the_same_photograph_would_be_far_off(shots):
 def test_photographs_that_show_no_chart(shots):
     _, manifest, (shot, _) = shots
     photo = shot.photo
-    with pytest.raises(CannotJudge, match="too_few_markers"):
+    with pytest.raises(PhotoRejected, match="too_few_markers"):
         read_chart(Photo(np.full((600, 800, 3), 90, np.uint8), None), manifest)
-    with pytest.raises(CannotJudge, match="mirrored"):
+    with pytest.raises(PhotoRejected, match="mirrored"):
         read_chart(Photo(np.ascontiguousarray(photo.srgb[:, ::-1]), None), manifest)
     light = linear_from_srgb(photo.srgb / 255) * 8
     white = Photo((srgb_from_linear(light.clip(0, 1)) * 255).astype(np.uint8), None)
-    with pytest.raises(CannotJudge, match=r"clipped|too_few"):
+    with pytest.raises(PhotoRejected, match=r"clipped|too_few"):
         read_chart(white, manifest)
 
 

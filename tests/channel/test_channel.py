@@ -10,7 +10,7 @@ from tolerances import BY_TABLE, CODE
 
 from patchproof.base.color import linear_from_srgb
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import validated
+from patchproof.base.validation import validated
 from patchproof.channel.camera import (
     _streaks,
     blurred,

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from patchproof.base import geometry
-from patchproof.base.strict import Refused, shipped
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
 from patchproof.channel.lens import Camera, load_camera
 
 ORIGIN = {"when": "2020-01-01", "instrument": "a board", "uncertainty": "1 px"}
@@ -147,7 +148,7 @@ def test_batches_equal_single_pictures():
         assert torch.equal(one.distorted(pictures[i : i + 1], (40, 30))[0], together[i])
 
 
-@pytest.mark.parametrize("path", sorted(shipped("calibration", "cameras").glob("*.json")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(packaged_path("calibration", "cameras").glob("*.json")), ids=lambda p: p.stem)
 def test_shipped_cameras_load_by_name_and_say_where_they_come_from(path):
     one = load_camera(path.stem)
     assert one.name == path.stem and one.when and one.instrument and one.uncertainty

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import validated
+from patchproof.base.validation import validated
 from patchproof.channel.light import Lighting, irradiance, lighting_of
 from patchproof.scene.conditions import draw
 

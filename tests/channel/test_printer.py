@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from patchproof.base.color import ciede2000, lab_from_linear, lab_from_srgb, linear_from_srgb
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import PrinterSettings
-from patchproof.base.strict import Refused, shipped
 from patchproof.calibrate import icc
 from patchproof.calibrate.printer import printer_from_icc
 from patchproof.calibrate.printer_files import printer_from_table, save_printer
@@ -115,7 +116,7 @@ def test_shipped_printers_leave_paper_white_and_lift_black(name):
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_shipped_files_are_small_and_their_errors_within_bounds(name):
-    assert shipped("calibration", "printers", f"{name}.npz").stat().st_size < 150_000
+    assert packaged_path("calibration", "printers", f"{name}.npz").stat().st_size < 150_000
     error = load_printer(name).provenance["delta_e00_to_exact_chain"]
     assert error["mean"] <= 0.25 and error["p95"] <= 0.5 and error["max"] <= 2.0 and error["colors"] == 10_000
 
@@ -255,7 +256,7 @@ def hostile(arrays, path):
 )
 def test_broken_files_are_refused_in_one_sentence(tmp_path, break_it):
     for suffix in (".npz", ".json"):
-        shutil.copy(shipped("calibration", "printers", f"coated{suffix}"), tmp_path / f"coated{suffix}")
+        shutil.copy(packaged_path("calibration", "printers", f"coated{suffix}"), tmp_path / f"coated{suffix}")
     assert isinstance(load_printer("coated.npz", tmp_path), Printer)
     break_it(tmp_path / "coated.npz")
     with pytest.raises(Refused) as error:

@@ -11,7 +11,7 @@ from patchlab.training import pictures as rendered
 from patchlab.training import train_builtin
 from patchlab.training.fit import Seconds
 from patchlab.training.pictures import HELD_OUT, Pictures, augmented, pictures, reduced
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import find_labels, load_classifier
 from patchproof.classifier.builtin import HERE, INPUT_PX, load_builtin
 from patchproof.mesh import primitives

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import Classifier, center_square, find_labels
 
 LABELS = ("jeep, landrover", "crane", "crane", "box truck", "maillot", "maillot, tank suit", "mouse, computer mouse")

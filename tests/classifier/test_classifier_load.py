@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from patchlab.training.fit import folded
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import Classifier, load_classifier, zoo
 from patchproof.classifier.builtin import SmallNetwork
 from patchproof.classifier.check import check_network

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 from small_networks import seeded
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier
 from test_zoo import judged
 

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 import patchproof as pp
 from patchlab.training import pictures as rendered
 from patchlab.training import train_detector
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import intrinsics, project
 from patchproof.base.goal import Goal
-from patchproof.base.strict import Refused
 from patchproof.channel.boxes import MOST_POINTS, box_of, outermost
 from patchproof.classifier.builtin_detector import HERE, INPUT_PX
 from patchproof.classifier.detector import NOTHING, Detector, iou
@@ -210,7 +210,7 @@ def test_a_detector_with_another_number_of_labels_is_refused():
 
 
 @pytest.fixture(scope="module")
-def shipped():
+def packaged_path():
     return load_classifier("builtin-detector", HERE)
 
 

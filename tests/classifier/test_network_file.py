@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import center_square, load_classifier, network_file
 from patchproof.classifier.network_file import load_network
 

@@ -16,7 +16,7 @@ from small_networks import seeded
 
 import patchproof as pp
 from patchproof.app.begin.new import _model
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier, zoo
 from patchproof.reprints.hung_sheet import Hanging
 

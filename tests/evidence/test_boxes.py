@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import patchproof as pp
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.detector import iou
 from patchproof.evidence.boxes import box_in, given_boxes, in_square
 

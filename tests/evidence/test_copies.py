@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from synthetic_photos import DESIGN_MM, save, view
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.evidence.copies import without_copies
 from patchproof.evidence.measure import MeasuredPhoto
 from patchproof.evidence.results import Geometry, PhotoEntry

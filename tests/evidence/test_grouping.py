@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from PIL import Image
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.evidence.grouping import FOLDERS, GUESS, TIMES, group
 
 

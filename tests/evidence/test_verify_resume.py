@@ -15,8 +15,8 @@ import torch
 from synthetic_photos import make_manifest, save
 
 from patchproof.app.verify import _networks, verify_photos
-from patchproof.base.strict import Refused
-from patchproof.base.workers import WorkerDied, can_fork
+from patchproof.base.errors import Refused, WorkerDied
+from patchproof.base.workers import can_fork
 from patchproof.channel.printer import identity_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence import batch, measure, placed

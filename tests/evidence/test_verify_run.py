@@ -22,7 +22,7 @@ from synthetic_photos import (
 
 from patchproof.base.claims import wilson
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
 from patchproof.evidence.appearance import _fitted_by_others, cells_fit

@@ -16,7 +16,7 @@ from patchlab.bench.chart import all_checks
 from patchlab.study.grid import scene_values
 from patchlab.study.record import bits
 from patchlab.study.study import Cell, Result, run_study
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import load_scene

@@ -26,7 +26,7 @@ from patchlab.validation.envelope.world import (
 )
 from patchproof.base import geometry
 from patchproof.base.claims import Estimate, paired_difference
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.optimizer.run import optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.report.images import drawn as drawing_of

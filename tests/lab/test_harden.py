@@ -17,7 +17,8 @@ from patchlab.harden.attacks import margin, survives_pgd
 from patchlab.harden.folder import HardenSettings, harden_images, tables, too_strong
 from patchlab.harden.harden import harden, moved, squares
 from patchlab.study.study import Cell, Result, Work, run_study
-from patchproof.base.strict import Refused, validated
+from patchproof.base.errors import Refused
+from patchproof.base.validation import validated
 from patchproof.classifier.network import Classifier
 from patchproof.photo.read import read_photo
 

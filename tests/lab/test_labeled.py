@@ -7,7 +7,7 @@ import pytest
 from patchlab.harden.labeled import labeled_files
 from patchlab.training.labeled import SEED, of_scenes, procedural, write_labeled
 from patchlab.training.pictures import HELD_OUT
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.labels import find_labels
 from patchproof.photo.read import read_photo

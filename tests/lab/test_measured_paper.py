@@ -11,7 +11,7 @@ import pytest
 
 from patchlab.study.study import STUDIES
 from patchproof.base.claims import wilson
-from patchproof.base.strict import read_toml, validated
+from patchproof.base.validation import read_toml, validated
 
 NOTES = Path(__file__).resolve().parents[2] / "src/patchlab/results"
 PAGE = " ".join((NOTES / "measured.md").read_text(encoding="utf-8").split())

@@ -22,9 +22,10 @@ from patchlab.paper.stress_map import (
 from patchlab.study.grid import GridSettings
 from patchlab.study.record import bits
 from patchlab.study.study import run_study
+from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.channel.effects import FIELDS
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.pixels import as_pixels

@@ -18,7 +18,7 @@ import toy_studies as toy
 import patchlab
 from patchlab.study import study
 from patchlab.study.study import Work, carry_out, load_study, run_study
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 
 BASE = Path(__file__).parents[1]
 

@@ -8,7 +8,7 @@ import torch
 from patchlab.study.study import Cell, Result
 from patchlab.validation import ablation
 from patchlab.validation.ablation import ALL, PRINTER, AblationSettings, without
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer import expectation, loop
 from patchproof.optimizer.problem import set_problem

@@ -18,8 +18,9 @@ from patchlab.study.grid import scene_values
 from patchlab.study.record import bits
 from patchlab.study.study import Cell, Result, run_study
 from patchproof.base.claims import LEAST_CLUSTERS
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import local_scale
-from patchproof.base.strict import Refused, read_toml, validated
+from patchproof.base.validation import read_toml, validated
 from patchproof.optimizer import loop
 from patchproof.optimizer.problem import set_problem
 from patchproof.scene.scene import load_scene

@@ -8,8 +8,8 @@ from PIL import Image
 
 from patchlab.study.study import Cell, Result, run_study
 from patchlab.validation import promises
+from patchproof.base.errors import Refused
 from patchproof.base.sessions import spread_of
-from patchproof.base.strict import Refused
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.promise import PER_SESSION
 from test_optimize import SCENE

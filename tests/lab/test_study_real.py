@@ -19,8 +19,9 @@ from patchlab.study.study import Result, load_study, run_study
 from patchlab.validation import real
 from patchlab.validation.board_fit import edge_of, fit_board, white_noise
 from patchlab.validation.known_boards import BoardSettings, find_pose
-from patchproof.base.strict import Refused, validated
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.errors import Refused
+from patchproof.base.validation import validated
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import cells_of
 
 FINER, SIZE = 8, (320, 240)
@@ -119,11 +120,11 @@ def test_the_wrong_print_leaves_much():
 
 def test_boards_that_are_not_there_or_not_flat_are_told():
     srgb, _ = photograph()
-    with pytest.raises(CannotJudge, match="0 markers of DICT_4X4_50"):
+    with pytest.raises(PhotoRejected, match="0 markers of DICT_4X4_50"):
         find_pose(srgb, grid(dictionary="DICT_4X4_50"))
-    with pytest.raises(CannotJudge, match="no plane fits"):
+    with pytest.raises(PhotoRejected, match="no plane fits"):
         find_pose(srgb, grid(gap=0.6))
-    with pytest.raises(CannotJudge, match="overexposed"):
+    with pytest.raises(PhotoRejected, match="overexposed"):
         fit_board(np.full_like(srgb, 255), find_pose(srgb, grid()))
 
 

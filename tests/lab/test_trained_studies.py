@@ -17,7 +17,8 @@ from patchlab.study.record import Record
 from patchlab.study.study import Cell, Result, run_study
 from patchlab.study.trained import TrainedSettings, trained_cells, verdict
 from patchproof.base.claims import Estimate
-from patchproof.base.strict import Refused, validated
+from patchproof.base.errors import Refused
+from patchproof.base.validation import validated
 from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate_run
 from patchproof.optimizer.problem import set_problem

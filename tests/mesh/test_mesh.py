@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, Part, from_parts
 

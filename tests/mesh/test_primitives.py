@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.mesh import primitives, solids
 from patchproof.mesh.load_mesh import load_mesh
 

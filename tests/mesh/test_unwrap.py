@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.base.strict import Refused
 from patchproof.mesh import unwrap as unwrapping
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, Part, from_parts

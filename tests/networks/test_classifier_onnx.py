@@ -10,7 +10,7 @@ import torch
 from small_networks import LABELS, ConvNeXt, ResNet, ViT, seeded
 
 import patchproof as pp
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from fuzz import Watch, limits
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier
 
 pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')

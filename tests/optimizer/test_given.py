@@ -14,8 +14,8 @@ from pycocotools.coco import COCO
 from pypdfium2 import PdfDocument
 
 from patchproof.app.compare import compare_runs
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.base.strict import Refused
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer import given
 from patchproof.optimizer import run as run_module

@@ -15,9 +15,10 @@ import trimesh
 from PIL import Image
 
 from patchproof.base.claims import wilson
+from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.base.workers import Workers, can_fork, threads
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer import loop, run, training_views

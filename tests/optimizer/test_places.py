@@ -15,8 +15,9 @@ from trimesh.triangles import closest_point
 import patchproof as pp
 from patchproof.app.plan.lines import geometry_lines, measured_lines
 from patchproof.app.plan.plan import measured_plan, plan_geometry
+from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.classifier.load import load_classifier
 from patchproof.optimizer import place_files, places, run
 from patchproof.optimizer.place_files import read_place, save_place

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from patchproof.base.claims import student_mean
+from patchproof.base.errors import Refused
 from patchproof.base.sessions import difference_in_sessions, spread_of
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.evidence.verdict import EACH, MOST_PHOTOS, sessions_needed
 from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem

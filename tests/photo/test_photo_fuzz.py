@@ -10,9 +10,9 @@ import pytest
 from hostile_bytes import PHOTO_KINDS, changed, mutated, whole_photo
 from synthetic_photos import make_manifest
 
-from patchproof.base.strict import Refused
-from patchproof.photo.cannot import CODES, CannotJudge
+from patchproof.base.errors import Refused
 from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import CODES, PhotoRejected
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 
 PHOTOS, MANIFESTS, SECONDS = 120, 60, 5.0
@@ -28,7 +28,7 @@ def test_damaged_photographs_give_a_picture_or_a_code(tmp_path):
         try:
             photo = read_photo(path)
             assert photo.srgb.dtype == np.uint8 and photo.srgb.ndim == 3 and photo.srgb.shape[2] == 3
-        except CannotJudge as cannot:
+        except PhotoRejected as cannot:
             assert cannot.code in CODES and cannot.advice
             refused += 1
         assert time.monotonic() - begin < SECONDS

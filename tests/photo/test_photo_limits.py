@@ -17,7 +17,7 @@ from PIL import Image
 from watch import peak_bytes
 
 from patchproof.base import input as bounds
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.calibrate import boards
 from patchproof.calibrate.boards import View, find_corners, see_boards
 from patchproof.evidence.batch import Item, _measured
@@ -25,10 +25,10 @@ from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.photo import detect, label, limits, read
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.label import read_label
 from patchproof.photo.limits import finder_lines_in, limited, limited_memory, squares_in
 from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.board import load_board
 from patchproof.sheets.markers import printed_markers
 
@@ -47,7 +47,7 @@ def test_work_is_interrupted_after_its_time_and_not_before(monkeypatch):
     monkeypatch.setattr(bounds, "SECONDS", 0.2)
     assert limited(toy.spin, 0.1) == 0.1
     before = time.process_time()
-    with pytest.raises(CannotJudge) as caught:
+    with pytest.raises(PhotoRejected) as caught:
         limited(toy.spin, 5.0)
     assert time.process_time() - before < 1
     assert (caught.value.code, caught.value.threshold) == ("too_costly", 0.2) and "0.2 s" in caught.value.advice
@@ -67,14 +67,14 @@ def test_a_library_that_swallows_what_interrupts_it_is_interrupted_again(monkeyp
                 continue
         toy.spin(5.0)
 
-    with pytest.raises(CannotJudge, match="too_costly"):
+    with pytest.raises(PhotoRejected, match="too_costly"):
         limited(stubborn)
 
 
 @needs_timer
 def test_inside_a_limit_there_is_one_and_in_other_threads_none(monkeypatch):
     monkeypatch.setattr(bounds, "SECONDS", 0.2)
-    with pytest.raises(CannotJudge):
+    with pytest.raises(PhotoRejected):
         limited(lambda: [limited(toy.spin, 0.1) for _ in range(20)])
     results = []
     thread = threading.Thread(target=lambda: results.append(limited(toy.spin, 0.3)))
@@ -112,7 +112,7 @@ def test_memory_is_limited_while_a_photograph_is_read(tmp_path, monkeypatch):
     np.empty(limits.MOST_BYTES + 2**28, np.uint8)
     Image.new("RGB", (40, 40)).save(tmp_path / "a.png")
     monkeypatch.setattr(read, "_pixels", lambda image, step: np.empty(limits.MOST_BYTES + 2**28, np.uint8))
-    with pytest.raises(CannotJudge, match="too_costly: the picture takes too much memory: save it smaller"):
+    with pytest.raises(PhotoRejected, match="too_costly: the picture takes too much memory: save it smaller"):
         read_photo(tmp_path / "a.png")
 
 
@@ -134,7 +134,7 @@ def test_a_photograph_of_any_size_is_measured_in_a_gigabyte(kind, size, tmp_path
 def test_a_file_that_is_too_large_is_not_opened(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(bytes(2001))
     monkeypatch.setattr(read, "MOST_BYTES", 2000)
-    with pytest.raises(CannotJudge) as caught:
+    with pytest.raises(PhotoRejected) as caught:
         read_photo(tmp_path / "a.png")
     assert (caught.value.code, caught.value.figure, caught.value.threshold) == ("too_costly", 2001, 2000)
 
@@ -148,14 +148,14 @@ def test_squares_are_counted_and_too_many_are_not_looked_into(monkeypatch):
     assert 2300 <= count <= 2600
     monkeypatch.setattr(detect, "MOST_SQUARES", count - 1)
     before = time.process_time()
-    with pytest.raises(CannotJudge) as caught:
+    with pytest.raises(PhotoRejected) as caught:
         list(detect._detect(picture, printed, 1200))
     assert (caught.value.code, caught.value.figure, caught.value.threshold) == ("too_costly", count, count - 1)
     assert time.process_time() - before < 2
     few = np.pad(squares(168), (0, 1032), constant_values=255)
     assert 45 <= squares_in(few) <= 55 and list(detect._detect(few, printed, 1200)) == []
     monkeypatch.setattr(detect, "seconds_left", lambda: 0.1)
-    with pytest.raises(CannotJudge) as caught:
+    with pytest.raises(PhotoRejected) as caught:
         list(detect._detect(few, printed, 1200))
     assert caught.value.threshold == 25
 
@@ -166,7 +166,7 @@ def test_squares_are_counted_from_the_size_on_that_the_detector_looks_into():
     picture = np.where((abs(y - 8) < 5) & (abs(x - 8) < 5), 0, 255).astype(np.uint8)
     assert squares_in(picture) == 0 and squares_in(picture, 29.76) > 3600
     before = time.process_time()
-    with pytest.raises(CannotJudge, match="squares that could be markers"):
+    with pytest.raises(PhotoRejected, match="squares that could be markers"):
         list(detect._detect(picture, printed_markers(detect.DICTIONARY), 992))
     assert time.process_time() - before < 2
 
@@ -178,7 +178,7 @@ def test_a_board_among_too_many_squares_is_left_out(tmp_path, monkeypatch):
     board = load_board("charuco_a4")
     with pytest.raises(Refused, match="photographs of the board"):
         see_boards(tmp_path, board)
-    with pytest.raises(CannotJudge, match="squares that could be markers"):
+    with pytest.raises(PhotoRejected, match="squares that could be markers"):
         find_corners(np.repeat(squares(1200)[..., None], 3, 2), board)
 
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image, ImageCms
 
 from patchproof.photo import read
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import PhotoRejected
 
 UPRIGHT = np.zeros((40, 60, 3), np.uint8)
 UPRIGHT[:20, :30], UPRIGHT[:20, 30:], UPRIGHT[20:, :30] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -126,7 +126,7 @@ def test_a_text_file_a_cut_file_and_a_missing_one_are_unreadable(tmp_path):
     (tmp_path / "text.jpg").write_text("not a picture")
     (tmp_path / "empty.jpg").write_bytes(b"")
     for name in ("cut.jpg", "text.jpg", "empty.jpg", "gone.jpg"):
-        with pytest.raises(CannotJudge) as caught:
+        with pytest.raises(PhotoRejected) as caught:
             read_photo(tmp_path / name)
         assert caught.value.code == "unreadable" and caught.value.advice
 
@@ -153,7 +153,7 @@ def test_opencv_reads_a_jpeg_as_pillow_does(tmp_path, monkeypatch, subsampling, 
 def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
     Image.fromarray(UPRIGHT).save(tmp_path / "a.png")
     monkeypatch.setattr(read, "LARGEST_PX", 1000)
-    with pytest.raises(CannotJudge) as caught:
+    with pytest.raises(PhotoRejected) as caught:
         read_photo(tmp_path / "a.png")
     assert (caught.value.figure, caught.value.threshold) == (2400, 1000)
 
@@ -182,10 +182,10 @@ def test_heic_without_its_extra_says_what_to_install(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "a.heic").write_bytes(b"x")
-    with pytest.raises(CannotJudge, match=r"pip install 'patchproof\[heic\]'"):
+    with pytest.raises(PhotoRejected, match=r"pip install 'patchproof\[heic\]'"):
         read_photo(tmp_path / "a.heic")
 
 
 def test_codes_are_those_of_the_report():
     with pytest.raises(ValueError, match="expected one of unreadable"):
-        CannotJudge("odd", None, None, "nothing")
+        PhotoRejected("odd", None, None, "nothing")

@@ -7,13 +7,13 @@ import pytest
 from synthetic_photos import DESIGN_MM, PIECE_IDS, make_manifest, page_raster, photograph, view
 
 from patchproof.base.geometry import apply_homography, intrinsics, plane_pose, rect_corners, view_angles
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.colorfit import affine12, white_black
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import find_markers
 from patchproof.photo.pose import flat_stance
 from patchproof.photo.quality import frame_light
 from patchproof.photo.rectify import corner_uncertainty_mm, fit_page, noise_and_bend, rectify
+from patchproof.photo.rejection import PhotoRejected
 
 
 def marker_corners():
@@ -61,7 +61,7 @@ def test_when_most_markers_lie_the_residual_or_the_ids_show_it():
 
 
 def test_no_known_marker_cannot_be_judged():
-    with pytest.raises(CannotJudge) as caught:
+    with pytest.raises(PhotoRejected) as caught:
         fit_page({7: np.zeros((4, 2))}, marker_corners())
     assert caught.value.code == "too_few_markers"
 

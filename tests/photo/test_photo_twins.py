@@ -17,7 +17,6 @@ from patchproof.evidence.measure import identify, measure
 from patchproof.evidence.ranges import promised_ranges
 from patchproof.evidence.surface import promised_of, surface_of
 from patchproof.photo import colorfit, complete, detect, edges
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import LIGHT, find_markers, luminance, refine
 from patchproof.photo.edges import fit_borders
@@ -25,6 +24,7 @@ from patchproof.photo.limits import edges_in, squares_in
 from patchproof.photo.quality import CLIPPED_CODE
 from patchproof.photo.read import Photo
 from patchproof.photo.registration import _vagueness
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import cells_of
 
 IDS = frozenset(PIECE_IDS)
@@ -78,7 +78,7 @@ def test_a_sheet_too_small_for_the_first_levels_is_found_and_one_too_small_for_a
         np.testing.assert_allclose(corners - [1300, 900], expected[marker_id], atol=0.01, rtol=0)
     far[900:1500, 1300:2100] = 128
     far[900:975, 1300:1400] = cv2.resize(near, (100, 75), interpolation=cv2.INTER_AREA)
-    with pytest.raises(CannotJudge, match="no marker is readable"):
+    with pytest.raises(PhotoRejected, match="no marker is readable"):
         identify(far, surface)
 
 

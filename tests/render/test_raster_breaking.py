@@ -10,7 +10,7 @@ import time
 import pytest
 import torch
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.render import raster
 from patchproof.render.fragments import Cameras
 from patchproof.render.raster import rasterize

@@ -16,7 +16,7 @@ from tolerances import BY_TABLE, FLOAT32
 from torch.nn.functional import avg_pool2d
 
 from patchproof.base import geometry
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.optimizer.problem import FIGURED, set_problem
 from patchproof.photo.detect import find_markers
 from patchproof.render import photograph as photograph_module

@@ -121,7 +121,7 @@ def test_one_foreign_marker_is_clutter_and_two_are_another_sheet(monkeypatch):
         if code is None:
             assert measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)[0] is found
         else:
-            with pytest.raises(measure.CannotJudge, match="several_sheets: more than one sheet"):
+            with pytest.raises(measure.PhotoRejected, match="several_sheets: more than one sheet"):
                 measure.identify(np.zeros((9, 9, 3), np.uint8), SURFACE)
 
 

@@ -19,9 +19,10 @@ from console import command
 from PIL import Image
 
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
+from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, shipped
 from patchproof.channel.effects import Print
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer.pixels import from_pixels
@@ -101,7 +102,7 @@ def few_views():
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
-    text = shipped("print_templates", "blank_a4.toml").read_text(encoding="utf-8")
+    text = packaged_path("print_templates", "blank_a4.toml").read_text(encoding="utf-8")
     smaller = {"piece_mm = [162.0, 162.0]": f"piece_mm = [{PIECE_MM}, {PIECE_MM}]", "= 19.0": f"= {MARKER_MM}"}
     for old, new in smaller.items():
         assert old in text
@@ -275,7 +276,7 @@ def test_evaluate_knows_scenes_without_a_mesh(request, kind):
 
 def test_another_page_keeps_the_piece_and_its_promise_or_is_refused(photos, tmp_path):
     """The piece is as large as the blank that was photographed, whatever page it is printed on."""
-    text = shipped("print_templates", "a4.toml").read_text(encoding="utf-8")
+    text = packaged_path("print_templates", "a4.toml").read_text(encoding="utf-8")
     zone = "167.0, 180.0]"
     assert zone in text
     for name, room in (("other", "160.0, 170.0]"), ("small", "100.0, 100.0]")):

@@ -12,7 +12,7 @@ import torch
 
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.render.photograph import photograph
 from patchproof.render.pixels import PiecePicture
 from patchproof.render.stage import set_stage

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.base.strict import Refused
 from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, Part, from_parts

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import validated
+from patchproof.base.validation import validated
 from patchproof.scene.conditions import draw, fields_of
 
 SETTINGS = validated(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused
 from patchproof.scene import flat
 from patchproof.scene.image_scene import ERASED_AREA, FEW, erase
 from patchproof.scene.scene import build_scene

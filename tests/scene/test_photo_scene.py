@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
+from patchproof.base.packaged import packaged_path
 from patchproof.base.settings import SceneSettings, identifying
-from patchproof.base.strict import Refused, shipped
-from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import flat
 from patchproof.scene.conditions import with_values
 from patchproof.scene.paper_light import paper_light, quadratic_terms
@@ -257,7 +258,7 @@ def test_glare_and_shadow_do_not_move_the_light():
 
 def test_overexposed_paper_is_clipped():
     piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "blank")
-    with pytest.raises(CannotJudge, match="clipped: the paper is overexposed"):
+    with pytest.raises(PhotoRejected, match="clipped: the paper is overexposed"):
         paper_light(np.full((400, 400, 3), 255, np.uint8), np.diag([2.0, 2.0, 1.0]), piece, 0.5)
 
 
@@ -307,7 +308,7 @@ def test_what_does_not_fit_is_refused(world, tables, sentence):
 
 
 def test_a_page_too_small_for_the_blank_s_piece_is_refused(world, tmp_path):
-    text = shipped("print_templates", "a4.toml").read_text(encoding="utf-8")
+    text = packaged_path("print_templates", "a4.toml").read_text(encoding="utf-8")
     assert "167.0, 180.0]" in text
     (tmp_path / "small.toml").write_text(text.replace("167.0, 180.0]", "120.0, 120.0]"), encoding="utf-8")
     with pytest.raises(Refused, match=r"at most 119\.6 × 119\.6 mm on this page, got 162 × 162 mm"):
@@ -343,6 +344,6 @@ def test_each_unusable_photograph_has_its_code(world, tmp_path):
     }
     for code, (pixels, manifest) in cases.items():
         Image.fromarray(pixels).save(tmp_path / "photo.png")
-        with pytest.raises(CannotJudge) as caught:
+        with pytest.raises(PhotoRejected) as caught:
             see(tmp_path / "photo.png", manifest, piece, SIZE)
         assert caught.value.code == code, caught.value

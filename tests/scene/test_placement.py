@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.base.strict import Refused
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.scene.placement import LIFT_MM, patch_frame, place_card
 

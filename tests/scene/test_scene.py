@@ -9,7 +9,7 @@ import trimesh
 from conftest import SCENE
 
 from patchproof.base import geometry
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.channel.printer import identity_printer
 from patchproof.render.designs import PrintedPiece
 from patchproof.render.photograph import expose, photograph

@@ -10,8 +10,8 @@ from scipy.spatial import Delaunay
 from tolerances import CODE
 
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.base.strict import Refused
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Material, Part, from_parts
 from patchproof.mesh.texels import coverage, face_counts

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from conftest import SCENE
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import load_scene_settings
-from patchproof.base.strict import Refused
 from patchproof.reprints.hung import hang
 from patchproof.reprints.run_sheet import _wrapped
 from patchproof.reprints.shots import shot_sections

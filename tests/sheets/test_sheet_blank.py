@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from patchproof.base.strict import Refused, shipped
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
 from patchproof.sheets.blank import blank_piece, blank_sheet
 from patchproof.sheets.piece import lay_out_piece
 from patchproof.sheets.raster import attached_manifest, piece_pixels
 from patchproof.sheets.template import load_template
 from test_sheet_write import words_px
 
-BLANK = shipped("print_templates", "blank_a4.toml")
+BLANK = packaged_path("print_templates", "blank_a4.toml")
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from patchproof.base.strict import Refused, shipped
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
 from patchproof.sheets.blank import blank_page, blank_sheet
 from patchproof.sheets.board import board_sheet, is_board, load_board
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.raster import attached_manifest, page_pixels
 
-FILE = shipped("print_templates", "charuco_a4.toml")
+FILE = packaged_path("print_templates", "charuco_a4.toml")
 
 
 @pytest.fixture(scope="module")

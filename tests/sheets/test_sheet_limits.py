@@ -12,7 +12,7 @@ import pikepdf
 import pytest
 
 from patchproof.base import input as bounds
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets import raster
 from patchproof.sheets.blank import blank_sheet
 from patchproof.sheets.raster import page_pixels
@@ -67,7 +67,7 @@ def test_a_process_that_has_left_a_page_behind_ends_as_any_other(tmp_path):
     forms_in_forms(tmp_path / "endless.pdf", 10)
     code = (
         "import sys; from patchproof.base import input; from patchproof.sheets.raster import page_pixels;"
-        "from patchproof.base.strict import Refused; input.SECONDS = 0.2\n"
+        "from patchproof.base.validation import Refused; input.SECONDS = 0.2\n"
         "try: page_pixels(sys.argv[1])\nexcept Refused: sys.exit(7)"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "endless.pdf")]

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from patchproof.base.strict import Refused, shipped
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import Box, prove_apart
 from patchproof.sheets.page import largest_piece_mm, lay_out_page, qr_rects_mm
@@ -120,7 +121,7 @@ def test_ink_in_the_margin_is_caught(rect):
     ],
 )
 def test_a_template_whose_parts_collide_is_refused(tmp_path, old, new, what):
-    text = shipped("print_templates", "a4.toml").read_text(encoding="utf-8")
+    text = packaged_path("print_templates", "a4.toml").read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "mine.toml"
     path.write_text(text.replace(old, new), encoding="utf-8")

@@ -11,8 +11,10 @@ import pikepdf
 import pypdfium2
 import pytest
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.base.strict import Refused, read_toml, shipped
+from patchproof.base.packaged import packaged_path
+from patchproof.base.validation import read_toml
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges
@@ -56,7 +58,7 @@ def write(path, name, piece_mm=None, marker_mm=None, design=DESIGN, **more):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_page_has_its_markers_within_a_tenth_of_a_millimeter_its_code_and_its_fonts(tmp_path, name):
-    path, margin = tmp_path / "s.pdf", read_toml(shipped("print_templates", f"{name}.toml"))["margin_mm"]
+    path, margin = tmp_path / "s.pdf", read_toml(packaged_path("print_templates", f"{name}.toml"))["margin_mm"]
     manifest = write(path, name)
     with pikepdf.open(path) as pdf:
         count = len(pdf.pages)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.piece import (
     KINDS,
     black_runs,

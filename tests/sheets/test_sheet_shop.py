@@ -8,7 +8,7 @@ import pytest
 from pikepdf import Array, Name
 from PIL import Image
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.shop import shop_lines
 from test_photo_label import sheet
 

@@ -5,11 +5,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from patchproof.base.strict import Refused, shipped
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
 from patchproof.sheets.chart import CORNERS, GRAYS, chart_colors, chart_swatches, sobol
 from patchproof.sheets.template import load_template, template_names
 
-A4 = shipped("print_templates", "a4.toml")
+A4 = packaged_path("print_templates", "a4.toml")
 
 
 def changed(tmp_path, old, new):

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from patchproof.base.color import linear_from_srgb
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import dump_manifest, load_manifest
 from patchproof.sheets.pdf import srgb_profile

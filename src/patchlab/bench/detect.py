@@ -17,10 +17,10 @@ from patchlab.bench.measure import clocked
 from patchlab.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
 from patchlab.study.claims import median
 from patchproof.base.geometry import apply_homography, rect_corners
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import find_sheet
 from patchproof.photo.detect import COARSEST_PX, levels, look, whole
 from patchproof.photo.rectify import fit_page
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.tables import Table
 from patchproof.sheets.markers import DICTIONARY, printed_markers
 
@@ -114,6 +114,6 @@ def _errors(corners: Corners, sheet: Sheet) -> np.ndarray:
     design = rect_corners(DESIGN_MM)
     try:
         fit = fit_page(corners, corners_mm())
-    except (CannotJudge, np.linalg.LinAlgError):
+    except (PhotoRejected, np.linalg.LinAlgError):
         return np.full(4, np.inf)
     return np.linalg.norm(apply_homography(fit.px_from_mm, design) - sheet.px(design), axis=1)

@@ -20,7 +20,7 @@ from patchlab.bench.measure import clocked
 from patchproof.app.demo import SCENE
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.settings import OptimizeSettings, SceneSettings
-from patchproof.base.strict import validated
+from patchproof.base.validation import validated
 from patchproof.base.workers import threads
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem

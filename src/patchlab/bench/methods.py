@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from patchlab.paper.patch3d import design_shares
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.loop import best_design, views_seen
 from patchproof.optimizer.problem import Problem

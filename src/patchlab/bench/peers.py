@@ -32,7 +32,7 @@ from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import gain_of, hardest, rate_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.demo import demo_scene
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.base.workers import threads
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.promise import shown_with_controls

@@ -13,8 +13,9 @@ from pathlib import Path
 from patchlab.bench.chart import Chart, OnStage, checks_table, failed_checks, points_table
 from patchlab.bench.draw import drawing
 from patchlab.bench.measure import describe, machine
+from patchproof.base.errors import Refused
 from patchproof.base.output import new_folder
-from patchproof.base.strict import Refused, nearest
+from patchproof.base.validation import nearest
 from patchproof.report.tables import Results, write_results
 
 Bench = Callable[[bool, OnStage], Iterator[Chart]]

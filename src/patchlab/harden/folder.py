@@ -28,12 +28,13 @@ from patchlab.study.claims import clustered
 from patchlab.study.grid import Count, Names, short_name
 from patchlab.study.study import HERE, Cell, Finished, Result, Study, Work, carry_out
 from patchproof.base.claims import difference, rate
+from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes, write_whole
-from patchproof.base.strict import Positive, Refused, Share, Strict, expand
+from patchproof.base.validation import Positive, Share, Strict, expand
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
-from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.tables import Table
 
 Attack = Literal["fgsm", "pgd"]
@@ -103,7 +104,7 @@ def run(settings: HardenSettings, base: Path, cell: Cell) -> dict[str, Any]:
         try:
             originals.append(read_large_enough(folder / photo["file"]))
             photos.append(photo | {"right": {}})
-        except CannotJudge as cannot:
+        except PhotoRejected as cannot:
             unread.append({"file": photo["file"], "reason": cannot.advice})
     labels, pictures, files = [photo["label"] for photo in photos], originals, {}
     if photos and "variant" in values:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, readable_formats
-from patchproof.base.strict import Refused
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.image_scene import label_rows
 
 BLOCK_PHOTOS, BLOCK_PX = 8, 4_000_000  # of photographs hardened together: some 200 MB with gradients
@@ -69,9 +69,9 @@ def in_blocks(folder: Path, rows) -> Iterator[list]:
 
 
 def read_large_enough(path: Path) -> np.ndarray:
-    """A photograph as uint8 H×W×3; `CannotJudge` where it is no picture or a few pixels only."""
+    """A photograph as uint8 H×W×3; `PhotoRejected` where it is no picture or a few pixels only."""
     srgb = read_photo(path).srgb
     if min(srgb.shape[:2]) < SMALLEST_PX:
         shape = "×".join(map(str, srgb.shape[1::-1]))
-        raise CannotJudge("too_small", min(srgb.shape[:2]), SMALLEST_PX, f"{shape} px are too few: use a larger one")
+        raise PhotoRejected("too_small", min(srgb.shape[:2]), SMALLEST_PX, f"{shape} px are too few: use a larger one")
     return srgb

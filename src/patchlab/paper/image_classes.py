@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from patchlab.harden.labeled import write_labels
 from patchlab.study.grid import Values, scene_of
 from patchproof.base.color import srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
 from patchproof.base.settings import (
     BackgroundSettings,
@@ -31,7 +32,7 @@ from patchproof.base.settings import (
     TargetSettings,
     ViewSettings,
 )
-from patchproof.base.strict import Positive, PositiveRange, Range, Refused, Share, Strict, expand
+from patchproof.base.validation import Positive, PositiveRange, Range, Share, Strict, expand
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import as_pixels
 from patchproof.optimizer.responses import in_parts

@@ -33,7 +33,8 @@ from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import difference, rate
-from patchproof.base.strict import Refused, expand, nearest
+from patchproof.base.errors import Refused
+from patchproof.base.validation import expand, nearest
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier

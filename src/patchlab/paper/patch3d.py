@@ -34,8 +34,9 @@ from patchlab.study.pictures import contact_sheet, enlarged, photographs
 from patchlab.study.record import Record, hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import difference, rate
+from patchproof.base.errors import Refused
 from patchproof.base.settings import ObjectSettings, PatchSettings, SceneSettings, ViewSettings
-from patchproof.base.strict import Range, Refused, Share
+from patchproof.base.validation import Range, Share
 from patchproof.optimizer.loop import best_design, views_seen
 from patchproof.optimizer.patch import Patch
 from patchproof.optimizer.pixels import from_pixels

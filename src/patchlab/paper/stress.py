@@ -43,7 +43,7 @@ from patchlab.study.pictures import contact_sheet, photographs
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.claims import difference, paired_difference, rate
-from patchproof.base.strict import Share, Strict
+from patchproof.base.validation import Share, Strict
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, ask, in_parts, joined
 from patchproof.report.tables import Drawing, Table

@@ -20,9 +20,10 @@ import torch
 from patchlab.study.figures import number_grid
 from patchlab.study.grid import Count, GridSettings, grid_cells
 from patchlab.study.study import Cell
+from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, Strict
+from patchproof.base.validation import Strict
 from patchproof.channel.effects import EFFECT, EFFECTS
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.responses import Answers, ask, in_parts, joined, responses

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from patchproof.base.strict import Refused, nearest
+from patchproof.base.errors import Refused
+from patchproof.base.validation import nearest
 
 _PAGE = Path(__file__).with_name("measured.md")
 

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from patchlab.study.study import Cell, Result
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Strict, expand, read_toml, validated
+from patchproof.base.validation import Strict, expand, read_toml, validated
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene

@@ -24,9 +24,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
 from patchproof.base.output import check_folder, make_folder, write_whole
-from patchproof.base.strict import Refused, Strict, nearest, read_toml, validated
+from patchproof.base.validation import Strict, nearest, read_toml, validated
 from patchproof.base.workers import open_workers, result_of, threads
 from patchproof.report.tables import Drawing, Results, Table, write_json, write_results
 

@@ -22,7 +22,7 @@ from patchlab.training.pictures import HELD_OUT, dressed, views_of
 from patchproof.base.color import codes_of
 from patchproof.base.output import check_folder, make_folder
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import read_toml, validated
+from patchproof.base.validation import read_toml, validated
 from patchproof.mesh import primitives
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage

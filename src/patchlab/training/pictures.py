@@ -18,7 +18,7 @@ from torch import Tensor
 
 from patchproof.base.color import codes_of
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import validated
+from patchproof.base.validation import validated
 from patchproof.classifier.network import center_square
 from patchproof.mesh import primitives
 from patchproof.mesh.mesh import Mesh

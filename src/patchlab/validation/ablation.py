@@ -30,9 +30,10 @@ from patchlab.study.record import hits_of, recorded
 from patchlab.study.study import Cell, Result, Study
 from patchproof.app.plan.terms import PRINTER, Setup, effect_terms, scene_terms
 from patchproof.base.claims import Estimate
+from patchproof.base.errors import Refused
 from patchproof.base.sessions import in_sessions, spread_of
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.channel.effects import EFFECT
 from patchproof.channel.printer import identity_printer
 from patchproof.optimizer.loop import best_design

@@ -24,9 +24,9 @@ import torch
 from patchlab.validation.known_boards import Pose, Printed, moved, paper_share
 from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE, codes_of
 from patchproof.channel.camera import READ_SHARE, SMALLEST_BLUR_PX, blurred, encoded
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import LIGHT
 from patchproof.photo.quality import CLIPPED_CODE
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.paper_light import quadratic_terms
 
 # px, to 4.4; a smaller one than 0.4 the channel skips
@@ -68,15 +68,15 @@ class BoardFit:
 
 
 def fit_board(srgb: np.ndarray, pose: Pose) -> BoardFit:
-    """What light, black and blur explain the board best; `CannotJudge` where it is too small or overexposed."""
+    """What light, black and blur explain the board best; `PhotoRejected` where it is too small or overexposed."""
     mask = pose.mask(srgb.shape)
     clipped = np.asarray((srgb >= CLIPPED_CODE).any(-1))
     known = np.flatnonzero(mask & ~clipped)
     if mask.sum() < _LEAST_PIXELS:
-        raise CannotJudge("too_small", int(mask.sum()), _LEAST_PIXELS, "the board has too few pixels")
+        raise PhotoRejected("too_small", int(mask.sum()), _LEAST_PIXELS, "the board has too few pixels")
     lost = float(clipped[mask].mean())
     if lost > _MOST_CLIPPED:
-        raise CannotJudge("clipped", lost, _MOST_CLIPPED, f"{lost:.0%} of the board is overexposed")
+        raise PhotoRejected("clipped", lost, _MOST_CLIPPED, f"{lost:.0%} of the board is overexposed")
     known = np.random.default_rng(0).permutation(known)[:_MOST_PIXELS]  # fixed: the same figures each time
     places = _places(srgb.shape)
     terms, light = _quadratic(places, srgb.shape)[known], LIGHT[srgb].reshape(-1, 3)[known].astype(float)

@@ -26,10 +26,11 @@ from patchlab.study.record import corner_error_mm
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.hung import hang_piece
 from patchproof.base.claims import Estimate, rate
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.base.output import image_pixels
 from patchproof.base.resample import sixteenths
-from patchproof.base.strict import Refused, Share, Strict
+from patchproof.base.validation import Share, Strict
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges

@@ -3,7 +3,7 @@
 In: an uint8 photograph and the `BoardSettings` of what it shows. Out: a `Pose`: every printed square with the
 homography that takes it into the photograph, and the mask of the pixels in which the pattern is known, which are those
 of the markers that were found and of what lies between them. A grid and a ChArUco board lie in one plane; where its
-homography misses the markers' corners by too much, `CannotJudge`. Loose markers have a plane each.
+homography misses the markers' corners by too much, `PhotoRejected`. Loose markers have a plane each.
 Left out on purpose: boards that are bent. A lens that bends, and paper that is nearly flat, are followed by `moved`.
 """
 
@@ -19,10 +19,10 @@ from pydantic import Field, model_validator
 
 from patchproof.base.geometry import apply_homography, fit_homography, rect_corners
 from patchproof.base.resample import between_indices, sixteenths
-from patchproof.base.strict import NotNegative, Strict
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.validation import NotNegative, Strict
 from patchproof.photo.detect import find_markers
 from patchproof.photo.rectify import fit_page, part_around
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import board_squares, cells_of, marker_corner
 
 LEAST_MARKERS = 4  # of a grid or a ChArUco board: two are met by planes that are far off
@@ -108,12 +108,12 @@ class Pose:
 
 
 def find_pose(srgb: np.ndarray, board: BoardSettings) -> Pose:
-    """The board in an uint8 photograph; `CannotJudge` where too few markers or no plane are to be seen."""
+    """The board in an uint8 photograph; `PhotoRejected` where too few markers or no plane are to be seen."""
     detected = find_markers(srgb, set(board.names), dictionary=board.dictionary)
     least = 1 if board.kind == "loose" else min(LEAST_MARKERS, len(board.names))
     if len(detected.markers) < least:
         advice = f"{len(detected.markers)} markers of {board.dictionary} with the board's ids were found"
-        raise CannotJudge("too_few_markers", len(detected.markers), least, advice)
+        raise PhotoRejected("too_few_markers", len(detected.markers), least, advice)
     corners_px = detected.corners_px
     module_px = float(np.median([borders.module_px for borders in detected.markers.values()]))
     if board.kind == "loose":
@@ -135,7 +135,7 @@ def _plane(board: BoardSettings, corners_px: Mapping[int, np.ndarray], module_px
     misfit_px = float(np.sqrt((np.concatenate(off) ** 2).sum(1).mean()))
     if misfit_px > LARGEST_MISFIT * module_px:
         advice = f"no plane fits: corners lie {misfit_px:.2f} px off it, a module is {module_px:.1f} px"
-        raise CannotJudge("curled", misfit_px, LARGEST_MISFIT * module_px, advice)
+        raise PhotoRejected("curled", misfit_px, LARGEST_MISFIT * module_px, advice)
     return fit.px_from_mm, misfit_px
 
 

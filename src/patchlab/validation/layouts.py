@@ -35,7 +35,7 @@ from patchlab.validation.hung import hang_piece
 from patchproof.base.claims import Estimate, rate
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.output import image_pixels
-from patchproof.base.strict import Positive, Strict
+from patchproof.base.validation import Positive, Strict
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.measure import measure
 from patchproof.evidence.ranges import promised_ranges

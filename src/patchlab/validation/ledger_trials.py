@@ -29,7 +29,7 @@ from patchlab.validation.hung import hang_own
 from patchproof.base.claims import rate
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.output import image_pixels
-from patchproof.base.strict import Strict
+from patchproof.base.validation import Strict
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier

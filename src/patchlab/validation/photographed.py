@@ -26,7 +26,7 @@ from patchlab.study.grid import (
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result
 from patchproof.base.sessions import Spread, in_sessions, spread_of
-from patchproof.base.strict import expand
+from patchproof.base.validation import expand
 
 if TYPE_CHECKING:
     from patchproof.optimizer.run import Run

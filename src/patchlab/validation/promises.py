@@ -36,8 +36,9 @@ from patchlab.validation.photographed import (
     take_photos,
 )
 from patchproof.base.claims import rate
+from patchproof.base.errors import Refused
 from patchproof.base.sessions import TAIL, Spread, in_sessions, spread_of
-from patchproof.base.strict import Refused, nearest
+from patchproof.base.validation import nearest
 from patchproof.optimizer.problem import set_problem
 from patchproof.optimizer.promise import shown_with_controls
 from patchproof.optimizer.responses import responses

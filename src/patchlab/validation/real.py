@@ -30,14 +30,14 @@ from patchproof.base.color import LUMINANCE, linear_from_srgb
 from patchproof.base.geometry import rect_corners
 from patchproof.base.output import image_bytes, image_pixels
 from patchproof.base.settings import CameraSettings, PrinterSettings
-from patchproof.base.strict import Strict, expand
+from patchproof.base.validation import Strict, expand
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.read import list_photos, read_photo
 from patchproof.photo.rectify import part_around
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.report.images import png
 from patchproof.report.tables import Drawing, Table
 
@@ -91,7 +91,7 @@ def run(settings: RealSettings, base: Path, cell: Cell) -> dict[str, Any]:
         srgb = read_photo(expand(cell.values["photo"], base)).srgb
         pose = find_pose(srgb, settings.boards[cell.values["board"]])
         fit = fit_board(srgb, pose)
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         return {"left_out": cannot.advice}
     ours = fit.rendered()
     pasted = np.where(fit.mask[..., None], ours, srgb)

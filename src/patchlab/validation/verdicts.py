@@ -19,7 +19,7 @@ from patchlab.study.grid import Count
 from patchlab.study.study import Cell, Result, Study
 from patchproof.base.goal import Goal
 from patchproof.base.sessions import Spread, evenly
-from patchproof.base.strict import Positive, Share, Strict
+from patchproof.base.validation import Positive, Share, Strict
 from patchproof.evidence.verdict import judge
 from patchproof.optimizer.promise import PER_SESSION, PROMISE_VIEWS
 from patchproof.report.tables import Drawing, Table

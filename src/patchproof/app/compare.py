@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from patchproof.base.claims import difference, rate
+from patchproof.base.errors import Refused
 from patchproof.base.output import new_folder
-from patchproof.base.strict import Refused, listed
+from patchproof.base.validation import listed
 from patchproof.base.workers import open_workers
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.evaluate import answers_of, forget, refuse_unnamed

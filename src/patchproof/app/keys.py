@@ -19,8 +19,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, Strict, models_in, nearest, ordered
+from patchproof.base.validation import Strict, models_in, nearest, ordered
 from patchproof.sheets.board import BoardTemplate
 from patchproof.sheets.template import Template
 
@@ -167,7 +168,7 @@ def _bounds(checks: tuple[Any, ...]) -> list[tuple[str, Any]]:
     """What a type's checks bound it by, by pydantic's names."""
     bounds = []
     for check in checks:
-        if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # strict.within
+        if isinstance(check, AfterValidator) and isinstance(check.func, partial):  # validation.within
             bounds += zip(("ge", "le"), check.func.args, strict=True)
         for limit in getattr(check, "metadata", ()):
             names = ("ge", "gt", "le", "lt", "min_length")

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
 from patchproof.base.output import check_folder, write_whole
-from patchproof.base.strict import Refused
 from patchproof.channel.cameras import camera_of
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier

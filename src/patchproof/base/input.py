@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused, TimeLimitExceeded
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -90,20 +90,12 @@ def readable_formats() -> list[str]:
     return [name for name in FORMATS if name in Image.OPEN]
 
 
-class OutOfTime(Exception):
-    """The work has taken so many `seconds` of this process's time."""
-
-    def __init__(self, seconds: float):
-        super().__init__(f"more than {seconds:g} s of processor time")
-        self.seconds = seconds
-
-
 class _Expired(BaseException):
     """The time is over; no `except Exception` on the way may think otherwise."""
 
 
 def within_time(work: Callable[Arguments, Result], *arguments: Arguments.args, **keywords: Arguments.kwargs) -> Result:
-    """What `work` returns; `OutOfTime` when it takes too long."""
+    """What `work` returns; `TimeLimitExceeded` when it takes too long."""
     if not has_timer() or signal.getitimer(signal.ITIMER_PROF)[0] > 0:
         return work(*arguments, **keywords)
     armed = [True]
@@ -123,7 +115,7 @@ def within_time(work: Callable[Arguments, Result], *arguments: Arguments.args, *
     except _Expired:
         armed.clear()  # it may have come just before the same two lines above
         signal.setitimer(signal.ITIMER_PROF, 0)
-        raise OutOfTime(SECONDS) from None
+        raise TimeLimitExceeded(SECONDS) from None
     finally:
         signal.signal(signal.SIGPROF, before)
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from patchproof.base.goal import Goal
-from patchproof.base.strict import (
+from patchproof.base.validation import (
     Finite,
     NotNegative,
     NotNegativeRange,

@@ -28,20 +28,13 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused, WorkerDied
 
 Numbered = tuple[int, Any]
 TRIES = 3  # of an item whose worker dies each time
 QUEUED = 1000  # items that a cluster is given at a time: enough to keep it busy, and for it to see what is to come
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds of a processor in how many
 _ANSWER_S = 10  # that a cluster's scheduler may take to answer
-
-
-class WorkerDied(Refused):
-    """One item's worker died at each try; the others' results stand."""
-
-    def __reduce__(self):
-        return WorkerDied, self._parts
 
 
 class Workers:

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import photo_codes_of
+from patchproof.base.errors import Refused
 from patchproof.base.input import readable_formats
-from patchproof.base.strict import Refused
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import detected, detector_settings, luminance
 from patchproof.photo.limits import limited
 from patchproof.photo.read import list_photos, read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.board import Board
 from patchproof.sheets.markers import DICTIONARY, printed_markers
 
@@ -63,7 +63,7 @@ def see_boards(
             view, focal_px = limited(_view, path, board, places)
             views.append(view)
             states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
-        except CannotJudge as cannot:
+        except PhotoRejected as cannot:
             left[path.name] = cannot.advice
         progress(number, len(paths))
     if not views:
@@ -87,7 +87,7 @@ def _view(path: Path, board: Board, places_mm: np.ndarray) -> tuple[View, float 
     ids, px, markers = find_corners(photo.srgb, board)
     if len(ids) < FEWEST_CORNERS or np.linalg.matrix_rank(places_mm[ids] - places_mm[ids].mean(0)) < 2:
         advice = f"{markers} markers and {len(ids)} corners of the board were read, {FEWEST_CORNERS} corners are needed"
-        raise CannotJudge("too_few_markers", len(ids), FEWEST_CORNERS, f"{advice}: show more of it, sharp")
+        raise PhotoRejected("too_few_markers", len(ids), FEWEST_CORNERS, f"{advice}: show more of it, sharp")
     height, width = photo.srgb.shape[:2]
     return View(path.name, ids, places_mm[ids], px, (width, height)), photo.focal_px
 

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import check_file, write_together
-from patchproof.base.strict import Refused
 from patchproof.calibrate.boards import FEWEST_CORNERS, View, see_boards
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import NUMBERS, Fit, climb, fit_rung

@@ -23,16 +23,16 @@ import numpy as np
 import torch
 
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
-from patchproof.base.strict import Refused
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
 from patchproof.calibrate.printer_files import printer_from_table, shown_colors
 from patchproof.channel.lens import Camera
 from patchproof.channel.printer import Printer, load_printer, node_colors, vary
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.limits import limited
 from patchproof.photo.read import pictures_in, read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest
 
 PRIORS = ("coated", "uncoated")
@@ -222,7 +222,7 @@ def _read_all(
             try:
                 photo = limited(lambda path: read_chart(read_photo(path), manifest, camera), path)
                 readings.append(Reading(path, number, photo))
-            except CannotJudge as cannot:
+            except PhotoRejected as cannot:
                 warnings.append(f"{path.name} is left out ({cannot})")
             on_photo(len(readings) + len(warnings), total)
     if not readings:

@@ -17,12 +17,12 @@ import numpy as np
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
 from patchproof.channel.lens import Camera
 from patchproof.channel.tone import light_of_codes
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.quality import CLIPPED_CODE, blur_px
 from patchproof.photo.read import Photo
 from patchproof.photo.rectify import fit_page
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import Manifest, Marker
 from patchproof.sheets.rects import RectMm, holds
 
@@ -63,7 +63,7 @@ class _Page:
 
 
 def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -> ChartPhoto:
-    """The chart's swatches; `CannotJudge` where there is none, or none that can be trusted."""
+    """The chart's swatches; `PhotoRejected` where there is none, or none that can be trusted."""
     page = _find_page(photo.srgb, manifest)
     rows = chart_rows(manifest, page.number)
     cores, readable = [], []
@@ -74,7 +74,7 @@ def read_chart(photo: Photo, manifest: Manifest, camera: Camera | None = None) -
             readable.append(row)
     if not readable:
         advice = "come closer to the chart, hold still and show all of it"
-        raise CannotJudge("too_small", page.px_per_mm, None, advice)
+        raise PhotoRejected("too_small", page.px_per_mm, None, advice)
     places = _bare_places(manifest, page, photo.srgb.shape)
     whites = [core for core, row in zip(cores, readable, strict=True) if min(manifest.chart[row].srgb) == 1]
     places = np.concatenate([places, np.reshape(whites, (-1, 4))])
@@ -115,18 +115,18 @@ def _find_page(srgb: np.ndarray, manifest: Manifest) -> _Page:
         fit = together
     rects = np.array([manifest.chart[i].rect_mm for i in chart_rows(manifest, number)]).reshape(-1, 4)
     if not len(rects):
-        raise CannotJudge("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")
+        raise PhotoRejected("too_few_markers", 0, 1, "there is no chart on this page: photograph the one that has it")
     scale, _ = local_scale(fit.px_from_mm, tuple((rects[:, :2] + rects[:, 2:] / 2).mean(0)))
     return _Page(number, fit.px_from_mm, blur_px(detected.markers.values()), float(scale))
 
 
-def _no_sheet(srgb: np.ndarray, detected: MarkersInView, markers: list[Marker], dictionary: str) -> CannotJudge:
+def _no_sheet(srgb: np.ndarray, detected: MarkersInView, markers: list[Marker], dictionary: str) -> PhotoRejected:
     if is_mirrored(srgb, {marker.id for marker in markers}, dictionary):
-        return CannotJudge("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
+        return PhotoRejected("mirrored", None, None, "the photo is mirrored: switch off the camera's mirror setting")
     if detected.foreign:
         advice = "these are the markers of another sheet: name that sheet's JSON, or leave the photo out"
-        return CannotJudge("wrong_sheet", len(detected.foreign), 0, advice)
-    return CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
+        return PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
+    return PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the page sharp and well lit")
 
 
 def _core(rect: RectMm, page: _Page, shape) -> RectMm | None:
@@ -165,11 +165,13 @@ def _bare_places(manifest: Manifest, page: _Page, shape) -> np.ndarray:
 def _paper(srgb: np.ndarray, page: _Page, places: np.ndarray, camera: Camera | None):
     """(places N×2 mm → the light of bare paper there, misfit): exp of a polynomial per channel, fitted robustly."""
     if not len(places):
-        raise CannotJudge("too_small", 0, 1, "no bare paper is in view: show the white paper around the chart")
+        raise PhotoRejected("too_small", 0, 1, "no bare paper is in view: show the white paper around the chart")
     codes = _codes(srgb, page, places.T, 5)
     clipped = float(np.median((codes >= CLIPPED_CODE).any(-1).mean(1)))
     if clipped > MOST_CLIPPED:
-        raise CannotJudge("clipped", clipped, MOST_CLIPPED, "the paper is overexposed: lower the exposure by one step")
+        raise PhotoRejected(
+            "clipped", clipped, MOST_CLIPPED, "the paper is overexposed: lower the exposure by one step"
+        )
     light = np.log(np.maximum(light_of_codes(codes / 255, camera).mean(1), 1e-4))
     centers = places[:, :2] + places[:, 2:] / 2
     middle, reach = centers.mean(0), max(float(np.ptp(centers, 0).max()), 1.0) / 2

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.color import ciede2000, codes_of, lab_from_srgb
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.base.strict import Refused
 from patchproof.calibrate.printer_files import printer_from_table, shown_colors
 from patchproof.channel.printer import NODES_8BIT, Printer, node_colors
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.calibrate.boards import View
 from patchproof.calibrate.ladder import Rung, compared, simplest
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import check_file, write_together
-from patchproof.base.strict import Refused
 from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
 from patchproof.calibrate.printer_files import save_printer

@@ -22,8 +22,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
-from patchproof.base.strict import Finite, Positive, Refused, Share, Strict, nearest, shipped, validated
+from patchproof.base.packaged import packaged_path
+from patchproof.base.validation import Finite, Positive, Share, Strict, nearest, validated
 from patchproof.channel.frame import Frame
 
 if TYPE_CHECKING:
@@ -202,10 +204,10 @@ def _path(name_or_file: str, base: Path | None) -> Path:
         if not is_file(path):
             raise Refused("a camera file (JSON)", f"no file at {path}", "check the path")
         return path
-    known = sorted(file.stem for file in shipped("calibration", "cameras").glob("*.json"))
+    known = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
     if name_or_file not in known:
         raise Refused("a camera's name or file", f'"{name_or_file}"', nearest(name_or_file, known))
-    return shipped("calibration", "cameras", f"{name_or_file}.json")
+    return packaged_path("calibration", "cameras", f"{name_or_file}.json")
 
 
 def _refuse_folded(camera: Camera, where: str) -> None:

@@ -23,8 +23,10 @@ from pydantic import Field
 from torch import Tensor
 
 from patchproof.base.color import clamped
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
-from patchproof.base.strict import Finite, Refused, Strict, nearest, shipped, validated
+from patchproof.base.packaged import packaged_path
+from patchproof.base.validation import Finite, Strict, nearest, validated
 
 # 8-bit values that exist, so that a table baked by an 8-bit engine is exact at its nodes: 0, 8, ..., 248, 255
 NODES_8BIT = (*range(0, 249, 8), 255)
@@ -113,10 +115,10 @@ def load_printer(name_or_file: str, base: Path | None = None) -> Printer:
         raise Refused("a printer model (.npz)", f"the ICC profile {name_or_file}", do)
     if suffix in {".npz", ".json"} or len(Path(name_or_file).parts) > 1:
         return _read((base or Path()) / name_or_file)
-    known = sorted(path.stem for path in shipped("calibration", "printers").glob("*.npz"))
+    known = sorted(path.stem for path in packaged_path("calibration", "printers").glob("*.npz"))
     if name_or_file not in known:
         raise Refused("a printer's name or file", f'"{name_or_file}"', nearest(name_or_file, [*known, "identity"]))
-    return _read(shipped("calibration", "printers", f"{name_or_file}.npz"))
+    return _read(packaged_path("calibration", "printers", f"{name_or_file}.npz"))
 
 
 def _read(path: Path) -> Printer:

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.network import Classifier
 
 INPUT_PX = 96

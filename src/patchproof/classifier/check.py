@@ -14,7 +14,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.network import NOTHING, Classifier
 
 # Logits differ by rounding when the batch does: 1e-6 of their spread in float32 here, 1e-3 with TF32. A dropout or a

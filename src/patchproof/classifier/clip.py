@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.labels import nearest_names
 from patchproof.classifier.network import Classifier

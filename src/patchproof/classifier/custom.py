@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import NOTHING, Classifier, weights_sha256
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 
 
 def find_labels(labels: Sequence[str], label: str | int, accept: Sequence[str | int] = ()) -> tuple[int, ...]:

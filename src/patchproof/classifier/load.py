@@ -20,7 +20,8 @@ from pathlib import Path
 
 import torch
 
-from patchproof.base.strict import Refused, expand
+from patchproof.base.errors import Refused
+from patchproof.base.validation import expand
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.check import check_network, smooth_pictures
 from patchproof.classifier.custom import load_custom

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.networks.batches import InBatches
 from patchproof.networks.windows import Windows
 

@@ -16,12 +16,12 @@ import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
-from patchproof.base.strict import Refused
 from patchproof.classifier.detector import Detector
 from patchproof.classifier.network import Classifier
 from patchproof.networks.batches import InBatches
-from patchproof.networks.bounds import Unwanted
+from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.networks.onnx_file import read_onnx
 
 MAX_BYTES = 4 << 30  # larger than any classifier here has been
@@ -46,7 +46,7 @@ def load_network(path: Path) -> Classifier:
 
     try:
         network = InBatches(*read_onnx(stored, beside))
-    except Unwanted as error:
+    except UnsupportedNetwork as error:
         do = "export it in evaluation mode, without custom operators and control flow, opset 13 or later"
         raise Refused("an ONNX file of plain tensors and operators", f"{path} with {error}", do) from error
     except Refused:

@@ -26,8 +26,8 @@ from urllib.request import getproxies
 import torch
 from torch import Tensor, nn
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
-from patchproof.base.strict import Refused
 from patchproof.classifier.check import first_line
 from patchproof.classifier.custom import MOST_FOUND, classifier_of, detector_of
 from patchproof.classifier.detector import Detector

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 
+from patchproof.base.errors import WorkerDied
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.resample import reduced_size, sixteenths
-from patchproof.base.strict import Finite, Share, Strict
-from patchproof.base.workers import WorkerDied, Workers, result_of
+from patchproof.base.validation import Finite, Share, Strict
+from patchproof.base.workers import Workers, result_of
 from patchproof.evidence.boxes import in_square
 from patchproof.evidence.camera import view_of
 from patchproof.evidence.classify import Box, Judges, square_of, squares_of
@@ -32,11 +33,11 @@ from patchproof.evidence.reproject import Shot, shot_of
 from patchproof.evidence.results import PhotoEntry, Remark
 from patchproof.evidence.surface import Surface
 from patchproof.evidence.task import Task
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.exif import of_a_camera
 from patchproof.photo.limits import limited
 from patchproof.photo.quality import FrameLight, shows_nothing
 from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import PhotoRejected
 
 WITH_PICTURES = 120  # photographs shown with pictures; the rest is listed. Keeps the page below some 15 MB
 _THUMBNAIL_PX = 560  # longer side: enough for a phone's width at twice its density, some 40 kB as JPEG
@@ -149,7 +150,7 @@ def _parsed(kept: Mapping[str, Any], item: Item, judges: Judges | None) -> Measu
 def _measured(task: Task, item: Item) -> MeasuredPhoto:
     try:
         return limited(_measure, task, item)
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         return _rejected(item, Remark.of(cannot))
     except (ArithmeticError, ValueError, TypeError, LookupError, MemoryError, cv2.error) as error:
         # no photograph is known that does this; one that does must not cost the others
@@ -218,5 +219,5 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
 
     try:
         return limited(shot)
-    except (CannotJudge, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
+    except (PhotoRejected, ArithmeticError, ValueError, LookupError, MemoryError, cv2.error):
         return None  # read before, so this is a file that went away: the ledger does without

@@ -14,9 +14,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from pydantic import BaseModel
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import rect_corners
 from patchproof.base.input import read_json
-from patchproof.base.strict import Finite, Positive, Refused, nearest, validated
+from patchproof.base.validation import Finite, Positive, nearest, validated
 from patchproof.evidence.classify import Box
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.evidence.results import Prediction
 from patchproof.sheets.manifest import Manifest, Promise
 

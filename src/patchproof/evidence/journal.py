@@ -20,7 +20,7 @@ import numpy as np
 
 from patchproof.base.input import LARGEST_JSON
 from patchproof.base.output import make_folder, write_whole
-from patchproof.base.strict import Strict, validated
+from patchproof.base.validation import Strict, validated
 from patchproof.base.version import __version__
 from patchproof.photo.limits import MOST_BYTES
 

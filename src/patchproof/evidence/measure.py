@@ -21,12 +21,12 @@ from patchproof.evidence.placed import MOST_SHIFT, Placed, geometry_of, object_b
 from patchproof.evidence.ranges import PromisedRanges
 from patchproof.evidence.results import Geometry, PhotoEntry, Remark, Scale
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.complete import complete, find_sheet
 from patchproof.photo.detect import MarkersInView, find_markers, is_mirrored
 from patchproof.photo.label import read_label, refuse_other_page
 from patchproof.photo.quality import FrameLight, frame_light
 from patchproof.photo.rectify import PageFit
+from patchproof.photo.rejection import PhotoRejected
 
 MOST_BLUR = 0.5  # modules of Gaussian sigma: beyond it borders of neighboring cells melt together
 SMALLEST_DESIGN_PX = 24.0  # shorter side: fewer pixels cannot tell a design from its mean color
@@ -83,14 +83,14 @@ def measure(
     """Everything that one readable photograph says; `promised` None leaves color unmeasured."""
     try:
         detected, surface = identify(view.srgb, surface)
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         return MeasuredPhoto(PhotoEntry(file=name, status="rejected", remark=Remark.of(cannot)), False)
     size_px = view.srgb.shape[1], view.srgb.shape[0]
     entry = partial(PhotoEntry, file=name, photo_px=size_px, markers_found=len(detected.markers))
     placed = place(view, detected, surface)
     if placed is None:
         advice = "the marker in view is distorted: show the whole patch"
-        few = CannotJudge("too_few_markers", len(detected.markers), 1, advice)
+        few = PhotoRejected("too_few_markers", len(detected.markers), 1, advice)
         return MeasuredPhoto(entry(status="judged", remark=Remark.of(few)), True)
     light = frame_light(view.srgb, detected.markers.values())
     fit = placed.fit
@@ -107,7 +107,7 @@ def measure(
             refuse_other_page(view.srgb, fit.px_from_mm, surface.page_mm, surface.label)
         if counted and (outside := ranges.violated(entry(status="judged"), trust_angles=trouble is None)) is not None:
             raise outside
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         return MeasuredPhoto(entry(status="rejected", remark=Remark.of(cannot)), False)
     color, pictures = None, {}
     # a page in tiles shows none of the piece's markers, or a part of them
@@ -115,7 +115,7 @@ def measure(
         color, pictures = appearance(placed.srgb, fit.px_from_mm, surface, promised, light, geometry, with_pictures)
         if color.clipped_share > MOST_CLIPPED:
             advice = "the patch is overexposed: lower the exposure by one or two steps"
-            trouble = CannotJudge("clipped", color.clipped_share, MOST_CLIPPED, advice)
+            trouble = PhotoRejected("clipped", color.clipped_share, MOST_CLIPPED, advice)
     if trouble is not None:
         entry = partial(entry, status="judged", remark=Remark.of(trouble))
     else:
@@ -124,8 +124,8 @@ def measure(
 
 
 def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface]:
-    """The sheet's markers and the surface they lie on: the whole, or one page of a piece in tiles. `CannotJudge` where
-    none is seen, or where it is not clear which sheet it is.
+    """The sheet's markers and the surface they lie on: the whole, or one page of a piece in tiles. Raises
+    `PhotoRejected` where none is seen, or where it is not clear which sheet it is.
     """
     wanted = surface.piece_ids or surface.page_ids
     if surface.pages:
@@ -136,16 +136,16 @@ def identify(srgb: np.ndarray, surface: Surface) -> tuple[MarkersInView, Surface
     if not detected.markers:
         if is_mirrored(srgb, surface.all_ids, surface.dictionary):
             advice = "the photo is mirrored: switch off the camera's mirror setting and save it again"
-            raise CannotJudge("mirrored", None, None, advice)
+            raise PhotoRejected("mirrored", None, None, advice)
         label = read_label(srgb)
         if detected.foreign or (label is not None and label != surface.label):
             which = "another sheet" if label is None else f"sheet {label.sheet_id} ({label.printed})"
             advice = f"this shows {which}: name that sheet's JSON, or leave the photo out"
-            raise CannotJudge("wrong_sheet", len(detected.foreign), 0, advice)
-        raise CannotJudge("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
+            raise PhotoRejected("wrong_sheet", len(detected.foreign), 0, advice)
+        raise PhotoRejected("too_few_markers", 0, 1, "no marker is readable: show the whole patch, sharp and well lit")
     if len(detected.foreign) > 1 or len(detected.doubled) > 1:
         others = max(len(detected.foreign), len(detected.doubled))
-        raise CannotJudge("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
+        raise PhotoRejected("several_sheets", others, 1, "more than one sheet is in view: photograph one at a time")
     if not surface.pages:
         return detected, surface
     surface = _page_in_view(detected, surface)
@@ -176,7 +176,7 @@ def _is_uncut(placed: Placed, detected: MarkersInView, surface: Surface) -> bool
 
 def _trouble(
     geometry: Geometry, fit: PageFit, detected: MarkersInView, surface: Surface, corners: int = 4
-) -> CannotJudge | None:
+) -> PhotoRejected | None:
     """Why geometry or color cannot be trusted, the nearest cause first; None where they can. The design shows itself in
     so many of its corners.
     """
@@ -211,7 +211,7 @@ def _trouble(
         (corners < 4, "too_few_markers", corners, 4, _HIDDEN),
     ):
         if wrong:
-            return CannotJudge(code, figure, limit, advice)
+            return PhotoRejected(code, figure, limit, advice)
     return None
 
 

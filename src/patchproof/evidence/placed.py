@@ -17,13 +17,13 @@ from patchproof.evidence.camera import FOCAL_ERROR, View
 from patchproof.evidence.classify import Box
 from patchproof.evidence.results import Focal, Geometry, Pose
 from patchproof.evidence.surface import Promised, Surface
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import MarkersInView
 from patchproof.photo.pose import bent_stance, flat_stance, scale_and_tilt, tilt_uncertainty_deg, turn_rad
 from patchproof.photo.quality import FrameLight, blur_px
 from patchproof.photo.ratio import x_over_y
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
 from patchproof.photo.registration import Registration, register
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.photo.unroll import Unrolled, unroll
 
 MOST_SHIFT = 0.005  # of the design's shorter side, by which its own pixels may lie elsewhere than the markers say
@@ -87,7 +87,7 @@ def _fit(detected: MarkersInView, surface: Surface) -> PageFit | None:
                 fit = replace(together, odd_mm=0.0)
         if not on_piece:
             fit = replace(fit, odd_mm=0.0)
-    except (np.linalg.LinAlgError, CannotJudge):
+    except (np.linalg.LinAlgError, PhotoRejected):
         return None
     return fit if np.isfinite(fit.px_from_mm).all() and np.isfinite(fit.covariance).all() else None
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from patchproof.evidence.results import PhotoEntry
-from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import ConditionClaim, Manifest
 
 MARGIN = 0.10  # of the range's width
@@ -37,7 +37,7 @@ class PromisedRanges:
     limits: dict[str, tuple[float, float]]
     side_px: float | None = None
 
-    def violated(self, entry: PhotoEntry, trust_angles: bool) -> CannotJudge | None:
+    def violated(self, entry: PhotoEntry, trust_angles: bool) -> PhotoRejected | None:
         """The first figure of the photo that the promise does not cover."""
         figures = figures_of(entry, self.side_px)
         for name, (low, high) in self.limits.items():
@@ -52,7 +52,7 @@ class PromisedRanges:
             do = _ADVICE[name][0 if below else 1]
             unit = f" at {self.side_px:g} px of the shorter side" if name == "px_per_mm" and self.side_px else ""
             advice = f"{name} is {value:.3g}{unit}, the promise covers {low:.3g} to {high:.3g}: {do}"
-            return CannotJudge("out_of_range", value, low if below else high, advice)
+            return PhotoRejected("out_of_range", value, low if below else high, advice)
         return None
 
 

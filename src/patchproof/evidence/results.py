@@ -12,8 +12,8 @@ from typing import Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from patchproof.base.goal import Goal
-from patchproof.base.strict import Finite, Strict
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.validation import Finite, Strict
+from patchproof.photo.rejection import PhotoRejected
 
 Status = Literal["judged", "measured", "rejected"]
 Word = Literal["kept", "broken", "cannot_tell"]
@@ -88,7 +88,7 @@ class Remark(Strict):
     threshold: Finite | None = None
 
     @classmethod
-    def of(cls, cannot: CannotJudge) -> Remark:
+    def of(cls, cannot: PhotoRejected) -> Remark:
         """The remark that says why."""
         return cls(code=cannot.code, figure=cannot.figure, threshold=cannot.threshold, advice=cannot.advice)
 

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.base.claims import wilson
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_folder
 from patchproof.base.sessions import TAIL
 from patchproof.base.settings import behind
-from patchproof.base.strict import Refused
 from patchproof.base.workers import open_workers
 from patchproof.evidence.batch import WITH_PICTURES, Item, measure_all, shot_again
 from patchproof.evidence.boxes import box_in

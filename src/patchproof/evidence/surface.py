@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import rect_corners
 from patchproof.base.resample import reduced
-from patchproof.base.strict import Refused
 from patchproof.photo.label import Label, label_of
 from patchproof.sheets.manifest import Manifest, Rect
 from patchproof.sheets.markers import MODULES

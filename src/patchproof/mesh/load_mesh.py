@@ -15,8 +15,8 @@ from typing import Literal
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.resample import reduced
-from patchproof.base.strict import Refused
 from patchproof.mesh.mesh import Material, Mesh, Part, from_parts
 
 GIVEN = "python:"

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 
 
 @dataclass(frozen=True, eq=False)

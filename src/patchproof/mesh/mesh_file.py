@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.errors import Refused
 from patchproof.base.input import FORMATS as PICTURES
 from patchproof.base.input import LARGEST_PX, is_file
-from patchproof.base.strict import Refused
 from patchproof.mesh.assets import MOST_BYTES, Assets
 from patchproof.mesh.mesh import Material, Part, normal_transform, topology_warnings
 

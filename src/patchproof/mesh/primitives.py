@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from patchproof.base.strict import Refused, nearest
+from patchproof.base.errors import Refused
+from patchproof.base.validation import nearest
 from patchproof.mesh.mesh import Mesh, Part, from_parts
 from patchproof.mesh.solids import box, lathe, moved, prism, tube, turned
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import cross, dot
-from patchproof.base.strict import Refused
 
 _CHUNK = 500_000  # line-triangle pairs held at a time, about 150 MB
 

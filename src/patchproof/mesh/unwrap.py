@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.mesh.mesh import Material, Mesh, places_of
 from patchproof.mesh.texels import coverage, face_counts, spans
 

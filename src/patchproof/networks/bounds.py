@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+from patchproof.base.errors import PatchproofError
+
 MAX_NUMBERS = 1 << 31  # along one side of a weight
 MAX_DIMENSIONS = 12
 MAX_LIST = 1 << 10  # numbers in one attribute
 MAX_BATCH = 4096  # pictures, of a network that takes one number of them only
 
 
-class Unwanted(Exception):
+class UnsupportedNetwork(PatchproofError):
     """Something in the file that is not allowed; the text follows "the file with"."""
 
 
@@ -23,5 +25,5 @@ def quoted(value: Any) -> str:
 def whole(value: Any, low: int, high: int) -> int:
     """A whole number from `low` to `high`, and not one in disguise."""
     if type(value) is not int or not low <= value <= high:
-        raise Unwanted(f"{quoted(value)} for a whole number from {low} to {high}")
+        raise UnsupportedNetwork(f"{quoted(value)} for a whole number from {low} to {high}")
     return value

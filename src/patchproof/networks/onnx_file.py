@@ -1,8 +1,8 @@
 """`file:NAME.onnx`: an ONNX file that nobody vouches for, read without onnx.
 
 In: its bytes, and a way to those of NAME.onnx.data, where exporters put large weights. Out: a Program of numbered
-steps (graph.py), and how many pictures it takes; Unwanted where there is anything else in it. Nothing of the file is
-executed, and no text of it becomes a path: where a weight's "location" points is not looked at.
+steps (graph.py), and how many pictures it takes; UnsupportedNetwork is raised for anything else in it. Nothing of the
+file is executed, and no text of it becomes a path: where a weight's "location" points is not looked at.
 Left out on purpose: subgraphs (If, Loop), functions of the file, operators of other domains, sparse and quantized
 weights, opsets before 13, of which onnx.version_converter makes newer ones.
 
@@ -19,7 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.networks.bounds import MAX_BATCH, MAX_DIMENSIONS, MAX_LIST, MAX_NUMBERS, Unwanted, quoted, whole
+from patchproof.networks.bounds import (
+    MAX_BATCH,
+    MAX_DIMENSIONS,
+    MAX_LIST,
+    MAX_NUMBERS,
+    UnsupportedNetwork,
+    quoted,
+    whole,
+)
 from patchproof.networks.graph import Program
 from patchproof.networks.onnx_operators import DTYPES, OPERATORS
 from patchproof.networks.onnx_plain import Way, way_through
@@ -88,7 +96,7 @@ def read_onnx(stored: bytes, beside: Callable[[], bytes]) -> tuple[Program, int 
     model = read_message(stored, _MODEL)
     versions = [opset.get("version", 0) for opset in model.get("opset", []) if opset.get("domain", "") in _STANDARD]
     if len(versions) != 1 or not OPSETS[0] <= versions[0] <= OPSETS[1]:
-        raise Unwanted(f"opset {quoted(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
+        raise UnsupportedNetwork(f"opset {quoted(versions)[1:-1]}, not one from {OPSETS[0]} to {OPSETS[1]}")
     return _Reader(model["graph"], _Weights(beside)).read()
 
 
@@ -106,15 +114,17 @@ class _Weights:
         sizes = [whole(size, 0, MAX_NUMBERS) for size in content.get("dims", [])]
         dtype = DTYPES.get(content.get("data_type", 0))
         if dtype is None or len(sizes) > MAX_DIMENSIONS:
-            raise Unwanted(f"{quoted(content.get('name'))} of a type that is not supported")
+            raise UnsupportedNetwork(f"{quoted(content.get('name'))} of a type that is not supported")
         if "ints" in content or "longs" in content:
             values = torch.tensor(content.get("ints") or content["longs"], dtype=torch.int64).to(dtype)
             if dtype.is_floating_point:
-                raise Unwanted("bits of fractions in a list of integers")
+                raise UnsupportedNetwork("bits of fractions in a list of integers")
         else:
             values = _from_bytes(self._bytes(content), dtype)
         if values.numel() != math.prod(sizes):
-            raise Unwanted(f"{values.numel()} numbers in {quoted(content.get('name'))} of the shape {quoted(sizes)}")
+            raise UnsupportedNetwork(
+                f"{values.numel()} numbers in {quoted(content.get('name'))} of the shape {quoted(sizes)}"
+            )
         return values.reshape(sizes)
 
     def _bytes(self, content: dict[str, Any]) -> Any:
@@ -124,21 +134,21 @@ class _Weights:
         where = {entry["key"]: entry["value"] for entry in content["external"]}
         self.locations.add(where["location"])
         if len(self.locations) > 1:
-            raise Unwanted("weights in more than one other file")
+            raise UnsupportedNetwork("weights in more than one other file")
         self.data = self.data or self.beside()
         offset = whole(int(where.get("offset", 0)), 0, len(self.data))
         size = whole(int(where.get("length", len(self.data))), 0, len(self.data))
         part = memoryview(self.data)[offset : offset + size]
         self.taken += len(part)
         if self.taken > len(self.data):
-            raise Unwanted("weights that overlap")
+            raise UnsupportedNetwork("weights that overlap")
         return part
 
 
 def _from_bytes(stored: Any, dtype: torch.dtype) -> Tensor:
     """Little-endian numbers, copied: torch's own memory is aligned for vector units."""
     if len(stored) % dtype.itemsize:
-        raise Unwanted("weights that end within a number")
+        raise UnsupportedNetwork("weights that end within a number")
     values = torch.empty(len(stored), dtype=torch.uint8)
     values.numpy()[:] = np.frombuffer(stored, np.uint8)
     return values != 0 if dtype == torch.bool else values.view(dtype)
@@ -164,7 +174,7 @@ class _Reader:
             if node["op_type"] == "Constant":
                 self._constant(node["output"][0], self._attribute(node["attribute"][0]))
         if len(given) != 1:
-            raise Unwanted(f"{len(given)} inputs, not one of N×3×S×S")
+            raise UnsupportedNetwork(f"{len(given)} inputs, not one of N×3×S×S")
         batch, sizes = _shape(given[0]["type"]["tensor"])
         self.count = len(self.weights)
         self.of_four = {number for number, weight in enumerate(self.weights) if weight.dim() == 4}
@@ -172,7 +182,7 @@ class _Reader:
         steps = [step for node in self.nodes for step in self._steps(node)]
         outputs = [self._known(place["name"]) for place in self.graph["output"]]
         if len(outputs) != 1 or not isinstance(outputs[0], Value):
-            raise Unwanted(f"{len(outputs)} outputs, not one of N×K")
+            raise UnsupportedNetwork(f"{len(outputs)} outputs, not one of N×K")
         mark_spent(steps, {*range(len(self.weights) + 1), outputs[0].number})
         return Program(self.weights, steps, outputs[0].number, sizes), batch
 
@@ -187,7 +197,7 @@ class _Reader:
 
     def _name(self, name: str, value: Value | Tensor | None) -> None:
         if name in self.values:
-            raise Unwanted(f"{quoted(name)} twice, or no name")
+            raise UnsupportedNetwork(f"{quoted(name)} twice, or no name")
         self.values[name] = value
 
     def _new(self, name: str) -> int:
@@ -197,17 +207,17 @@ class _Reader:
 
     def _known(self, name: str) -> Value | Tensor | None:
         if name not in self.values:
-            raise Unwanted(f"{quoted(name)} before it is computed")
+            raise UnsupportedNetwork(f"{quoted(name)} before it is computed")
         return self.values[name]
 
     def _steps(self, node: dict[str, Any]) -> list[Step]:
         """What computes a node: nothing where it is a constant or another name for one."""
         name, domain, outputs = node["op_type"], node.get("domain", ""), node["output"]
         if domain not in _STANDARD or name not in (*OPERATORS, "Constant", "Identity"):
-            raise Unwanted(f"the operator {quoted(f'{domain}.{name}'.lstrip('.'))}")
+            raise UnsupportedNetwork(f"the operator {quoted(f'{domain}.{name}'.lstrip('.'))}")
         several = name == "Split"
         if len(outputs) != 1 and not several:
-            raise Unwanted(f"{len(outputs)} results of {name}, where only the first is supported")
+            raise UnsupportedNetwork(f"{len(outputs)} results of {name}, where only the first is supported")
         inputs = [self._known(word) for word in node.get("input", [])]
         if name == "Identity":
             self._name(outputs[0], *inputs)
@@ -233,29 +243,29 @@ class _Reader:
     def _attributes(self, node: dict[str, Any]) -> dict[str, Any]:
         listed = [(attribute["name"], self._attribute(attribute)) for attribute in node.get("attribute", [])]
         if len(dict(listed)) != len(listed):
-            raise Unwanted("an attribute twice")
+            raise UnsupportedNetwork("an attribute twice")
         return dict(listed)
 
     def _attribute(self, attribute: dict[str, Any]) -> Any:
         """A plain number, word or list of numbers, or a tensor."""
         contents = {kind: content for kind, content in attribute.items() if kind != "name"}
         if len(contents) != 1:
-            raise Unwanted(f"the attribute {quoted(attribute.get('name'))} of {len(contents)} kinds")
+            raise UnsupportedNetwork(f"the attribute {quoted(attribute.get('name'))} of {len(contents)} kinds")
         ((kind, content),) = contents.items()
         if kind == "t":
             return self.tensor(content)
         if isinstance(content, list) and len(content) > MAX_LIST:
-            raise Unwanted(f"a list of more than {MAX_LIST} items")
+            raise UnsupportedNetwork(f"a list of more than {MAX_LIST} items")
         return content
 
 
 def _shape(tensor: dict[str, Any]) -> tuple[int | None, list[int | None]]:
     """The batch, and the input's sizes; None where any is allowed."""
     if tensor["kind"] != 1:
-        raise Unwanted("an input that is not float32")
+        raise UnsupportedNetwork("an input that is not float32")
     sizes = [size.get("value") for size in tensor["shape"].get("dim", [])]
     if len(sizes) != 4:
-        raise Unwanted(f"an input of {len(sizes)} dimensions, not N×3×S×S")
+        raise UnsupportedNetwork(f"an input of {len(sizes)} dimensions, not N×3×S×S")
     fixed = [None if size is None else whole(size, 1, 1 << 16) for size in sizes]
     batch = None if fixed[0] is None else whole(fixed[0], 1, MAX_BATCH)
     return batch, [None, *fixed[1:]]

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import patchproof.networks.onnx_shapes as shapes
-from patchproof.networks.bounds import Unwanted
+from patchproof.networks.bounds import UnsupportedNetwork
 from patchproof.networks.onnx_shapes import MAX_SIZES, numbers
 
 # the numbers of TensorProto.DataType
@@ -58,13 +58,15 @@ class Operator:
         self.makes = "device" in self.signature.parameters
 
     def check(self, inputs: Sequence[Any], attributes: dict[str, Any]) -> None:
-        """Unwanted where it takes other inputs or attributes; what they hold is the operator's own to check."""
+        """Raise UnsupportedNetwork for inputs or attributes that the operator does not take; what they hold is the
+        operator's own to check.
+        """
         if "device" in attributes:
-            raise Unwanted("an attribute 'device'")
+            raise UnsupportedNetwork("an attribute 'device'")
         try:
             self.signature.bind(*inputs, **attributes, **({"device": None} if self.makes else {}))
         except TypeError as error:
-            raise Unwanted(f"other inputs or attributes than are supported ({error})") from error
+            raise UnsupportedNetwork(f"other inputs or attributes than are supported ({error})") from error
 
     def __call__(self, device: torch.device, *inputs: Any, **attributes: Any) -> Any:
         """Its result, a tensor or a tuple of them; inputs that are left out are None."""

@@ -1,8 +1,8 @@
 """A protobuf message as plain tables, of the fields that a schema names.
 
-In: bytes, from anyone. Out: names, numbers and views of the bytes, or Unwanted. Messages lie in each other as deep as
-the schema does and no deeper, all fields are counted before they are kept, and bytes are not copied: Google's own
-reader makes 810 MB of a hostile file of 10 MB. What the schema does not name is passed over.
+In: bytes, from anyone. Out: names, numbers and views of the bytes, or UnsupportedNetwork. Messages lie in each other
+as deep as the schema does and no deeper, all fields are counted before they are kept, and bytes are not copied:
+Google's own reader makes 810 MB of a hostile file of 10 MB. What the schema does not name is passed over.
 
 Source: protobuf.dev/programming-guides/encoding.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from patchproof.networks.bounds import Unwanted
+from patchproof.networks.bounds import UnsupportedNetwork
 
 MAX_FIELDS = 1 << 19  # in a file: Swin's, which computes all its sizes, has 57 thousand
 MAX_ITEMS = 1 << 15  # of one kind in a message
@@ -46,9 +46,9 @@ class _Reader:
                 items = table.setdefault(name, [])
                 items.extend(self._values(content, kind, name))
                 if isinstance(kind, dict) and len(items) > MAX_ITEMS:
-                    raise Unwanted(f"more than {MAX_ITEMS} items of {name}")
+                    raise UnsupportedNetwork(f"more than {MAX_ITEMS} items of {name}")
             elif name in table:  # other readers join the two, or take the last
-                raise Unwanted(f"{name} twice")
+                raise UnsupportedNetwork(f"{name} twice")
             else:
                 (table[name],) = self._values(content, kind, name)
         return table
@@ -65,17 +65,17 @@ class _Reader:
                 size, at = self._varint(data, at) if wire == 2 else (8 if wire == 1 else 4, at)
                 content = data[at : at + size]
                 if len(content) < size:
-                    raise Unwanted("a field that ends after the file does")
+                    raise UnsupportedNetwork("a field that ends after the file does")
                 at += size
             else:
-                raise Unwanted(f"a field of wire type {wire}")
+                raise UnsupportedNetwork(f"a field of wire type {wire}")
             yield key >> 3, content
 
     def _varint(self, data: memoryview, at: int) -> tuple[int, int]:
         """A number from 0 to 2^64 - 1 and the place behind it."""
         self.count += 1
         if self.count > 2 * MAX_FIELDS:  # a field has a key and a size
-            raise Unwanted(f"more than {MAX_FIELDS} fields")
+            raise UnsupportedNetwork(f"more than {MAX_FIELDS} fields")
         number = 0
         for shift in range(0, 64, 7):
             byte = data[at]  # IndexError past the end
@@ -83,7 +83,7 @@ class _Reader:
             number |= (byte & 127) << shift
             if byte < 128:
                 return number & (1 << 64) - 1, at
-        raise Unwanted("a number of more than 64 bits")
+        raise UnsupportedNetwork("a number of more than 64 bits")
 
     def _values(self, content: int | memoryview, kind: Any, name: str) -> list[Any]:
         """What a field holds; several where numbers are packed into one."""
@@ -98,17 +98,17 @@ class _Reader:
             return numbers
         elif kind == FLOAT:
             if len(content) > 4 * MAX_ITEMS:
-                raise Unwanted(f"more than {MAX_ITEMS} {name}")
+                raise UnsupportedNetwork(f"more than {MAX_ITEMS} {name}")
             return np.frombuffer(content, "<f4").tolist()
         elif kind == TEXT:
             if len(content) > MAX_TEXT:
-                raise Unwanted(f"{name} of more than {MAX_TEXT} bytes")
+                raise UnsupportedNetwork(f"{name} of more than {MAX_TEXT} bytes")
             return [str(content, "utf-8")]
         elif kind == BYTES:
             return [content]
         elif isinstance(kind, dict):
             return [self.message(content, kind)]
-        raise Unwanted(f"{name}, which is not supported" if kind == NEVER else f"{name} of another kind")
+        raise UnsupportedNetwork(f"{name}, which is not supported" if kind == NEVER else f"{name} of another kind")
 
 
 def _signed(number: int) -> int:

@@ -13,9 +13,10 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
 from patchproof.base.output import write_whole
-from patchproof.base.strict import Refused, Strict
+from patchproof.base.validation import Strict
 from patchproof.optimizer.loop import State, start
 from patchproof.optimizer.problem import Problem
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
 from patchproof.base.output import write_whole
-from patchproof.base.strict import Refused
 from patchproof.base.workers import Workers, open_workers
 from patchproof.classifier.network import Classifier, center_square
 from patchproof.classifier.precision import Finding, average_precision, findings

@@ -23,18 +23,19 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import is_file
 from patchproof.base.output import check_folder, new_folder
-from patchproof.base.strict import Refused, listed
+from patchproof.base.validation import listed
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
 from patchproof.optimizer.run import OWN, Run, check_promise, finish_run, load_run
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable, read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene.interface import PieceScene, Scene, needs_piece
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import design_sha256
@@ -197,7 +198,7 @@ def _read(picture: str | Path | np.ndarray) -> tuple[str, str, np.ndarray]:
         raise Refused("a picture", f"no file at {path}", "check the path")
     try:
         pixels = read_photo(path).srgb
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         raise Refused("a picture that can be read", printable(path.name), cannot.advice) from cannot
     with open(path, "rb") as file:
         return printable(path.name), hashlib.file_digest(file, "sha256").hexdigest(), pixels
@@ -253,7 +254,7 @@ def _marker_notes(design: np.ndarray, piece: Piece) -> Iterator[str]:
     expected, do = "a design beside which the piece's markers can be read", "take squares like those of markers out"
     try:
         seen = find_markers(flat, ids)
-    except CannotJudge as cannot:
+    except PhotoRejected as cannot:
         raise Refused(expected, f"one that makes photographs too costly ({cannot.advice})", do) from cannot
     if lost := ids - seen.markers.keys():
         raise Refused(expected, f"one that hides {len(lost)} of {len(ids)}", do)

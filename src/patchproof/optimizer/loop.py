@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import OptimizeSettings
-from patchproof.base.strict import Refused
 from patchproof.optimizer.expectation import Answer, expectation, gradient_in_views
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.training_views import task_conditions, training_views

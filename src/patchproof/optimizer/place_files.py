@@ -17,10 +17,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from patchproof.base import geometry
 from patchproof.base.color import photo_codes_of, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.output import write_whole
 from patchproof.base.settings import BackgroundSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.channel.effects import Light, Pose
 from patchproof.optimizer.places import Candidate, Place
 from patchproof.render.photograph import shade

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.claims import student_mean
+from patchproof.base.errors import Refused
 from patchproof.base.settings import OptimizeSettings
-from patchproof.base.strict import Refused, Side, Strict
+from patchproof.base.validation import Side, Strict
 from patchproof.base.workers import sharing
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.expectation import gradient_in_views

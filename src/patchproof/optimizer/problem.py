@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import OptimizeSettings
-from patchproof.base.strict import Refused
 from patchproof.base.workers import threads
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.labels import find_labels

@@ -23,10 +23,11 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.output import check_folder, make_folder, write_whole
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, validated
+from patchproof.base.validation import validated
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint

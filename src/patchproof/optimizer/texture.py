@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import write_whole
-from patchproof.base.strict import Refused
 from patchproof.channel.printer import Printer
 from patchproof.mesh.export import write_glb
 from patchproof.optimizer import pyramid

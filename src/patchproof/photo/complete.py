@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 from patchproof.base.geometry import apply_homography
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.detect import (
     COARSEST_PX,
     Box,
@@ -30,6 +29,7 @@ from patchproof.photo.detect import (
 )
 from patchproof.photo.edges import Borders, sample
 from patchproof.photo.rectify import fit_page, part_around
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, cells_of, printed_markers
 
 # of light with printed cells; wrong codes of the dictionary stay below 0.6, blur lowers it to 0.8
@@ -124,7 +124,7 @@ def _predicted(srgb, view: MarkersInView, missing: Set[int], corners_mm) -> dict
     """Where the fitted markers say that missing ones lie in the picture, by id; None where they cannot tell."""
     try:
         px_from_mm = fit_page({i: b.corners_px for i, b in view.markers.items() if b.fitted}, corners_mm).px_from_mm
-    except (CannotJudge, np.linalg.LinAlgError):
+    except (PhotoRejected, np.linalg.LinAlgError):
         return None
     quads = {i: apply_homography(px_from_mm, corners_mm[i]) for i in missing}
     return {i: quad for i, quad in quads.items() if possible(quad) and _inside(quad, srgb)}

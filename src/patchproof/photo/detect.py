@@ -21,10 +21,10 @@ import numpy as np
 from patchproof.base.color import LIGHT_OF_CODE, LUMINANCE
 from patchproof.base.input import seconds_left
 from patchproof.base.resample import reduced
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.edges import Borders, fit_borders
 from patchproof.photo.limits import squares_in
 from patchproof.photo.rectify import part_around
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.markers import DICTIONARY, cells_of, printed_markers
 
 LIGHT = LIGHT_OF_CODE.astype(np.float32)
@@ -225,14 +225,14 @@ def _detect(
 
 
 def detected(picture: np.ndarray, printed, settings: cv2.aruco.DetectorParameters):
-    """OpenCV's (corners, ids or None) of one uint8 gray picture; `CannotJudge("too_costly")` where it shows so much
+    """OpenCV's (corners, ids or None) of one uint8 gray picture; `PhotoRejected("too_costly")` where it shows so much
     that looks like markers that the detector would not end in time.
     """
     most = int(min(MOST_SQUARES, seconds_left() / _SQUARE_S))
     squares = squares_in(picture, settings.minMarkerPerimeterRate * max(picture.shape), most)
     if squares > most:
         advice = f"it shows {squares} squares that could be markers: photograph less of that pattern"
-        raise CannotJudge("too_costly", squares, most, advice)
+        raise PhotoRejected("too_costly", squares, most, advice)
     return cv2.aruco.ArucoDetector(printed, settings).detectMarkers(picture)[:2]
 
 

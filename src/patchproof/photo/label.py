@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from patchproof.base.resample import reduced
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.limits import finder_lines_in, squares_in
 from patchproof.photo.rectify import rectify
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.manifest import PAGE_CODE, Manifest
 
 _LARGEST_PX = 2000  # of a whole photograph's longer side: a code that needs more is too far away to be of use
@@ -68,7 +68,7 @@ def read_label(srgb: np.ndarray) -> Label | None:
 
 
 def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[float, float], label: Label) -> None:
-    """`CannotJudge("wrong_sheet")` where the page under this homography carries another code than `label`."""
+    """`PhotoRejected("wrong_sheet")` where the page under this homography carries another code than `label`."""
     scale = min(_PAGE_PX_PER_MM, _LARGEST_PX / max(page_mm))
     read = read_label(rectify(srgb, px_from_mm, (0.0, 0.0, *page_mm), scale))
     if read is None or read == label:
@@ -79,4 +79,4 @@ def refuse_other_page(srgb: np.ndarray, px_from_mm: np.ndarray, page_mm: tuple[f
             f"it is sheet {read.sheet_id} with another design: its code says {read.printed}, the JSON {label.printed}; "
             "name the JSON that was written with this PDF"
         )
-    raise CannotJudge("wrong_sheet", None, None, advice)
+    raise PhotoRejected("wrong_sheet", None, None, advice)

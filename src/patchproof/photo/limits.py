@@ -1,6 +1,6 @@
 """What a photograph may cost: ten seconds of processor time, and a gigabyte of memory to be read.
 
-In: work on a photograph. Out: its result, or `CannotJudge("too_costly")`. A long call into a library is seen through
+In: work on a photograph. Out: its result, or `PhotoRejected("too_costly")`. A long call into a library is seen through
 before the time is over (`input.within_time`), so those that a picture could make endless are not made where
 `squares_in` or `finder_lines_in` count too many. Memory is limited where the kernel says how much there is of it: on
 Linux.
@@ -16,8 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from patchproof.base.input import Arguments, OutOfTime, Result, has_timer, within_time
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.errors import TimeLimitExceeded
+from patchproof.base.input import Arguments, Result, has_timer, within_time
+from patchproof.photo.rejection import PhotoRejected
 
 MOST_BYTES = 1_000_000_000  # 119 megapixels take 0.5 GB while they are read
 _SPARSE = 4  # rows of which one is looked at
@@ -25,11 +26,11 @@ _NOISY = 4  # times the edges that so many squares have
 
 
 def limited(work: Callable[Arguments, Result], *arguments: Arguments.args, **keywords: Arguments.kwargs) -> Result:
-    """What `work` returns; `CannotJudge("too_costly")` when it takes longer than `within_time` allows."""
+    """What `work` returns; `PhotoRejected("too_costly")` when it takes longer than `within_time` allows."""
     try:
         return within_time(work, *arguments, **keywords)
-    except OutOfTime as over:
-        raise CannotJudge(
+    except TimeLimitExceeded as over:
+        raise PhotoRejected(
             "too_costly", None, over.seconds, f"it takes {over}: save it smaller, or leave it out"
         ) from None
 

@@ -2,7 +2,7 @@
 
 In: any still picture that Pillow reads as one of `FORMATS` (HEIC with the `heic` extra). Out: `Photo`. EXIF
 orientation is applied, an embedded color profile (phones write Display P3) is converted to sRGB, alpha lies on
-white, deeper channels become 8-bit. Whatever cannot be read raises `CannotJudge("unreadable")`, and what takes more
+white, deeper channels become 8-bit. Whatever cannot be read raises `PhotoRejected("unreadable")`, and what takes more
 than `limits` allow "too_costly", so that one bad file never stops a batch. Pixels are converted in strips, since whole
 copies took twice the memory, and of more than `WHOLE_PX` every four become one: to measure takes up to 30 bytes each.
 Whole JPEG files are decoded by OpenCV, which says on stderr what Pillow keeps to itself where their data are broken.
@@ -21,11 +21,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import LARGEST_PX, is_file, is_folder, readable_formats
-from patchproof.base.strict import Refused, listed
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.validation import listed
 from patchproof.photo.exif import EXIF_SPREAD, focal_of, is_part
 from patchproof.photo.limits import MOST_BYTES, limited, limited_memory
+from patchproof.photo.rejection import PhotoRejected
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .webp .bmp .gif .mpo .avif .heic .heif".split())
 _ORIENTATION = 0x0112
@@ -64,7 +65,7 @@ class Photo:
 
 
 def read_photo(path: str | Path) -> Photo:
-    """The photograph at `path`; `CannotJudge` "unreadable" where there is none that can be read whole, "too_costly"
+    """The photograph at `path`; `PhotoRejected` "unreadable" where there is none that can be read whole, "too_costly"
     where that would take too much.
     """
     path = Path(path)
@@ -74,7 +75,7 @@ def read_photo(path: str | Path) -> Photo:
             srgb, orientation, focal, part = limited(_stored, path)
             # of the picture as Pillow had it nothing is left by now
             return Photo(np.ascontiguousarray(_UPRIGHT.get(orientation, np.asarray)(srgb)), *focal, part)
-    except CannotJudge:
+    except PhotoRejected:
         raise
     except Exception as error:  # decoders fail in many ways (OSError, SyntaxError, struct.error...), all alike here
         if isinstance(error, MemoryError) or type(error).__name__ == "DecompressionBombError":
@@ -249,9 +250,9 @@ def _why(path: Path, error: Exception) -> str:
     return f"{path.name} is damaged or cut short: copy it again from the camera"
 
 
-def _unreadable(advice: str) -> CannotJudge:
-    return CannotJudge("unreadable", None, None, advice)
+def _unreadable(advice: str) -> PhotoRejected:
+    return PhotoRejected("unreadable", None, None, advice)
 
 
-def _too_large(advice: str, figure: float | None = None, threshold: float | None = None) -> CannotJudge:
-    return CannotJudge("too_costly", figure, threshold, advice)
+def _too_large(advice: str, figure: float | None = None, threshold: float | None = None) -> PhotoRejected:
+    return PhotoRejected("too_costly", figure, threshold, advice)

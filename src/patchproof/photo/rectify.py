@@ -23,7 +23,7 @@ from scipy.special import fdtri, stdtrit
 
 from patchproof.base.geometry import apply_homography, fit_homography, normalized, rect_corners
 from patchproof.base.resample import between_indices
-from patchproof.photo.cannot import CannotJudge
+from patchproof.photo.rejection import PhotoRejected
 
 # px per coordinate: what fitted corners of noisy JPEGs of flat pages still miss (measured 0.03 to 0.05)
 CORNER_NOISE_PX = 0.045
@@ -51,10 +51,10 @@ class PageFit:
 
 
 def fit_page(corners_px: Mapping[int, np.ndarray], corners_mm: Mapping[int, np.ndarray]) -> PageFit:
-    """The homography page mm → photo px from all markers that both mappings know; `CannotJudge` where there is none."""
+    """The homography page mm → photo px from all markers that both mappings know; raises `PhotoRejected` for none."""
     ids, px, mm = common_corners(corners_px, corners_mm)
     if not ids:
-        raise CannotJudge("too_few_markers", 0, 1, "no marker of this sheet is in view: show the whole patch")
+        raise PhotoRejected("too_few_markers", 0, 1, "no marker of this sheet is in view: show the whole patch")
     keep = _agreeing(mm, px) if len(ids) > 2 else np.ones(len(px), bool)
     homography = fit_homography(mm[keep], px[keep])
     for _ in range(3):

@@ -22,8 +22,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import cross, dot
-from patchproof.base.strict import Refused
 from patchproof.render.clip import GUARD_PX, clipped
 from patchproof.render.fragments import Cameras, Fragments, columns
 

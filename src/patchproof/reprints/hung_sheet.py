@@ -19,9 +19,9 @@ from torch import Tensor
 
 from patchproof.base import geometry
 from patchproof.base.color import photo_codes_of
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.output import image_bytes
-from patchproof.base.strict import Refused
 from patchproof.channel.boxes import box_of
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.evidence.surface import surface_of

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from patchproof.base import geometry
 from patchproof.base.color import LIGHT_OF_CODE, linear_from_srgb
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.channel.camera import develop
 from patchproof.channel.effects import Light, Print
 from patchproof.channel.frame import Frame

@@ -16,8 +16,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, new_folder
-from patchproof.base.strict import Refused
 from patchproof.base.workers import Workers, open_workers, result_of, sharing
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import Labeled, coco_json

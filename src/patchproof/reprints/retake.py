@@ -23,7 +23,7 @@ import torch
 
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb, photo_codes_of, srgb_from_linear
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.evidence.reproject import Shot
 from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.optimizer.promise import shown_with_controls

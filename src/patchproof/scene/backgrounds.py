@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import codes_of
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder, opened_picture
 from patchproof.base.resample import between_indices, halvings
 from patchproof.base.settings import BackgroundSettings
-from patchproof.base.strict import Refused, expand
+from patchproof.base.validation import expand
 from patchproof.scene.rooms import place
 
 SMALLEST_CROP = 0.6  # of the largest crop that fits

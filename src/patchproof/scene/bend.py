@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.mesh.exponential import Smooth, exponential_map, stretch_at
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.surface import Chart, crop, edge_points, heights, net, surface_at

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.scene.bend import lay_for, place_bent
 from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import load_bare

@@ -14,8 +14,9 @@ from typing import get_args
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import PatchSettings
-from patchproof.base.strict import Refused, Side
+from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
 from patchproof.scene.placement import WARN_OVERHANG_SHARE, Frame, Lay, Placement, gap_limit_mm, patch_frame, side_frame
 

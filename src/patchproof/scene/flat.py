@@ -17,10 +17,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import rect_corners, scaled_about
 from patchproof.base.resample import between_indices, halvings
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, PieceScene
 from patchproof.sheets.piece import Piece

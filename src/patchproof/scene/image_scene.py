@@ -22,12 +22,13 @@ from typing import Self
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import turned_extent
 from patchproof.base.input import is_file
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, expand
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.validation import expand
 from patchproof.photo.read import read_photo
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions, Stream
 from patchproof.scene.interface import PX_PER_MODULE, READABLE_SHARE, SceneSource
@@ -202,7 +203,7 @@ def _read_all(files: list[Path], photo_px: tuple[int, int]) -> tuple[tuple[flat.
     for path in files:
         try:
             images.append(flat.picture_for(read_photo(path).srgb, photo_px)[0])
-        except CannotJudge:
+        except PhotoRejected:
             unread.append(path.name)
     if not images:
         raise Refused(

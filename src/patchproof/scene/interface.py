@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, local_scales
 from patchproof.base.settings import SceneSettings, identifying
-from patchproof.base.strict import Refused
 from patchproof.channel.effects import Effect
 from patchproof.scene.conditions import Conditions, Stream, draw
 from patchproof.sheets.piece import Piece, sheet_id

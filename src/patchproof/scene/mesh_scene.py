@@ -14,7 +14,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from patchproof.base import geometry
-from patchproof.base.strict import Refused, expand
+from patchproof.base.errors import Refused
+from patchproof.base.validation import expand
 from patchproof.channel.boxes import box_of, outermost
 from patchproof.channel.cameras import camera_of
 from patchproof.channel.effects import Pose

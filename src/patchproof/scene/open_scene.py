@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from patchproof.base.errors import Refused
 from patchproof.base.settings import SceneSettings, SearchSettings
-from patchproof.base.strict import Refused
 from patchproof.scene.bent_scene import BentScene
 from patchproof.scene.interface import Scene, SceneSource
 from patchproof.scene.mesh_scene import MeshScene, load_bare

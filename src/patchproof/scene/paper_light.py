@@ -16,8 +16,8 @@ import numpy as np
 
 from patchproof.base.color import LIGHT_OF_CODE
 from patchproof.base.geometry import apply_homography, local_scale, rect_corners
-from patchproof.photo.cannot import CannotJudge
 from patchproof.photo.quality import CLIPPED_CODE
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.sheets.piece import Piece, marker_rect
 
 _CUT_SLACK_MM = 1.0  # scissors do not follow the line
@@ -38,13 +38,13 @@ class PaperLight:
 
 
 def paper_light(srgb: np.ndarray, px_from_piece: np.ndarray, piece: Piece, blur_px: float) -> PaperLight:
-    """The light on a blank piece in a uint8 photograph; `CannotJudge` where it shows too little white paper."""
+    """The light on a blank piece in a uint8 photograph; `PhotoRejected` where it shows too little white paper."""
     codes, mm = _white_pixels(srgb, px_from_piece, piece, blur_px)
     if len(codes) < _LEAST_PIXELS:
-        raise CannotJudge("too_small", len(codes), _LEAST_PIXELS, "come closer: too little white paper is in view")
+        raise PhotoRejected("too_small", len(codes), _LEAST_PIXELS, "come closer: too little white paper is in view")
     clipped = (codes >= CLIPPED_CODE).any(1)
     if clipped.mean() > _MOST_CLIPPED:
-        raise CannotJudge("clipped", float(clipped.mean()), _MOST_CLIPPED, "the paper is overexposed: expose less")
+        raise PhotoRejected("clipped", float(clipped.mean()), _MOST_CLIPPED, "the paper is overexposed: expose less")
     codes, mm = codes[~clipped], mm[~clipped]
     light, terms = LIGHT_OF_CODE[codes], quadratic_terms(mm, piece.size_mm)
     coefficients, weight = _robust_fit(terms, light)

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from patchproof.base import geometry
-from patchproof.base.strict import Refused, Side
+from patchproof.base.errors import Refused
+from patchproof.base.validation import Side
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.fitting import advice
 from patchproof.scene.interface import (

@@ -23,16 +23,17 @@ from typing import Self
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import Refused, expand
-from patchproof.photo.cannot import CannotJudge
+from patchproof.base.validation import expand
 from patchproof.photo.complete import complete
 from patchproof.photo.detect import find_markers
 from patchproof.photo.limits import limited
 from patchproof.photo.quality import blur_px
 from patchproof.photo.read import SUFFIXES, read_photo
 from patchproof.photo.rectify import PageFit, corner_uncertainty_mm, fit_page
+from patchproof.photo.rejection import PhotoRejected
 from patchproof.scene import flat
 from patchproof.scene.conditions import Conditions
 from patchproof.scene.interface import Part, SceneSource
@@ -161,7 +162,7 @@ def build(source: SceneSource) -> PhotoScene:
 
 
 def see(path: Path, manifest: Manifest, piece: Piece, photo_px: tuple[int, int]) -> BasePhoto:
-    """What one photograph of the blank sheet says; `CannotJudge` where it cannot be used."""
+    """What one photograph of the blank sheet says; `PhotoRejected` where it cannot be used."""
     srgb = read_photo(path).srgb
     fit, blur = _locate(srgb, manifest, min(piece.size_mm))
     x, y, *_ = manifest.cut_mm
@@ -196,7 +197,7 @@ def _see_all(folder: Path, manifest: Manifest, piece: Piece, photo_px) -> tuple[
     for path in files:
         try:
             photos.append(limited(see, path, manifest, piece, photo_px))
-        except CannotJudge as cannot:
+        except PhotoRejected as cannot:
             skipped[path.name] = cannot.code
     if len(photos) < LEAST_PHOTOS:
         reasons = f" ({'; '.join(f'{name}: {code}' for name, code in skipped.items())})" if skipped else ""
@@ -223,21 +224,21 @@ def _locate(srgb: np.ndarray, manifest: Manifest, side_mm: float) -> tuple[PageF
     found = find_markers(srgb, frozenset(on_piece), frozenset(markers), DICTIONARY)
     if not found.markers.keys() & on_piece.keys():
         if found.foreign:
-            raise CannotJudge("wrong_sheet", len(found.foreign), 0, "these are the markers of another sheet")
-        raise CannotJudge("too_few_markers", 0, 3, "no marker of the piece is readable")
+            raise PhotoRejected("wrong_sheet", len(found.foreign), 0, "these are the markers of another sheet")
+        raise PhotoRejected("too_few_markers", 0, 3, "no marker of the piece is readable")
     found = complete(srgb, found, on_piece)
     borders = [b for i, b in found.markers.items() if b.fitted and i in on_piece]
     if len(borders) < 3:
-        raise CannotJudge("too_few_markers", len(borders), 3, "show the whole piece, sharp and well lit")
+        raise PhotoRejected("too_few_markers", len(borders), 3, "show the whole piece, sharp and well lit")
     corners = {i: b.corners_px for i, b in found.markers.items() if b.fitted and i in on_piece}
     fit, blur = fit_page(corners, on_piece), blur_px(borders)
     if blur > _MOST_BLUR * (module_px := float(np.median([b.module_px for b in borders]))):
-        raise CannotJudge("blurred", blur, _MOST_BLUR * module_px, "hold still and focus on the sheet")
+        raise PhotoRejected("blurred", blur, _MOST_BLUR * module_px, "hold still and focus on the sheet")
     if fit.residual_mm > _MOST_RESIDUAL * side_mm:
-        raise CannotJudge("too_few_markers", len(fit.inlier_ids), len(on_piece), "press the sheet flat")
+        raise PhotoRejected("too_few_markers", len(fit.inlier_ids), len(on_piece), "press the sheet flat")
     uncertain = corner_uncertainty_mm(fit, manifest.cut_mm)
     if uncertain > _MOST_UNCERTAIN * side_mm:
-        raise CannotJudge("too_small", uncertain, _MOST_UNCERTAIN * side_mm, "come closer")
+        raise PhotoRejected("too_small", uncertain, _MOST_UNCERTAIN * side_mm, "come closer")
     return fit, blur
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import turned_extent
 from patchproof.base.settings import PatchSettings, SceneSettings
-from patchproof.base.strict import Refused, Side
+from patchproof.base.validation import Side
 from patchproof.mesh.mesh import Mesh
 from patchproof.mesh.surface import Chart, heights
 

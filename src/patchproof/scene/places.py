@@ -16,8 +16,9 @@ from typing import get_args
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import camera_centers
-from patchproof.base.strict import Refused, Side
+from patchproof.base.validation import Side
 from patchproof.mesh.surface import Chart, crop, heights, net
 from patchproof.scene.bend import lay_for
 from patchproof.scene.fitting import laid_well

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from patchproof.base.settings import SceneSettings, load_scene_settings
-from patchproof.base.strict import validated
+from patchproof.base.validation import validated
 from patchproof.scene.interface import Scene, SceneSource
 
 if TYPE_CHECKING:

@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.base.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, opened_picture
 from patchproof.base.settings import PatchSettings
-from patchproof.base.strict import Refused, expand, nearest
+from patchproof.base.validation import expand, nearest
 from patchproof.mesh.mesh import Material, Mesh, places_of
 from patchproof.mesh.texels import coverage, face_counts
 from patchproof.mesh.unwrap import has_place, unwrap

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.board import board_sheet, is_board
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest

@@ -11,7 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from patchproof.base.strict import Refused, validated
+from patchproof.base.errors import Refused
+from patchproof.base.validation import validated
 from patchproof.sheets.layout import Box, PageLayout
 from patchproof.sheets.manifest import Manifest, load_manifest
 from patchproof.sheets.markers import DICTIONARY, MODULES, board_squares, marker_corner

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes
-from patchproof.base.strict import Refused
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Design, Manifest, Promise, Swatch, design_sha256
 from patchproof.sheets.piece import Piece, on_paper, printed

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.piece import PieceMarker
 from patchproof.sheets.rects import PointMm, RectMm, SwatchRect, grown, holds, meet
 from patchproof.sheets.template import Rulers, TextLine

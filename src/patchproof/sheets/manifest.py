@@ -17,10 +17,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, create_model, field_validator, model_validator
 
+from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.input import opened_picture, read_json
 from patchproof.base.sessions import Spread, in_sessions, spread_of
-from patchproof.base.strict import Finite, NotNegativeRange, Refused, Share, Strict, validated
+from patchproof.base.validation import Finite, NotNegativeRange, Share, Strict, validated
 
 Mm = Annotated[Finite, Field(ge=-1e5, le=1e5)]
 SizeMm = Annotated[Finite, Field(ge=0.1, le=1e5)]

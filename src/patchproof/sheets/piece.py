@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.color import codes_of, linear_from_srgb, srgb_from_linear
+from patchproof.base.errors import Refused
 from patchproof.base.settings import identifying
-from patchproof.base.strict import Refused, Strict, nearest
+from patchproof.base.validation import Strict, nearest
 from patchproof.sheets.manifest import Marker
 from patchproof.sheets.markers import DICTIONARY, MODULES, cells_of
 from patchproof.sheets.rects import PointMm, RectMm, grown

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.layout import CAP_HEIGHT, DESCENT, Box, Line, PageLayout, prove_apart, text_box, text_width_mm
 from patchproof.sheets.pdf import Printed
 from patchproof.sheets.rects import PointMm, RectMm

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from patchproof.base.errors import Refused, TimeLimitExceeded
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.input import LARGEST_JSON, OutOfTime, Result, is_file, left_behind, within_time
-from patchproof.base.strict import Refused, validated
+from patchproof.base.input import LARGEST_JSON, Result, is_file, left_behind, within_time
+from patchproof.base.validation import validated
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.pdf import ATTACHMENT, POINTS_PER_MM, numbered
 
@@ -138,7 +139,7 @@ def _within_time(pdf_path: str | Path, work: Callable[[Any], Result]) -> Result:
     _existing(pdf_path)
     try:
         return within_time(left_behind, done)
-    except OutOfTime as over:
+    except TimeLimitExceeded as over:
         from pypdfium2._library_scope import destroy_lib
 
         atexit.unregister(destroy_lib)  # the library is still at work, and is not to be taken down

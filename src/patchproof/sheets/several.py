@@ -17,7 +17,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, design_sha256

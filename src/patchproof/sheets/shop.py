@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
-from patchproof.base.strict import Refused
 from patchproof.sheets.manifest import Manifest
 
 _MM = MM_PER_INCH / 72

@@ -14,18 +14,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from patchproof.base.strict import (
-    Finite,
-    NotNegative,
-    Positive,
-    Refused,
-    Share,
-    Strict,
-    nearest,
-    read_toml,
-    shipped,
-    validated,
-)
+from patchproof.base.errors import Refused
+from patchproof.base.packaged import packaged_path
+from patchproof.base.validation import Finite, NotNegative, Positive, Share, Strict, nearest, read_toml, validated
 
 Point = tuple[Finite, Finite]
 Rect = tuple[Finite, Finite, Positive, Positive]
@@ -150,14 +141,14 @@ def template_data(name_or_file: str | Path) -> tuple[Path, dict[str, Any]]:
         names = template_names()
         if str(path) not in names:
             raise Refused("a print template's name or a .toml file", f'"{path}"', nearest(str(path), names))
-        path = shipped("print_templates", f"{path}.toml")
+        path = packaged_path("print_templates", f"{path}.toml")
     return path, read_toml(path)
 
 
 def template_lines() -> list[str]:
     """Each shipped template's name and what its first comment says it is."""
     names = template_names()
-    files = [shipped("print_templates", f"{name}.toml") for name in names]
+    files = [packaged_path("print_templates", f"{name}.toml") for name in names]
     heads = [file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for file in files]
     width = max(map(len, names))
     return [f"{name:<{width}}  {head.partition('. ')[0].rstrip('.')}" for name, head in zip(names, heads, strict=True)]
@@ -165,5 +156,5 @@ def template_lines() -> list[str]:
 
 def template_names(table: str | None = None) -> list[str]:
     """The shipped templates' names; with `table`, of those that have it."""
-    paths = shipped("print_templates").glob("*.toml")
+    paths = packaged_path("print_templates").glob("*.toml")
     return sorted(path.stem for path in paths if table is None or table in read_toml(path))

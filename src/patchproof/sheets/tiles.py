@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from patchproof.base.strict import Refused
+from patchproof.base.errors import Refused
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.layout import (
     Box,

@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import write_together
-from patchproof.base.strict import Refused, Strict
+from patchproof.base.validation import Strict
 from patchproof.sheets.content import PrintedPiece, page_manifest
 from patchproof.sheets.layout import PageLayout
 from patchproof.sheets.manifest import Manifest, dump_manifest

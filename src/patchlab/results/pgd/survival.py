@@ -25,7 +25,7 @@ from torch import Tensor
 from patchlab.harden.attacks import cross_entropy, even_loss, margin, right
 from patchlab.harden.harden import harden, squares
 from patchproof.base.claims import wilson
-from patchproof.base.strict import expand
+from patchproof.base.validation import expand
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.photo.read import read_photo

@@ -26,7 +26,8 @@ from patchlab.validation.envelope.fit import find_break
 from patchlab.validation.envelope.gains import gain_break
 from patchlab.validation.envelope.pages import figures, found_and_measured, gains_in, tables
 from patchlab.validation.envelope.world import measured, open_world, recognized
-from patchproof.base.strict import Finite, Refused, Strict, nearest
+from patchproof.base.errors import Refused
+from patchproof.base.validation import Finite, Strict, nearest
 from patchproof.optimizer.run import load_run
 from patchproof.scene.interface import needs_piece
 

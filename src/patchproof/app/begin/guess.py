@@ -22,7 +22,8 @@ from typing import Literal
 import numpy as np
 
 from patchproof.app.begin.sides import SIDE_NAMES
-from patchproof.base.strict import Refused, Side
+from patchproof.base.errors import Refused
+from patchproof.base.validation import Side
 from patchproof.classifier.labels import find_labels, find_words
 from patchproof.mesh.load_mesh import load_mesh
 from patchproof.mesh.mesh import Mesh

@@ -16,10 +16,11 @@ from pathlib import Path
 
 from patchproof.app.begin.guess import Axis, Up, guess_up, label_of, length_of, other_axis, place_for
 from patchproof.app.begin.sides import SIDE_NAMES
+from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
 from patchproof.base.output import check_file, write_whole
 from patchproof.base.settings import SceneSettings
-from patchproof.base.strict import NETWORK_FILE, Refused, validated
+from patchproof.base.validation import NETWORK_FILE, validated
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.load_mesh import load_mesh

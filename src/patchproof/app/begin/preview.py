@@ -21,10 +21,10 @@ from patchproof.app.begin.guess import lies_oddly, other_axis
 from patchproof.app.begin.sides import SIDE_NAMES, gap_colors, ramp, side_of, side_views, turntable
 from patchproof.app.begin.views import Look, looks
 from patchproof.base.color import codes_of
+from patchproof.base.errors import Refused
 from patchproof.base.output import image_bytes, new_folder, write_whole
 from patchproof.base.resample import reduced
 from patchproof.base.settings import SceneSettings, load_scene_settings
-from patchproof.base.strict import Refused
 from patchproof.classifier.labels import find_labels
 from patchproof.classifier.load import load_classifier
 from patchproof.mesh.export import write_glb

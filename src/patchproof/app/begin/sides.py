@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 
 from patchproof.base.geometry import UP, orbit
-from patchproof.base.strict import Side
+from patchproof.base.validation import Side
 from patchproof.render.stage import Stage
 from patchproof.reprints.hung import straight_picture
 from patchproof.scene.mesh_scene import MeshScene, needs_mesh

@@ -16,8 +16,8 @@ import os
 import re
 from pathlib import Path
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import check_folder, make_folder
-from patchproof.base.strict import Refused
 from patchproof.photo.read import pictures_in
 
 CONTROLS_FOLDER, JOURNAL, ADDRESS = "controls", "photos.jsonl", ".capture.json"
@@ -30,12 +30,15 @@ _HEIF = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 _NUMBERED = re.compile(r"\.?photo_(\d{4,})\.")
 
 
-class NotTaken(Refused):
-    """What is not let in, with the HTTP status that says so."""
+class UploadRefused(Refused):
+    """An upload that is not accepted, with its HTTP status."""
 
     def __init__(self, status: int, expected: str, got: str, do: str):
         super().__init__(expected, got, do)
         self.status = status
+
+    def __reduce__(self):
+        return UploadRefused, (self.status, *self._parts)
 
 
 class Album:
@@ -83,14 +86,16 @@ class Album:
         elif into in self.sessions:
             folder = self.folder / into
         else:
-            raise NotTaken(404, "a session or a control that is here", "another name", "load the page again")
+            raise UploadRefused(404, "a session or a control that is here", "another name", "load the page again")
         return Incoming(folder, self._free_number(), self._by_sha256)
 
     def _free_number(self) -> int:
         names = (match for path in self.folder.rglob("*photo_*") if (match := _NUMBERED.match(path.name)))
         number = 1 + max((int(match[1]) for match in names), default=0)
         if number > MOST_PHOTOS:
-            raise NotTaken(507, f"at most {MOST_PHOTOS} photographs in a folder", "more", "start with a new folder")
+            raise UploadRefused(
+                507, f"at most {MOST_PHOTOS} photographs in a folder", f"photograph {number}", "start with a new folder"
+            )
         return number
 
 
@@ -136,7 +141,7 @@ class Incoming:
         if kept is not None:
             if kept.parent != self._folder:
                 got = f"{kept.parent.name}/{kept.name} once more"
-                raise NotTaken(409, "a photograph that is not here yet", got, "take a new one")
+                raise UploadRefused(409, "a photograph that is not here yet", got, "take a new one")
             return kept
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -155,7 +160,7 @@ def refuse_size(size: int) -> None:
     if size > MOST_BYTES:
         got = "a larger file" if size < 2 * MOST_BYTES else f"one of {size / 1e6:.0f} MB"
         do = "choose a smaller picture size in the camera's settings"
-        raise NotTaken(413, f"a photograph of at most {MOST_BYTES / 1e6:.0f} MB", got, do)
+        raise UploadRefused(413, f"a photograph of at most {MOST_BYTES / 1e6:.0f} MB", got, do)
 
 
 def _suffix_of(head: bytes) -> str:
@@ -168,4 +173,4 @@ def _suffix_of(head: bytes) -> str:
         return ".webp"
     if head[4:8] == b"ftyp" and head[8:12] in (*_HEIF, b"avif"):
         return ".avif" if head[8:12] == b"avif" else ".heic"
-    raise NotTaken(415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)", "a file of another kind", "take it again")
+    raise UploadRefused(415, "a photograph (JPEG, PNG, WebP, HEIC or AVIF)", "a file of another kind", "take it again")

@@ -22,7 +22,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from patchproof.app.capture.album import MOST_BYTES, NotTaken, refuse_size
+from patchproof.app.capture.album import MOST_BYTES, UploadRefused, refuse_size
 from patchproof.app.capture.gathered import Gathered
 from patchproof.app.capture.state import answer_of, state_of
 from patchproof.evidence.verdict import sessions_needed
@@ -50,7 +50,7 @@ def capture_app(gathered: Gathered, token: str) -> ASGIApp:
         Route(f"/{token}/photos", desk.photo, methods=["POST"]),
         Route(f"/{token}/sessions", desk.session, methods=["POST"]),
     ]
-    app = Starlette(routes=routes, exception_handlers={NotTaken: _refused})
+    app = Starlette(routes=routes, exception_handlers={UploadRefused: _refused})
     app.router.redirect_slashes = False
     return _Guard(app, token)
 
@@ -144,7 +144,7 @@ class _Desk:
 
 
 async def _refused(request: Request, error: Exception) -> Response:
-    assert isinstance(error, NotTaken)
+    assert isinstance(error, UploadRefused)
     return _refusal(error.status, str(error))
 
 

@@ -21,9 +21,10 @@ from pydantic import Field
 from patchproof.app.capture.album import ADDRESS, Album
 from patchproof.app.capture.gathered import Gathered, ready
 from patchproof.app.verify import options_of
+from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
 from patchproof.base.output import write_whole
-from patchproof.base.strict import Refused, Strict, validated
+from patchproof.base.validation import Strict, validated
 from patchproof.base.workers import open_workers
 from patchproof.evidence.results import Report
 from patchproof.sheets.manifest import load_manifest

@@ -18,8 +18,8 @@ from typing import Annotated, Any
 
 import typer
 
+from patchproof.base.errors import Refused
 from patchproof.base.output import disk_is_full
-from patchproof.base.strict import Refused
 from patchproof.base.version import __version__
 from patchproof.base.workers import can_fork, free_cores, keep_freed_memory, threads
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchproof.base.strict import Strict
+from patchproof.base.validation import Strict
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.training_views import new_pose_share
 from patchproof.render.photograph import expose, windows_of

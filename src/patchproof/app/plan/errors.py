@@ -18,7 +18,7 @@ from torch import Tensor
 
 from patchproof.app.plan.terms import Setup, Term, scene_terms
 from patchproof.base.output import image_bytes, image_pixels
-from patchproof.base.strict import Strict
+from patchproof.base.validation import Strict
 from patchproof.classifier.network import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import Problem

@@ -27,7 +27,7 @@ from torch import Tensor
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
 from patchproof.base.claims import wilson
-from patchproof.base.strict import Strict
+from patchproof.base.validation import Strict
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.places import Place, choose_place

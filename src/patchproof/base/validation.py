@@ -1,9 +1,7 @@
-"""The one way to refuse, strict settings, and where shipped data lies.
+"""Read and validate settings: TOML files or dictionaries into frozen pydantic models.
 
-In: a TOML file or a dictionary and a model of it; `${VAR}` in paths is expanded. Out: frozen settings, every value
-checked: an unknown key names the nearest known one, a NaN or a reversed range is refused. Whatever refuses says three
-things in one sentence: what was expected, what was there, and what to do. The command line prints that sentence and
-exits with 1.
+In: a TOML file or a dictionary, and a model of it; `${VAR}` in paths is expanded. Out: frozen settings with every value
+checked: an unknown key is refused with the nearest known one, a NaN or a reversed range with the value.
 """
 
 from __future__ import annotations
@@ -21,34 +19,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-
-class Refused(ValueError):
-    """What the tool will not do, in one sentence that says expected, got, do."""
-
-    def __init__(self, expected: str, got: str, do: str):
-        self._parts = expected, got, do
-        # what stands in a hostile file may be of any length
-        expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
-        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
-
-    def advised(self, advice: str) -> Refused:
-        """The same with more to do."""
-        expected, got, do = self._parts
-        return Refused(expected, got, f"{do.rstrip('.')}{advice}")
-
-    def __reduce__(self):
-        # exceptions are rebuilt from their message when they come back from another process; this one has three parts
-        return Refused, self._parts
-
-
-def shipped(folder: Literal["calibration", "print_templates"], *parts: str) -> Path:
-    """A file of the data that travels with the program: inside the installed package, else in the checkout."""
-    package = Path(__file__).resolve().parents[1]
-    # an editable install keeps these folders at the top of the checkout, two levels up
-    roots = [root for root in (package / folder, package.parents[1] / folder) if root.is_dir()]
-    if not roots:
-        raise Refused(f"the folder {folder} beside the program", "none", "install patchproof again")
-    return roots[0].joinpath(*parts)
+from patchproof.base.errors import Refused
 
 
 def _finite(value: float) -> float:

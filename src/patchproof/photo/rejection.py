@@ -1,9 +1,11 @@
 """Why a photograph cannot be judged or measured: a code, the figure that decided it, its threshold, and what to do.
 
-The codes are those of report.json. A `CannotJudge` never stops a batch: the photograph is listed with it.
+The codes are those of report.json. A `PhotoRejected` never stops a batch: the photograph is listed with it.
 """
 
 from __future__ import annotations
+
+from patchproof.base.errors import PatchproofError
 
 CODES = (
     "unreadable",
@@ -25,7 +27,7 @@ CODES = (
 )
 
 
-class CannotJudge(ValueError):
+class PhotoRejected(PatchproofError, ValueError):
     """Evidence too weak; `figure` and `threshold` are in the unit of what the code names, None if not measured."""
 
     def __init__(self, code: str, figure: float | None, threshold: float | None, advice: str):
@@ -36,4 +38,4 @@ class CannotJudge(ValueError):
 
     def __reduce__(self):
         # exceptions are rebuilt from their message when they come back from another process; this one has four parts
-        return CannotJudge, (self.code, self.figure, self.threshold, self.advice)
+        return PhotoRejected, (self.code, self.figure, self.threshold, self.advice)

@@ -1,0 +1,54 @@
+"""The errors of patchproof: one tree, so that one `except PatchproofError` catches all that it raises on purpose.
+
+    PatchproofError
+    ├── Refused              a mistake in the input: what was expected, what was found, what to do (also a ValueError)
+    │   ├── WorkerDied       the process that worked on one item died at each try; the other items' results stand
+    │   └── UploadRefused    a photograph that `capture` does not accept, with its HTTP status
+    ├── PhotoRejected        a photograph that cannot be measured or judged: a code, figure, threshold and advice
+    ├── UnsupportedNetwork   an ONNX file that holds something not supported; callers turn it into Refused
+    └── TimeLimitExceeded    a file that takes more processor time than it may; callers turn it into Refused
+
+Public functions raise `Refused`; `load_manifest`, `load_run`, `load_scene` and all verbs do so for missing, damaged or
+contradicting files. Rejected photographs never stop a batch: they are listed in the report with their code. The command
+line prints the sentence of a `PatchproofError` and exits with 1. All survive pickling, to cross processes.
+"""
+
+from __future__ import annotations
+
+
+class PatchproofError(Exception):
+    """Base of all errors that patchproof raises on purpose."""
+
+
+class Refused(PatchproofError, ValueError):
+    """An input that is not accepted, in one sentence: "Expected EXPECTED, got GOT: DO."."""
+
+    def __init__(self, expected: str, got: str, do: str):
+        self._parts = expected, got, do
+        # what stands in a hostile file may be of any length
+        expected, got, do = (part if len(part) < 2000 else f"{part[:1000]} ..." for part in self._parts)
+        super().__init__(" ".join(f"Expected {expected}, got {got}: {do.rstrip('.')}.".split()))
+
+    def advised(self, advice: str) -> Refused:
+        """A copy of this error with `advice` appended to what to do."""
+        expected, got, do = self._parts
+        return Refused(expected, got, f"{do.rstrip('.')}{advice}")
+
+    def __reduce__(self):
+        # exceptions are rebuilt from their message when they come back from another process; this one has three parts
+        return type(self), self._parts
+
+
+class WorkerDied(Refused):
+    """The process that worked on one item died at each try; the other items' results stand."""
+
+
+class TimeLimitExceeded(PatchproofError):
+    """The work has taken its limit of `seconds` of processor time."""
+
+    def __init__(self, seconds: float):
+        super().__init__(f"more than {seconds:g} s of processor time")
+        self.seconds = seconds
+
+    def __reduce__(self):
+        return TimeLimitExceeded, (self.seconds,)
