@@ -42,6 +42,7 @@ from safetensors.numpy import save as safetensors_bytes
 from watch import MOST_BYTES, SECONDS, TooLong, Watch, limits, peak_bytes, temporary_files_in
 
 from patchproof.base.errors import Refused
+from patchproof.optimizer.promise import PromiseOptions
 
 Read = Callable[[], object]
 
@@ -208,7 +209,9 @@ def finished_run() -> Path:
     folder = Path(runs_folder().name)
     kept, run.PROMISE_VIEWS = run.PROMISE_VIEWS, 4
     try:
-        run.optimize_scene(toml(folder / "scene.toml", optimize__steps=1), folder / "run", controls=("bare",))
+        run.optimize(
+            toml(folder / "scene.toml", optimize__steps=1), folder / "run", promise=PromiseOptions(controls=("bare",))
+        )
     finally:
         run.PROMISE_VIEWS = kept
     return folder / "run"

@@ -23,6 +23,8 @@ import conftest  # noqa: F401 - finds helpers of other rooms where this is a pro
 import numpy as np
 import pytest
 
+from patchproof.optimizer.promise import PromiseOptions
+
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 JOBS = ("optimize", "verify", "sheet", "reprint", "study")
 IN_THE_SUITE = len(JOBS)
@@ -44,20 +46,20 @@ def optimize(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer import loop, run
 
     run.PROMISE_VIEWS, loop.SELECT_VIEWS, loop.SELECT_AFTER, loop.SAVE_AFTER = 4, 4, 8, 4
-    run.optimize_scene(base / "scene.toml", out, controls=("bare",), resume=again)
+    run.optimize(base / "scene.toml", out, promise=PromiseOptions(controls=("bare",)), resume=again)
 
 
 def verify(base: Path, out: Path, again: bool) -> None:
     from fuzz import network
 
-    from patchproof.app.verify import verify_photos
+    from patchproof.app.verify import verify as verify_photos
 
     verify_photos(base / "photos", base / "sheet.json", out, models=[network()], resume=again)
 
 
 def sheet(base: Path, out: Path, again: bool) -> None:
     from patchproof.optimizer.run import load_run
-    from patchproof.reprints.run_sheet import sheet_of
+    from patchproof.reprints.run_sheet import sheet as sheet_of
 
     out.mkdir(exist_ok=True)
     sheet_of(load_run(base / "run"), out / "sheet.pdf", control="gray")  # without its plan of photographs

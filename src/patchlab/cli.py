@@ -137,7 +137,7 @@ def bench(
     from patchlab.bench.run import run_bench
 
     with progress() as bar:
-        written = run_bench(name, out, quick=quick, overwrite=overwrite, on_stage=bar)
+        written = run_bench(name, out, quick=quick, overwrite=overwrite, progress=bar)
     for results in written:
         say_study(results)
         say(f"page: {out / results.name}.html")

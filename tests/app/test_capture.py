@@ -34,7 +34,8 @@ from patchproof.app.capture.album import CONTROLS, MOST_BYTES, Album, UploadRefu
 from patchproof.app.capture.app import capture_app
 from patchproof.app.capture.gathered import Gathered
 from patchproof.app.capture.views import map_views
-from patchproof.app.verify import options_of, verify_photos
+from patchproof.app.verify import options_of
+from patchproof.app.verify import verify as verify_photos
 from patchproof.base import input
 from patchproof.base.errors import Refused
 from patchproof.base.workers import open_workers
@@ -404,10 +405,10 @@ def test_served_until_interrupted_and_at_the_same_address_afterwards(tmp_path, s
     def begin(address: str) -> None:
         threading.Thread(target=visit, args=(address,)).start()
 
-    def progress(done: int, total: int) -> None:
+    def progress(stage: str, done: int, total: int) -> None:
         measured.append((done, total))
 
-    capture = partial(serve.serve_capture, sheet, tmp_path / "photos", on_photo=progress, on_address=begin)
+    capture = partial(serve.serve_capture, sheet, tmp_path / "photos", progress=progress, on_address=begin)
     with monkeypatch.context() as patch:  # the first time in this process, which has imported everything
         patch.setattr(serve, "open_workers", lambda *_, **__: open_workers(1))
         patch.setattr(serve, "ready", lambda _: None)

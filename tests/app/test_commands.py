@@ -22,7 +22,9 @@ from patchproof.base.errors import Refused
 from patchproof.base.validation import validated
 from patchproof.base.version import __version__
 from patchproof.optimizer import run as run_module
-from patchproof.optimizer.run import load_run, optimize_scene
+from patchproof.optimizer.promise import PromiseOptions
+from patchproof.optimizer.run import load_run
+from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.reprints.run_sheet import sheet_of_several
 from patchproof.scene.scene import load_scene
 from patchproof.sheets.manifest import load_manifest
@@ -99,7 +101,7 @@ def test_a_draft_says_that_it_is_one(tmp_path, scene_file, capsys):
     several = sheet_of_several([made, other], tmp_path / "two.pdf", template="a3")
     assert [manifest.plan_page for manifest in several] == [2, 3] and page_count(tmp_path / "two.pdf") == 3
     with pytest.raises(Refused, match="promise of 8 views, two sessions, at least, got 7"):
-        optimize_scene(scene_file, tmp_path / "other", promise_views=7)
+        optimize_scene(scene_file, tmp_path / "other", promise=PromiseOptions(views=7))
 
 
 def test_a_stopped_run_says_what_is_kept_and_a_second_try_how_to_go_on(tmp_path, scene_file, monkeypatch, capsys):
@@ -114,7 +116,7 @@ def test_a_stopped_run_says_what_is_kept_and_a_second_try_how_to_go_on(tmp_path,
     assert capsys.readouterr().err.splitlines()[-1] == f"Stopped: {out} keeps what was finished. Go on with: {again}"
     assert command("optimize", scene_file, "--out", out) == 1
     assert "which is unfinished: go on with --resume" in capsys.readouterr().err
-    monkeypatch.setattr("patchproof.optimizer.evaluate.evaluate_run", stop)
+    monkeypatch.setattr("patchproof.optimizer.evaluate.evaluate", stop)
     assert command("evaluate", out) == 130 and capsys.readouterr().err == "Stopped: nothing was written.\n"
 
 

@@ -272,7 +272,7 @@ def test_a_detector_carries_a_run_from_scene_to_verdict(name, tmp_path, two_stag
             "optimize": {"steps": 2, "views": 2},
         }
     )
-    run = pp.optimize(scene, tmp_path / "run", promise_views=8, controls=["bare"])
+    run = pp.optimize(scene, tmp_path / "run", promise=pp.PromiseOptions(8, ("bare",)))
     claim = run.promise.models[0]
     assert claim.least_score == 0.4 and 3 < len(run.promise.outermost_mm) <= MOST_POINTS
     pp.sheet(run, tmp_path / "sheet.pdf")

@@ -42,7 +42,7 @@ def judged(folder, model, label) -> tuple[pp.Run, pp.Report]:
     (folder / "scene.toml").write_text(text.replace("steps = 3\nviews = 4", "steps = 2\nviews = 2"), encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
-        run = pp.optimize(pp.load_scene(folder / "scene.toml"), folder / "run", promise_views=8)
+        run = pp.optimize(pp.load_scene(folder / "scene.toml"), folder / "run", promise=pp.PromiseOptions(8))
     assert np.ptp(run.design) > 0  # gradients came through all of it
     pp.sheet(run, folder / "sheet.pdf")
     how = Hanging(path_traced=find_spec("mitsuba") is not None)  # by a renderer that is not ours where it is installed

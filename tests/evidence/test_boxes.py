@@ -74,7 +74,7 @@ def journey(tmp_path_factory):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 2)
-        run = pp.optimize(scene, folder / "run", promise_views=8, controls=["bare"])
+        run = pp.optimize(scene, folder / "run", promise=pp.PromiseOptions(8, ("bare",)))
     pp.sheet(run, folder / "sheet.pdf")
     pp.reprint(folder / "sheet.pdf", run, 3, folder / "photos")
     bare = folder / "controls" / "bare"
@@ -95,7 +95,9 @@ def answers(report):
 
 def test_drawn_boxes_judge_as_the_sheet_s_own_do_which_are_where_the_object_is(journey):
     alone = verified(journey, "alone")
-    drawn = verified(journey, "drawn", boxes=journey.photos / "coco.json")  # the truth, as `reprint` wrote it
+    drawn = verified(
+        journey, "drawn", capture=pp.CaptureInfo(boxes=journey.photos / "coco.json")
+    )  # the truth, as `reprint` wrote it
     assert answers(drawn) == pytest.approx(answers(alone), abs=0.02) and drawn.origin.options["boxes"] == "coco.json"
     told, true = (given_boxes(f / "coco.json", "box truck") for f in (journey.folder / "alone", journey.photos))
     sizes = {image["file_name"]: image for image in json.loads((journey.photos / "coco.json").read_text())["images"]}
@@ -116,11 +118,11 @@ def test_boxes_elsewhere_take_the_object_away_from_design_and_bare_photographs_e
     options = {"controls": journey.folder / "controls"}
     (bare,) = verified(journey, "wrong", **options).controls
     assert bare.recognized == 3, "without a box whatever is found counts"
-    report = verified(journey, "wrong", **options, boxes=wrong, resume=True)
+    report = verified(journey, "wrong", **options, capture=pp.CaptureInfo(boxes=wrong), resume=True)
     assert max(answers(report)) < 0.3 and report.controls[0].recognized == 0
 
 
 def test_boxes_of_other_photographs_are_refused(journey):
     other = coco(journey.folder / "o.json", (1, 1, [1, 2, 3, 4]), categories=("box truck",), images=("x.jpg",))
     with pytest.raises(Refused, match="boxes of these photographs"):
-        verified(journey, "other", boxes=other)
+        verified(journey, "other", capture=pp.CaptureInfo(boxes=other))

@@ -14,7 +14,7 @@ import pytest
 import torch
 from synthetic_photos import make_manifest, save
 
-from patchproof.app.verify import _networks, verify_photos
+from patchproof.app.verify import _networks, verify
 from patchproof.base.errors import Refused, WorkerDied
 from patchproof.base.workers import can_fork
 from patchproof.channel.printer import identity_printer
@@ -58,15 +58,15 @@ def sheet(tmp_path_factory) -> Path:
 
 
 def killed_after_three(folder: Path, sheet: Path, out: Path) -> None:
-    def die(done, total):
+    def die(stage, done, total):
         if done == 3:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    verify_photos(folder, sheet, out, on_photo=die)
+    verify(folder, sheet, out, progress=die)
 
 
 def test_a_kill_costs_what_was_in_work_and_not_the_report(folder, sheet, tmp_path):
-    verify_photos(folder, sheet, tmp_path / "whole", ledger_photos=2)
+    verify(folder, sheet, tmp_path / "whole", ledger_photos=2)
     out = tmp_path / "killed"
     process = get_context("fork" if can_fork() else "spawn").Process(
         target=killed_after_three, args=(folder, sheet, out)
@@ -76,10 +76,10 @@ def test_a_kill_costs_what_was_in_work_and_not_the_report(folder, sheet, tmp_pat
     assert process.exitcode == -signal.SIGKILL
     assert len((out / "photos.jsonl").read_text().splitlines()) == 3 and not (out / "report.json").exists()
     with pytest.raises(Refused, match="unfinished verification: add --resume"):
-        verify_photos(folder, sheet, out)
+        verify(folder, sheet, out)
     with open(out / "photos.jsonl", "a") as file:
         file.write('{"file": "b4.jpg", "sha')  # a line that the kill cut short
-    verify_photos(folder, sheet, out, resume=True, ledger_photos=2)
+    verify(folder, sheet, out, resume=True, ledger_photos=2)
     for name in WRITTEN:
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     pictures = {p.name: p.read_bytes() for p in (out / "pictures").iterdir()}
@@ -96,7 +96,7 @@ def test_resuming_measures_only_what_is_new_or_differs(tmp_path, folder, monkeyp
     def judged(resume=True, progress=lambda done, total: None, **options):
         opened.clear()
         options = Options([NET], identity_printer(), ledger_photos=0, **options)
-        kept = dict(journal=tmp_path / "photos.jsonl", resume=resume, progress=progress)
+        kept = dict(journal=tmp_path / "photos.jsonl", resume=resume, advance=progress)
         return gather_evidence(photos, make_manifest(promise()), options, **kept)
 
     first = judged()
@@ -194,9 +194,9 @@ def test_a_folder_of_somebody_else_is_not_resumed(folder, sheet, tmp_path):
     (tmp_path / "thesis.txt").write_text("x")
     for resume in (True, False):
         with pytest.raises(Refused, match="files"):
-            verify_photos(folder, sheet, tmp_path, resume=resume)
+            verify(folder, sheet, tmp_path, resume=resume)
     with pytest.raises(Refused, match=r"thesis\.txt"):
-        verify_photos(folder, sheet, tmp_path, overwrite=True)
+        verify(folder, sheet, tmp_path, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
 
@@ -205,7 +205,7 @@ def test_names_of_any_length_and_bytes_are_reported(folder, sheet, tmp_path):
     photos.mkdir()
     for name, source in ((b"\xff" * 9, "b0.jpg"), (b"x" * 245, "b1.jpg")):
         (photos / os.fsdecode(name + b".jpg")).write_bytes((folder / source).read_bytes())
-    report = verify_photos(photos, sheet, tmp_path / "report", ledger_photos=0)
+    report = verify(photos, sheet, tmp_path / "report", ledger_photos=0)
     assert sorted(p.file for p in report.photos) == ["\\udcff" * 9 + ".jpg", "x" * 245 + ".jpg"]
     assert {p.code for p in report.photos} == {None} and len(list((tmp_path / "report" / "pictures").iterdir())) >= 4
 

@@ -22,6 +22,7 @@ from synthetic_photos import (
 
 from patchproof.base.claims import wilson
 from patchproof.base.color import ciede2000, lab_from_linear, linear_from_srgb, srgb_from_linear
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.channel.printer import identity_printer, load_printer
 from patchproof.classifier import Classifier
@@ -270,7 +271,7 @@ def folder(tmp_path_factory):
 
 def verified(folder, jobs=1, progress=lambda done, total: None, **options):
     options = Options([NET], identity_printer(), **{"ledger_photos": 0} | options)
-    return gather_evidence(folder, make_manifest(promise()), options, jobs=jobs, progress=progress)
+    return gather_evidence(folder, make_manifest(promise()), options, compute=Compute(jobs=jobs), advance=progress)
 
 
 def test_a_folder_is_listed_in_full_and_counted_as_the_contract_says(folder):

@@ -64,7 +64,7 @@ def test_a_useless_patch_keeps_its_promise_and_is_not_taken_for_one_that_helps(p
 @pytest.mark.parametrize(("exits", "how"), [(0, ()), (0, ("--require", "kept")), (1, ("--require", "helps"))])
 def test_scripts_can_ask_for_more_than_a_useless_promise_that_held(exits, how, monkeypatch, tmp_path):
     useless = some_report().changed(summary=summary_of(0, 40, USELESS))
-    monkeypatch.setattr("patchproof.app.verify.verify_photos", lambda *_, **__: useless)
+    monkeypatch.setattr("patchproof.app.verify.verify", lambda *_, **__: useless)
     done = CliRunner().invoke(app, ["verify", "photos", "--sheet", "a.json", "--out", str(tmp_path), *how])
     assert done.exit_code == exits and done.stdout.startswith("No better than the bare object.")
     assert ("--require helps asks for both" in done.stderr) == ("kept" in how)

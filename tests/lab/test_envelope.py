@@ -27,7 +27,7 @@ from patchlab.validation.envelope.world import (
 from patchproof.base import geometry
 from patchproof.base.claims import Estimate, paired_difference
 from patchproof.base.errors import Refused
-from patchproof.optimizer.run import optimize_scene
+from patchproof.optimizer.run import optimize
 from patchproof.render.photograph import photograph
 from patchproof.report.images import drawn as drawing_of
 from patchproof.scene.conditions import with_values
@@ -43,7 +43,7 @@ def world(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
-        optimize_scene(folder / "scene.toml", folder / "run")
+        optimize(folder / "scene.toml", folder / "run")
     return open_world(folder / "run", None)
 
 
@@ -201,7 +201,7 @@ def blue_run(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
-        optimize_scene(folder / "scene.toml", folder / "run")
+        optimize(folder / "scene.toml", folder / "run")
     return folder / "run"
 
 

@@ -20,9 +20,9 @@ from patchproof.base.claims import Estimate
 from patchproof.base.errors import Refused
 from patchproof.base.validation import validated
 from patchproof.optimizer import loop, run
-from patchproof.optimizer.evaluate import evaluate_run
+from patchproof.optimizer.evaluate import evaluate
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.run import optimize_scene
+from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.scene.scene import load_scene
 from test_textures_optimized import scene_file
 
@@ -166,12 +166,12 @@ def test_a_study_finds_what_optimize_and_evaluate_find(tmp_path):
     config = written(tmp_path, "carton", 'networks = ["builtin"]\nn = 8\nlights = 1\nseeds = [3]\n')
     finished = run_study("transfer", config, tmp_path / "out")
     optimize_scene(tmp_path / "texture.toml", tmp_path / "run", seed=3)
-    found = evaluate_run(tmp_path / "run", n=8)["models"]["builtin"]
+    found = evaluate(tmp_path / "run", n=8).models["builtin"]
     original, design = table(finished, "matrix")
-    assert design["rate"].value == found["rate"] and original["rate"].value == found["controls"]["bare"]["rate"]
+    assert design["rate"].value == found.rate and original["rate"].value == found.controls["bare"].rate
     # cells keep five digits
-    assert design["confidence"].value == pytest.approx(found["confidence"], abs=1e-5)
-    low, high = found["controls"]["bare"]["difference_interval"]
+    assert design["confidence"].value == pytest.approx(found.confidence, abs=1e-5)
+    low, high = found.controls["bare"].difference_interval
     assert (design["gain in rate"].low, design["gain in rate"].high) == pytest.approx((low, high))
     glb = (tmp_path / "out/files/texture.as_is.builtin.3.glb").read_bytes()
     assert glb == (tmp_path / "run/object.glb").read_bytes()

@@ -13,16 +13,17 @@ from PIL import Image
 from pycocotools.coco import COCO
 from pypdfium2 import PdfDocument
 
-from patchproof.app.compare import compare_runs
+from patchproof.app.compare import compare as compare_runs
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.channel.printer import load_printer
 from patchproof.optimizer import given
 from patchproof.optimizer import run as run_module
 from patchproof.optimizer.given import fit, import_folder, import_patch
+from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.report.coco import PATCH
-from patchproof.reprints.run_sheet import sheet_of
+from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.sheets.manifest import load_manifest
 from patchproof.sheets.markers import DICTIONARY
 from patchproof.sheets.piece import marker_image
@@ -31,7 +32,7 @@ from test_optimize import scene_with, toml
 
 RNG = np.random.default_rng(0)
 SMALL = {"camera__photo_px": [96, 96], "background__color": [0.5, 0.5, 0.5]}
-DRAFT = {"promise_views": 8, "controls": ("bare",)}
+DRAFT = {"promise": PromiseOptions(views=8, controls=("bare",))}
 
 
 def noise(width: int, height: int) -> np.ndarray:
@@ -292,9 +293,9 @@ def test_runs_that_are_not_seen_alike_are_not_compared(several, tmp_path):
 def test_a_folder_goes_on_where_it_was_stopped(several, tmp_path, monkeypatch):
     pictures, scene = several / "pictures", several / "scene.toml"
     with pytest.raises(Refused, match="add --overwrite"):
-        import_folder(pictures, scene, several / "runs", promise_views=8)
+        import_folder(pictures, scene, several / "runs", promise=PromiseOptions(views=8))
     monkeypatch.setattr(given, "import_patch", lambda *_, **__: pytest.fail("imported again"))
-    kept = import_folder(pictures, scene, several / "runs", promise_views=8, resume=True)
+    kept = import_folder(pictures, scene, several / "runs", promise=PromiseOptions(views=8), resume=True)
     assert [run.folder.name for run in kept] == ["blue", "gray", "red"]
     (tmp_path / "alike").mkdir()
     for kind in ("png", "bmp"):

@@ -15,6 +15,7 @@ import trimesh
 from PIL import Image
 
 from patchproof.base.claims import wilson
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.goal import Goal
 from patchproof.base.settings import SceneSettings
@@ -26,9 +27,10 @@ from patchproof.optimizer.goals import target_loss, total_variation
 from patchproof.optimizer.loop import start, step_on, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROLS, make_promise
+from patchproof.optimizer.promise import CONTROLS, PromiseOptions, make_promise
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.run import load_run, optimize_scene, promise_run
+from patchproof.optimizer.run import load_run, promise_run
+from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.scene.conditions import fields_of, with_values
 from patchproof.scene.scene import build_scene
@@ -344,18 +346,18 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
     scene = toml(tmp_path / "scene.toml", optimize__steps=6)
     optimize_scene(scene, tmp_path / "whole")
     for last, after in ((5, 4), (3, 2)):
-        out, made = tmp_path / str(last), list[int]()
+        out, made = tmp_path / str(last), list[tuple]()
 
-        def kill(step, total, last=last):
-            if step.state.number == last:
+        def kill(stage, done, total, last=last):
+            if (stage, done) == ("optimize", last):
                 raise Killed
 
         with pytest.raises(Killed):
-            optimize_scene(scene, out, on_step=kill)
+            optimize_scene(scene, out, progress=kill)
         with pytest.raises(Refused, match="an unfinished one"):
             load_run(out)
-        resumed = optimize_scene(scene, out, resume=True, on_step=lambda step, _, m=made: m.append(step.state.number))
-        assert made == [*range(after + 1, 7)]
+        resumed = optimize_scene(scene, out, resume=True, progress=lambda *report, m=made: m.append(report))
+        assert [done for stage, done, _ in made if stage == "optimize"] == [*range(after + 1, 7)]
         assert same_files(tmp_path / "whole", out)
         assert len((out / "steps.jsonl").read_text().splitlines()) == 6
         np.testing.assert_array_equal(load_run(out).design, resumed.design)
@@ -372,7 +374,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     with threads(1):
         for jobs, kept_px in ((3, training_views.CACHE_PX), (1, 0)):
             monkeypatch.setattr(training_views, "CACHE_PX", kept_px)
-            optimize_scene(scene, tmp_path / str(jobs), jobs=jobs)
+            optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs))
     assert same_files(tmp_path / "1", tmp_path / "3", files)
 
 
@@ -441,7 +443,7 @@ def test_a_session_is_seen_by_one_process_but_for_the_last_ones(tmp_path, monkey
     problem = set_problem(scene_with(tmp_path, camera__photo_px=[96, 96]))
     drawn, beside = problem.scene.draw("promise", 32, per_session=4), np.arange(32) % 4 < 2
     shown = {"design": problem.subject.shown(start(problem).design), "bare": None}
-    responses(problem, shown, drawn, beside=beside, on_views=lambda *count: counts.append(count))
+    responses(problem, shown, drawn, beside=beside, advance=lambda *count: counts.append(count))
     rows = [np.concatenate([part.rows for part in task]) for task in tasks]
     assert sorted(np.concatenate(rows)) == list(range(32)) and [len(each) for each in rows] == [8, 8, 8, 4, 4]
     assert all(len({*each // 4}) == 2 for each in rows), "two sessions each"
@@ -467,7 +469,7 @@ def test_texels_are_to_the_byte_those_of_one_thread_before_processes_share_views
 def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml")
     optimize_scene(scene, tmp_path / "whole")
-    draft = optimize_scene(scene, tmp_path / "draft", promise_views=8)
+    draft = optimize_scene(scene, tmp_path / "draft", promise=PromiseOptions(views=8))
     assert draft.promise.draft and not same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",))
     promised = promise_run(tmp_path / "draft")
     assert same_files(tmp_path / "whole", tmp_path / "draft", ("run.json",)) and not promised.promise.draft

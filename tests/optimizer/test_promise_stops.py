@@ -16,7 +16,15 @@ from patchproof.base.validation import validated
 from patchproof.evidence.verdict import EACH, MOST_PHOTOS, sessions_needed
 from patchproof.optimizer import promise, run
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.promise import CONTROL_VIEWS, PER_SESSION, SETTLED, _looks, control_claims, make_promise
+from patchproof.optimizer.promise import (
+    CONTROL_VIEWS,
+    PER_SESSION,
+    SETTLED,
+    PromiseOptions,
+    _looks,
+    control_claims,
+    make_promise,
+)
 from patchproof.optimizer.responses import Answers
 from patchproof.optimizer.run import promise_run
 from test_optimize import scene_with
@@ -32,8 +40,8 @@ def promised(tmp_path):
     conditions = problem.scene.draw("promise", 40, per_session=PER_SESSION)
 
     def make(half_width=None, told=None):
-        on_views = (lambda *count: None) if told is None else (lambda *count: told.append(count))
-        return make_promise(problem, blue, conditions, ("bare",), on_views, PER_SESSION, half_width)
+        advance = (lambda *count: None) if told is None else (lambda *count: told.append(count))
+        return make_promise(problem, blue, conditions, ("bare",), advance, PER_SESSION, half_width)
 
     return make
 
@@ -78,7 +86,7 @@ def test_a_scene_asks_for_a_half_width_and_a_number_of_views_for_all_of_them(tmp
     gray = {"background__color": [0.5, 0.5, 0.5]}
     scene = scene_with(tmp_path, optimize__steps=1, promise__half_width=0.3, **gray)
     assert SceneSettings.model_fields["promise"].default.half_width == 0.04
-    whole = run.optimize_scene(scene, tmp_path / "run", controls=("bare",))
+    whole = run.optimize(scene, tmp_path / "run", promise=PromiseOptions(controls=("bare",)))
     assert whole.promise.n == 20 and not whole.promise.draft
     assert promise_run(tmp_path / "run", views=40).promise.n == 40
     assert promise_run(tmp_path / "run").promise == whole.promise

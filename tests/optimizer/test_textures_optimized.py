@@ -12,10 +12,11 @@ from PIL import Image
 from patchproof.mesh.export import write_glb
 from patchproof.mesh.mesh import Material, Part, from_parts
 from patchproof.optimizer import loop, run
-from patchproof.optimizer.evaluate import evaluate_run
+from patchproof.optimizer.evaluate import evaluate as evaluate_run
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
-from patchproof.optimizer.run import load_run, optimize_scene
+from patchproof.optimizer.run import load_run
+from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.scene.conditions import with_values
@@ -176,7 +177,7 @@ def test_a_texture_run_is_read_back_evaluated_and_refused_a_sheet(tmp_path, caps
     assert again.promise == finished.promise and again.promise.n == 8
     assert set(again.promise.controls) == {"bare", "mean", "gray", "noise"}
     result = evaluate_run(tmp_path / "run", n=4)
-    assert result["n"] == 4 and (tmp_path / "run" / "evaluate.json").is_file()
+    assert result.n == 4 and (tmp_path / "run" / "evaluate.json").is_file()
     assert command("sheet", tmp_path / "run", "--out", tmp_path / "sheet.pdf") == 1
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("Expected a run of a patch, got one of the object's own texture:")
@@ -188,14 +189,14 @@ class Killed(Exception):
 
 
 def test_a_texture_run_killed_and_resumed_gives_the_same_bytes(tmp_path):
-    def kill(step, total):
-        if step.state.number == 3:
+    def kill(stage, done, total):
+        if (stage, done) == ("optimize", 3):
             raise Killed
 
     scene = scene_file(tmp_path, "masked")
     optimize_scene(scene, tmp_path / "whole")
     with pytest.raises(Killed):
-        optimize_scene(scene, tmp_path / "cut", on_step=kill)
+        optimize_scene(scene, tmp_path / "cut", progress=kill)
     optimize_scene(scene, tmp_path / "cut", resume=True)
     files = sorted(path.name for path in (tmp_path / "whole").iterdir())
     assert files == sorted(path.name for path in (tmp_path / "cut").iterdir())

@@ -31,7 +31,7 @@ from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import photograph
 from patchproof.render.stage import set_stage
 from patchproof.reprints.hung_sheet import HungSheet, sent_pixels, take_photo
-from patchproof.reprints.run_sheet import sheet_of
+from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import draw, with_values
 from patchproof.scene.patch_scene import PatchScene
 from patchproof.scene.placement import place_card

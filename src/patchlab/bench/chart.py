@@ -15,7 +15,7 @@ import numpy as np
 from patchproof.base.claims import Estimate
 from patchproof.report.tables import Table, Value
 
-OnStage = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]
 OFF_FRONT = 5.0  # % more error than the front's at its cost that a default may have, where intervals do not overlap
 
 

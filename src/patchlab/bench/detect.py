@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from patchlab.bench.chart import Chart, Check, OnStage, Point
+from patchlab.bench.chart import Chart, Check, Point, Progress
 from patchlab.bench.measure import clocked
 from patchlab.bench.paper import DESIGN_MM, Sheet, corners_mm, drawn_sheet, photographed
 from patchlab.study.claims import median
@@ -45,12 +45,12 @@ class Trial:
     share: float
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """Start size and refinement, one chart per photo size."""
     count = 3 if quick else 12
     for number, size_px in enumerate(SIZES_PX):
         yield _levels_chart([shoot(size_px, seed) for seed in range(count)], size_px)
-        on_stage("detect", number + 1, len(SIZES_PX))
+        progress("detect", number + 1, len(SIZES_PX))
 
 
 def _levels_chart(shots: list[Shot], size_px: tuple[int, int]) -> Chart:

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.measure import clocked
 from patchproof.app.demo import SCENE
 from patchproof.base.claims import Estimate, rate
@@ -24,8 +24,10 @@ from patchproof.base.validation import validated
 from patchproof.base.workers import threads
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.responses import responses
-from patchproof.optimizer.run import DRAFT, THOROUGH, Run, optimize_scene
+from patchproof.optimizer.run import DRAFT, THOROUGH, Run
+from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.report.tables import Table
 from patchproof.scene.interface import Scene
 from patchproof.scene.scene import build_scene
@@ -44,14 +46,14 @@ EFFORTS = {"draft": DRAFT, DEFAULT: (OptimizeSettings().steps, None), "thorough"
 QUICK_EFFORTS = {"draft": DRAFT, DEFAULT: (2 * DRAFT[0], 2 * DRAFT[1])}
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """The one chart."""
     labels = list(OBJECTS)[:1] if quick else list(OBJECTS)
-    yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, on_stage)
+    yield effort_chart(labels, QUICK_EFFORTS if quick else EFFORTS, 100 if quick else 400, progress)
 
 
 def effort_chart(
-    labels: list[str], efforts: Mapping[str, tuple[int, int | None]], judged: int, on_stage: OnStage
+    labels: list[str], efforts: Mapping[str, tuple[int, int | None]], judged: int, progress: Progress
 ) -> Chart:
     """Each effort's seconds beside the default's against the share of `judged` views that its design misses."""
     series, rows = {}, []
@@ -59,7 +61,7 @@ def effort_chart(
         runs = {}
         for name, (steps, views) in efforts.items():
             runs[name] = _timed_run(_scene(label, steps), views)
-            on_stage("runs", len(series) * len(efforts) + len(runs), len(labels) * len(efforts))
+            progress("runs", len(series) * len(efforts) + len(runs), len(labels) * len(efforts))
         missed = _missed({name: run for name, (run, _) in runs.items()}, judged)
         seconds = {name: taken for name, (_, taken) in runs.items()}
         series[label] = [
@@ -93,7 +95,9 @@ def _scene(label: str, steps: int) -> Scene:
 
 def _timed_run(scene: Scene, views: int | None) -> tuple[Run, float]:
     with TemporaryDirectory() as folder, threads(1):
-        run, ms = clocked(lambda: optimize_scene(scene, Path(folder) / "run", promise_views=views), perf_counter)
+        run, ms = clocked(
+            lambda: optimize_scene(scene, Path(folder) / "run", promise=PromiseOptions(views)), perf_counter
+        )
         return run, ms / 1000
 
 

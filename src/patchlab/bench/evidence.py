@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.measure import clocked
 from patchlab.bench.paper import (
     DESIGN_MM,
@@ -37,9 +37,9 @@ Corners = Mapping[int, np.ndarray]
 ToPx = Callable[[np.ndarray], np.ndarray]
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """Models."""
-    yield models_chart(4 if quick else 24, on_stage)
+    yield models_chart(4 if quick else 24, progress)
 
 
 def error_mm(model: ToPx, sheet: Sheet) -> float:
@@ -101,7 +101,7 @@ def corners_found(kind: Kind, seed: int) -> dict[int, np.ndarray]:
     return find_sheet(photo, frozenset(corners_mm()), corners_mm(), DICTIONARY).corners_px
 
 
-def models_chart(count: int, on_stage: OnStage) -> Chart:
+def models_chart(count: int, progress: Progress) -> Chart:
     """Models of the sheet against the error of the design, on flat, misprinted, bent and rolled sheets."""
     kinds: dict[str, tuple[Kind, float]] = {
         "flat": ("flat", 0.0),
@@ -123,7 +123,7 @@ def models_chart(count: int, on_stage: OnStage) -> Chart:
         series[label] = [
             Point(name, median(milliseconds[name]), median(errors[name]), name == DEFAULT_MODEL) for name in MODELS
         ]
-        on_stage("models of sheets", number + 1, len(kinds))
+        progress("models of sheets", number + 1, len(kinds))
     return Chart(
         name="models",
         title="What makes a sheet flat",

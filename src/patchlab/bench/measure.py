@@ -22,6 +22,7 @@ import numpy as np
 
 from patchlab.study.claims import median
 from patchproof.base.claims import Estimate
+from patchproof.base.progress import Advance, no_advance
 
 Name = TypeVar("Name", bound=Hashable)
 Answer = TypeVar("Answer")
@@ -51,14 +52,14 @@ def describe(about: Mapping[str, Any]) -> str:
 def in_turn(
     calls: Mapping[Name, Callable[[], Answer]],
     rounds: int,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> dict[Name, list[Answer]]:
     """What each call returns in each of some rounds, all calls in turn in every round; a round before them warms up."""
     answers: dict[Name, list[Answer]] = {name: [] for name in calls}
     for number in range(rounds + 1):
         for name, call in calls.items():
             answers[name].append(call())
-        progress(number + 1, rounds + 1)
+        advance(number + 1, rounds + 1)
     return {name: values[1:] for name, values in answers.items()}
 
 

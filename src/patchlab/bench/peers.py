@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.measure import clocked
 from patchlab.bench.methods import METHODS, load_art
 from patchlab.paper.patch3d import patch_cells
@@ -166,7 +166,7 @@ STUDY = Study("peers", PeersSettings, cells, run, tables, figures)
 # The benchmark: the same on the demo's scene
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """Every method's time against its error on the demo's scene; ART where it is installed."""
     with TemporaryDirectory() as folder:
         base, peers = Path(folder), PEERS if _has_art() else PEERS_ALWAYS
@@ -178,7 +178,7 @@ def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
                 cell = replace(cell, values=with_tables(dict(cell.values), {"optimize": {"steps": _QUICK_STEPS}}))
             with threads(1):
                 results.append(Result(cell, run(settings, base, cell), base))
-            on_stage("cells", len(results), len(settings.seeds))
+            progress("cells", len(results), len(settings.seeds))
         yield peers_chart(settings, results)
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from patchlab.bench.chart import Chart, Check, OnStage, Point
+from patchlab.bench.chart import Chart, Check, Point, Progress
 from patchlab.bench.chart_page import chart_manifest, printed_page
 from patchlab.bench.inkjets import DRIVERS, draw_inkjet
 from patchlab.study.claims import mean, median
@@ -49,12 +49,12 @@ class Trial:
         return self.errors[self.chosen] - min(self.errors.values())
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """The ladder's chart for each size of a printer's chart."""
     count, trials = 6 if quick else 36, []  # three minutes of one core; a multiple of the six kinds of printer
     for i in range(count):
         trials += [try_printer(i, swatches) for swatches in SWATCHES]
-        on_stage("printers", i + 1, count)
+        progress("printers", i + 1, count)
     for swatches in SWATCHES:
         yield ladder_chart([trial for trial in trials if trial.swatches == swatches])
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.measure import ratio, timed
 from patchlab.bench.world import design_for_demo
 from patchproof.base.claims import student_mean
@@ -28,13 +28,13 @@ from patchproof.scene.conditions import Conditions
 SIDES_PX = (96, 128, 192, 224, 384)  # and the default's
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """The one chart."""
-    problem, design = design_for_demo(80 if quick else 160, on_stage)
-    yield resolution_chart(problem, design, 6 if quick else 40, 2 if quick else 15, on_stage)
+    problem, design = design_for_demo(80 if quick else 160, progress)
+    yield resolution_chart(problem, design, 6 if quick else 40, 2 if quick else 15, progress)
 
 
-def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, on_stage: OnStage) -> Chart:
+def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int, progress: Progress) -> Chart:
     """Sides at which views are rendered against whole photographs of the same conditions, JPEG files and all."""
     shown = problem.patch.shown(trained)
     conditions, (classifier,), (indices,) = problem.scene.draw("select", views), problem.classifiers, problem.indices
@@ -55,7 +55,7 @@ def resolution_chart(problem: Problem, trained: Tensor, views: int, rounds: int,
         for i in range(views):
             photo = image_pixels(take_photo(problem.stage, shown, conditions[i : i + 1]))
             truth.append(confidence(from_pixels(photo)[None])[0])
-            on_stage("photographs", i + 1, views)
+            progress("photographs", i + 1, views)
     times, points, rows = timed({side: lambda side=side: step(side) for side in sides}, rounds), [], []
     for side in sides:
         with torch.no_grad():

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 
-from patchlab.bench.chart import Chart, OnStage, checks_table, failed_checks, points_table
+from patchlab.bench.chart import Chart, Progress, checks_table, failed_checks, points_table
 from patchlab.bench.draw import drawing
 from patchlab.bench.measure import describe, machine
 from patchproof.base.errors import Refused
@@ -18,7 +18,7 @@ from patchproof.base.output import new_folder
 from patchproof.base.validation import nearest
 from patchproof.report.tables import Results, write_results
 
-Bench = Callable[[bool, OnStage], Iterator[Chart]]
+Bench = Callable[[bool, Progress], Iterator[Chart]]
 BENCHES = ("render", "train", "effort", "printer", "detect", "evidence", "peers")  # modules with a `charts`
 _OWN = ("*.json", "*.html", "*_*.csv", "*_*.png")
 
@@ -29,7 +29,7 @@ def run_bench(
     *,
     quick: bool = False,
     overwrite: bool = False,
-    on_stage: OnStage = lambda stage, done, total: None,
+    progress: Progress = lambda stage, done, total: None,
 ) -> list[Results]:
     """Run one benchmark, or `all`, into the folder `out`; returns what was written."""
     if name not in ("all", *BENCHES):
@@ -37,7 +37,7 @@ def run_bench(
     written = []
     with new_folder(out, _OWN, overwrite) as folder:
         for bench in BENCHES if name == "all" else (name,):
-            charts = list(load_bench(bench)(quick, on_stage))
+            charts = list(load_bench(bench)(quick, progress))
             written.append(_results(bench, quick, charts))
             write_results(folder, written[-1])
     return written

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from patchlab.bench.chart import Chart, OnStage, Point
+from patchlab.bench.chart import Chart, Point, Progress
 from patchlab.bench.world import demo_problem
 from patchlab.study.claims import paired_means
 from patchproof.base.settings import OptimizeSettings
@@ -39,14 +39,14 @@ class Effort:
     judged: int
 
 
-def charts(quick: bool, on_stage: OnStage) -> Iterator[Chart]:
+def charts(quick: bool, progress: Progress) -> Iterator[Chart]:
     """Every chart of training, one after the other."""
     effort = Effort(120, 3, 64) if quick else Effort(960, 4, 256)
     views = {f"{n}": USUAL.changed(views=n) for n in (QUICK_VIEWS if quick else VIEWS)}
     moves = {f"adam {size:g}": USUAL.changed(step_size=size) for size in (QUICK_ADAM if quick else ADAM)}
     for size in QUICK_SIGN if quick else SIGN:
         moves[f"sign {size:g}"] = USUAL.changed(optimizer="sign", step_size=size)
-    losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, on_stage)
+    losses = trained_losses(demo_problem(), list(dict.fromkeys([*views.values(), *moves.values()])), effort, progress)
     yield runs_chart("views", "Views per step, for as many views in all", views, losses, effort)
     yield runs_chart("optimizer", "Optimizer and step size", moves, losses, effort)
 
@@ -81,7 +81,7 @@ def ends_of(run: OptimizeSettings, effort: Effort) -> list[int]:
 
 
 def trained_losses(
-    problem: Problem, runs: Collection[OptimizeSettings], effort: Effort, on_stage: OnStage
+    problem: Problem, runs: Collection[OptimizeSettings], effort: Effort, progress: Progress
 ) -> dict[tuple[OptimizeSettings, int], list[float]]:
     """Losses on new conditions, the same for every design."""
     shown = {}
@@ -91,7 +91,7 @@ def trained_losses(
             numbers = [end // run.views for end in ends]
             designs = trained(problem.trained_by(run.changed(steps=numbers[-1]), seed), numbers)
             shown |= {(run, end, seed): problem.subject.shown(d) for end, d in zip(ends, designs, strict=True)}
-            on_stage("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
+            progress("training", seed * len(runs) + i + 1, effort.seeds * len(runs))
     answers = responses(problem, shown, problem.scene.draw("evaluate", effort.judged), problem.training_px)
     return {
         (run, end): [float(answers[run, end, seed].loss.mean()) for seed in range(effort.seeds)]

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 from torch import Tensor
 
-from patchlab.bench.chart import OnStage
+from patchlab.bench.chart import Progress
 from patchproof.app.demo import demo_scene
 from patchproof.base.settings import OptimizeSettings
 from patchproof.optimizer.loop import start, steps
@@ -20,13 +20,13 @@ from patchproof.optimizer.problem import Problem, set_problem
 from patchproof.scene.scene import load_scene
 
 
-def design_for_demo(count: int, on_stage: OnStage) -> tuple[Problem, Tensor]:
+def design_for_demo(count: int, progress: Progress) -> tuple[Problem, Tensor]:
     """The demo's problem, and the best design 3×h×w of `count` steps of its optimization."""
     problem = demo_problem().trained_by(OptimizeSettings(steps=count))
     state = start(problem)
     for step in steps(problem, state):
         state = step.state
-        on_stage("design", state.number, count)
+        progress("design", state.number, count)
     return problem, from_pixels(as_pixels(state.best))
 
 

@@ -40,7 +40,7 @@ class ForecastsSettings(SessionsSettings):
 
 def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Forecasts, estimates and what was photographed, by session."""
-    from patchproof.app.verify import verify_photos
+    from patchproof.app.verify import verify as verify_photos
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

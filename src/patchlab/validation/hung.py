@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from patchproof.optimizer.run import Run
 from patchproof.render.stage import Stage, set_stage
 from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, sent_pixels
-from patchproof.reprints.run_sheet import sheet_of
+from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.sheets.content import PrintedPiece
 from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.template import load_template

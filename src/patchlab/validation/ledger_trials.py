@@ -33,8 +33,9 @@ from patchproof.base.validation import Strict
 from patchproof.channel.printer import Printer, load_printer
 from patchproof.classifier.load import load_classifier
 from patchproof.classifier.network import Classifier
+from patchproof.evidence.batch import MEASURABLE_CODES
 from patchproof.evidence.classify import target_indices
-from patchproof.evidence.ledger import LEAST_PHOTOS, usable
+from patchproof.evidence.ledger import LEAST_PHOTOS
 from patchproof.evidence.run import gather_evidence
 from patchproof.evidence.task import Options
 from patchproof.optimizer.pixels import from_pixels
@@ -135,7 +136,7 @@ class _Hall:
                 (Path(folder) / f"{i:03d}.jpg").write_bytes(photo)
             report = gather_evidence(folder, self.sheet.manifest, Options([self.model], self.sheet.printer))
         ledger = report.ledger
-        used = np.array([usable(entry.status, entry.code) for entry in report.photos])
+        used = np.array([entry.status != "rejected" and entry.code in MEASURABLE_CODES for entry in report.photos])
         if ledger is None or ledger.photos < LEAST_PHOTOS:
             return {"outcome": "unreadable", "photos": 0 if ledger is None else ledger.photos}
         shares = {step: share.share for step, share in ledger.shares.items()}

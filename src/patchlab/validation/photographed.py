@@ -27,6 +27,7 @@ from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result
 from patchproof.base.sessions import Spread, in_sessions, spread_of
 from patchproof.base.validation import expand
+from patchproof.optimizer.promise import PromiseOptions
 
 if TYPE_CHECKING:
     from patchproof.optimizer.run import Run
@@ -57,16 +58,16 @@ def cells(settings: SessionsSettings, base: Path) -> list[Cell]:
 def printed_run(base: Path, cell: Cell, folder: Path) -> Run:
     """The cell's design in folder/run, its sheet in folder/sheet.pdf."""
     from patchproof.optimizer.given import import_patch
-    from patchproof.optimizer.run import optimize_scene
-    from patchproof.reprints.run_sheet import sheet_of
+    from patchproof.optimizer.run import optimize
+    from patchproof.reprints.run_sheet import sheet as sheet_of
 
     scene = scene_of(base, cell.values)
     scene = replace(scene, settings=scene.settings.changed(target={"models": networks_at(base, cell.values)}))
     # one control is enough for a page, and all of them would take most of a promise's time
     if (picture := cell.values.get("picture")) is None:
-        made = optimize_scene(scene, folder / "run", controls=("bare",))
+        made = optimize(scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
     else:
-        made = import_patch(expand(picture, base), scene, folder / "run", controls=("bare",))
+        made = import_patch(expand(picture, base), scene, folder / "run", promise=PromiseOptions(controls=("bare",)))
     sheet_of(made, folder / "sheet.pdf")
     return made
 

@@ -79,7 +79,7 @@ def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
 
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise and count of one combination."""
-    from patchproof.app.verify import verify_photos
+    from patchproof.app.verify import verify as verify_photos
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -11,14 +11,16 @@ out on purpose: corrections of the other rows for how many there are; they only 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from patchproof.base.claims import difference, rate
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.output import new_folder
+from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import listed
 from patchproof.base.workers import open_workers
 from patchproof.classifier.network import Classifier
@@ -37,35 +39,44 @@ _HEAD = ("design", "made", "network", "rate", "best control", "minus it", "minus
 Shown = Mapping[str, Answers]  # what networks answered to a design and its controls
 
 
-def compare_runs(
+def compare(
     runs: Sequence[str | Path],
     out: str | Path,
     *,
     models: Sequence[str | Classifier] | None = None,
     n: int = PROMISE_VIEWS,
     seed: int | None = None,
-    device: str = "cpu",
-    jobs: int = 1,
-    cluster: str | None = None,
+    compute: Compute = Compute(),
     overwrite: bool = False,
-    on_view: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> Results:
-    """Compare the designs of run folders under n conditions of the first one's seed (or of `seed`), and the two best
-    under n more; all else as in `evaluate_run`. Written into the folder `out`.
+    """Compare the designs of several runs under the same conditions, and the two best of them under as many fresh ones.
+
+    runs: folders of finished runs of one scene, two or more.
+    out: folder for designs.html, designs.json and the tables.
+    models, compute, overwrite, progress: as in `evaluate`.
+    n: conditions for each comparison.
+    seed: of the conditions, in place of the first run's.
+
+    Raises Refused for runs of different scenes.
     """
     networks, loaded = None if models is None else tuple(models), _loaded(runs, models is None)
-    refuse_unnamed(networks, jobs, cluster)
+    refuse_unnamed(networks, compute)
     scene, total, before = next(iter(loaded.values())).scene, n * (len(loaded) + 2), 0
     judges = networks or scene.settings.target.models
     names = tuple(each.name if isinstance(each, Classifier) else each for each in judges)
     seed = scene.seed if seed is None else seed
-    with new_folder(out, OWN, overwrite) as folder, open_workers(jobs, cluster) as workers:
+    with new_folder(out, OWN, overwrite) as folder, open_workers(compute.jobs, compute.cluster) as workers:
 
         def ask(name: str, start: int) -> Shown:
             nonlocal before
             run, done = loaded[name], before
-            views, step = run.scene.draw("evaluate", n, seed, start), lambda count: on_view(done + count, total)
-            answers, _ = answers_of(run.folder.resolve(), views, workers, networks, device, step)
+            conditions = run.scene.draw("evaluate", n, seed, start)
+
+            def advance(count: int, _: int) -> None:
+                progress("evaluate", done + count, total)
+
+            answers, _ = answers_of(run.folder.resolve(), conditions, workers, networks, compute.device, advance)
             before += n
             return answers
 

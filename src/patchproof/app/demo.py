@@ -7,17 +7,17 @@ to gain.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from patchproof.app.verify import verify_photos
+from patchproof.app.verify import verify
+from patchproof.base.compute import Compute
 from patchproof.base.output import new_folder
+from patchproof.base.progress import Progress, no_progress
 from patchproof.base.settings import behind
-from patchproof.optimizer.run import optimize_scene
+from patchproof.optimizer.run import optimize
 from patchproof.report.words import promise_lines, verdict_lines
 from patchproof.reprints.reprint import reprint
-from patchproof.reprints.run_sheet import sheet_of
+from patchproof.reprints.run_sheet import sheet
 
 PHOTOS, SESSIONS = 48, 12
 OWN = ("scene.toml", "run", "sheet.pdf", "sheet.json", "photos", "report")
@@ -67,21 +67,16 @@ def run_demo(
     detector: bool = False,
     jobs: int = 1,
     overwrite: bool = False,
-    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+    progress: Progress = no_progress,
 ) -> list[str]:
     """Run every step into the folder `out`, before the built-in classifier or detector; returns the summary's lines."""
+    compute = Compute(jobs=jobs)
     with new_folder(out, OWN, overwrite) as folder:
         pdf, photos, report = folder / "sheet.pdf", folder / "photos", folder / "report"
-        run = optimize_scene(
-            demo_scene(folder, detector),
-            folder / "run",
-            jobs=jobs,
-            on_step=lambda step, total: on_stage("optimize", step.state.number, total),
-            on_promise=partial(on_stage, "promise"),
-        )
-        sheet_of(run, pdf)
-        reprint(pdf, run, PHOTOS, photos, sessions=SESSIONS, jobs=jobs, on_photo=partial(on_stage, "photograph"))
-        judged = verify_photos(photos, folder / "sheet.json", report, jobs=jobs, on_photo=partial(on_stage, "verify"))
+        run = optimize(demo_scene(folder, detector), folder / "run", compute=compute, progress=progress)
+        sheet(run, pdf)
+        reprint(pdf, run, PHOTOS, photos, sessions=SESSIONS, compute=compute, progress=progress)
+        judged = verify(photos, folder / "sheet.json", report, compute=compute, progress=progress)
     return [
         "Hard conditions on purpose (far, dim, oblique, cluttered): bare object and controls are often misread.",
         *promise_lines(run.promise, behind(run.scene.settings.model_dump())),

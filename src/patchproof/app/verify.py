@@ -9,17 +9,20 @@ and the optimizer in.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, rect_corners
 from patchproof.base.input import is_file
-from patchproof.base.output import check_folder, write_whole
+from patchproof.base.output import check_folder, write_pictures, write_whole
+from patchproof.base.progress import Progress, no_progress
 from patchproof.channel.cameras import camera_of
 from patchproof.channel.printer import load_printer
 from patchproof.classifier.load import load_classifier
@@ -40,45 +43,75 @@ if TYPE_CHECKING:
     from patchproof.channel.lens import Camera
     from patchproof.optimizer.run import Run
 
-_JOURNAL = "photos.jsonl"
-OWN = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _JOURNAL)
+_JOURNAL, _PHOTOS = "photos.jsonl", "photos"
+OWN = ("report.json", "report.csv", "report.html", "coco.json", "pictures", _PHOTOS, _JOURNAL)
 _LIBRARIES = ("patchproof", "numpy", "opencv-contrib-python-headless", "torch", "scipy")
 
 
-def verify_photos(
-    photos: str | Path,
+@dataclass(frozen=True)
+class CaptureInfo:
+    """What is known about how the photographs were taken.
+
+    camera: a camera file's name or path, which replaces the EXIF focal length and takes the lens's distortion out.
+    scan_dpi: resolution of flat scans of the uncut page; None for photographs.
+    ruler_mm: lengths (x, y) of the two printed 100 mm rulers as measured on the print, in millimeters.
+    boxes: COCO JSON with the object's box in photographs, for detectors, where the sheet does not tell it.
+    """
+
+    camera: str | Path | None = None
+    scan_dpi: float | None = None
+    ruler_mm: tuple[float, float] | None = None
+    boxes: str | Path | None = None
+
+
+def verify(
+    photos: str | Path | Sequence[np.ndarray],
     sheet: str | Path,
     out: str | Path,
     *,
     models: Sequence[str | Classifier] | None = None,
     controls: str | Path | None = None,
-    scan_dpi: float | None = None,
-    ruler_mm: tuple[float, float] | None = None,
-    ledger_photos: int = LEDGER_PHOTOS,
-    camera: str | None = None,
-    boxes: str | Path | None = None,
+    capture: CaptureInfo = CaptureInfo(),
     run: str | Path | Run | None = None,
-    jobs: int = 1,
-    cluster: str | None = None,
+    ledger_photos: int = LEDGER_PHOTOS,
+    compute: Compute = Compute(),
     resume: bool = False,
     overwrite: bool = False,
-    on_photo: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> Report:
-    """Judge the photographs and write the report; `ruler_mm` are the printed rulers (x, y) as somebody measured them.
+    """Measure photographs of a print, judge them against the promise of its sheet, and write the report.
 
-    `models` are names, or classifiers in memory; a network of the sheet that is code (`module:`) is run only where it
-    is one of them. `camera` is a camera file's name or path. Model and printer names are looked up from the manifest's
-    folder, then as the scene's were. For detectors, `boxes` is COCO JSON with the object's box in photographs whose
-    sheet does not tell it, or tells it wrongly. With the `run` that the sheet was made from, each photograph gets a
-    forecast of its own. `resume` goes on from what an earlier run finished, whole or killed: only photographs that are
-    new, or differ, are measured.
+    photos: a folder of photographs, or of folders, one a session; one photograph; or uint8 H×W×3 sRGB arrays of one
+        session, which are kept as PNG files in `out`.
+    sheet: the manifest, SHEET.json; its folder is where its models and printers are looked up.
+    out: folder for the report, new or empty.
+    models: networks besides the sheet's first: names, or classifiers in memory. Code (`module:`) that the sheet names
+        runs only where it is one of them.
+    controls: folder with a folder of photographs for each control ("bare", "mean", ...).
+    capture: camera, scan resolution, measured rulers, the object's boxes.
+    run: the run that the sheet was made from; each photograph then gets a forecast at its measured view.
+    ledger_photos: photographs at most in the gap ledger and the estimated effect, 0 for neither; each costs 16
+        classifications.
+    compute: processes or cluster; photographs are judged on the CPU, and another device is refused.
+    resume: keep what an earlier call finished, and measure only photographs that are new or differ.
+    overwrite: delete an earlier report in `out` first.
+    progress: called with the stage "verify" (photographs).
+
+    Raises Refused for a sheet, network or folder that cannot be used. Photographs that cannot be measured or judged are
+    listed in the report with the code of their `PhotoRejected`.
+
+        report = pp.verify("photos", "sheet.json", "report", compute=pp.Compute(jobs=4))
+        print(report.summary.verdict, report.summary.rate)
     """
-    out, manifest = Path(out), load_manifest(sheet)
+    out, manifest, compute = Path(out), load_manifest(sheet), compute.without("verify", device=True)
     _check_out(out, resume, overwrite)
+    if not isinstance(photos, str | Path):
+        photos = write_pictures(photos, out / _PHOTOS)
+    boxes = capture.boxes
     options = replace(
-        options_of(sheet, manifest, models, camera),
-        scan_dpi=scan_dpi,
-        ruler_mm=ruler_mm,
+        options_of(sheet, manifest, models, capture.camera),
+        scan_dpi=capture.scan_dpi,
+        ruler_mm=capture.ruler_mm,
         controls=controls,
         ledger_photos=ledger_photos,
     )
@@ -96,15 +129,15 @@ def verify_photos(
         photos,
         manifest,
         options,
-        jobs=jobs,
-        cluster=cluster,
+        compute=compute,
         journal=out / _JOURNAL,
         resume=resume,
         forecast=forecast,
         on_pictures=lambda file, kinds: save_pictures(out / "pictures", file, kinds),
-        progress=on_photo,
+        advance=partial(progress, "verify"),
     )
-    given = {"scan_dpi": scan_dpi, "ruler_mm": ruler_mm, "camera": camera and Path(camera).name}
+    given = {"scan_dpi": capture.scan_dpi, "ruler_mm": capture.ruler_mm}
+    given |= {"camera": capture.camera and Path(capture.camera).name}
     given |= {"boxes": boxes and Path(boxes).name, "ledger_photos": ledger_photos}
     hashes = {"manifest": file_sha256(Path(sheet)), **{f"network {each.name}": each.sha256 for each in options.models}}
     report = report.changed(origin=Origin(options=given, sha256=hashes, versions=versions_of(_LIBRARIES)))
@@ -138,9 +171,12 @@ def _boxes(report: Report, manifest: Manifest, camera: Camera | None) -> str:
 
 
 def options_of(
-    sheet: str | Path, manifest: Manifest, models: Sequence[str | Classifier] | None = None, camera: str | None = None
+    sheet: str | Path,
+    manifest: Manifest,
+    models: Sequence[str | Classifier] | None = None,
+    camera: str | Path | None = None,
 ) -> Options:
-    """What photographs of the sheet are judged with and measured against; see `verify_photos`."""
+    """What photographs of the sheet are judged with and measured against; see `verify`."""
     base, promise = Path(sheet).resolve().parent, manifest.promise
     least_score = None if promise is None else promise.models[0].least_score
     return Options(

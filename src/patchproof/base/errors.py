@@ -15,6 +15,8 @@ line prints the sentence of a `PatchproofError` and exits with 1. All survive pi
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class PatchproofError(Exception):
     """Base of all errors that patchproof raises on purpose."""
@@ -34,7 +36,7 @@ class Refused(PatchproofError, ValueError):
         expected, got, do = self._parts
         return Refused(expected, got, f"{do.rstrip('.')}{advice}")
 
-    def __reduce__(self):
+    def __reduce__(self) -> Any:
         # exceptions are rebuilt from their message when they come back from another process; this one has three parts
         return type(self), self._parts
 

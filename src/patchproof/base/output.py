@@ -11,7 +11,7 @@ import errno
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -131,6 +131,24 @@ def image_bytes(pixels: np.ndarray, kind: str, options: Mapping[str, Any] | None
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind, **(options or {}))
     return buffer.getvalue()
+
+
+def write_pictures(pictures: Sequence[np.ndarray], folder: Path) -> Path:
+    """Write uint8 H×W×3 sRGB arrays as photo_0001.png and so on into `folder`, in place of others; returns the folder.
+
+    Raises Refused where there is no array, or one of another type or shape.
+    """
+    pictures = list(pictures)
+    if not pictures:
+        raise Refused("a folder of photographs or arrays", "an empty list", "give one array or more")
+    for number, array in enumerate(pictures):
+        if not isinstance(array, np.ndarray) or array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+            what = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else f"a {type(array).__name__}"
+            raise Refused("photographs as uint8 H×W×3 arrays", f"{what} at index {number}", "convert it to 8-bit RGB")
+    with new_folder(folder, ("photo_*.png",), overwrite=True) as part:
+        for number, array in enumerate(pictures, 1):
+            (part / f"photo_{number:04d}.png").write_bytes(image_bytes(array, "PNG"))
+    return folder
 
 
 def image_pixels(content: bytes) -> np.ndarray:

@@ -10,7 +10,6 @@ nor the tone curve shifts them. Pixel centers are at .5.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import numpy as np
 from patchproof.base.color import photo_codes_of
 from patchproof.base.errors import Refused
 from patchproof.base.input import readable_formats
+from patchproof.base.progress import Advance, no_advance
 from patchproof.photo.detect import detected, detector_settings, luminance
 from patchproof.photo.limits import limited
 from patchproof.photo.read import list_photos, read_photo
@@ -50,7 +50,7 @@ def see_boards(
     photos: str | Path,
     board: Board,
     ruler_mm: tuple[float, float] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> tuple[list[View], dict[str, str], str]:
     """(views, reasons by the names of photographs left out, what the files call the camera) of a folder's pictures.
 
@@ -65,7 +65,7 @@ def see_boards(
             states.append((view.size_px, _tags(path), focal_px and round(focal_px)))
         except PhotoRejected as cannot:
             left[path.name] = cannot.advice
-        progress(number, len(paths))
+        advance(number, len(paths))
     if not views:
         got = f"{len(paths)} without it"
         raise Refused(f"photographs of the board {board.sheet_id}", got, "name the board with --board")

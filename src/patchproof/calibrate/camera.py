@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import partial
@@ -24,6 +24,7 @@ import numpy as np
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import check_file, write_together
+from patchproof.base.progress import Advance, Progress, no_advance, no_progress
 from patchproof.calibrate.boards import FEWEST_CORNERS, View, see_boards
 from patchproof.calibrate.ladder import Rung
 from patchproof.calibrate.lens_ladder import NUMBERS, Fit, climb, fit_rung
@@ -64,7 +65,7 @@ def calibrate_camera(
     *,
     ruler_mm: tuple[float, float] | None = None,
     overwrite: bool = False,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    progress: Progress = no_progress,
 ) -> Calibrated:
     """Calibrate and write the three files; `board` is a template or BOARD.json, `ruler_mm` its rulers as measured."""
     out = Path(out)
@@ -87,7 +88,7 @@ def solve(
     board: Board,
     name: str,
     camera: str = "",
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> Calibrated:
     """The camera that took these views; refused where they cannot tell. `camera` is what it calls itself."""
     _enough(views, left)
@@ -95,7 +96,7 @@ def solve(
     left = {**left, **odd}
     _enough(views, left)
     size_px = views[0].size_px
-    rungs, fit = climb(views, lambda fit: _is_usable(fit, size_px), progress)
+    rungs, fit = climb(views, lambda fit: _is_usable(fit, size_px), advance)
     _refuse_blind(fit)
     about = f"{len(views)} photographs of board {board.sheet_id}" + (f", camera {camera}" if camera else "")
     made = _camera(fit, name, size_px, about, _uncertainty(fit))

@@ -13,7 +13,7 @@ page's own, and the table is the printer's. Either is what the paper shows under
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ import torch
 from patchproof.base.color import linear_from_srgb, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, is_folder
+from patchproof.base.progress import Advance, no_advance
 from patchproof.calibrate.chart_photo import ChartPhoto, chart_rows, read_chart
 from patchproof.calibrate.color_ladder import WIDE, Choice, Map, choose, difference, kinds_of_maps
 from patchproof.calibrate.printer_files import printer_from_table, shown_colors
@@ -63,10 +64,10 @@ def calibrate_chart(
     manifest: Manifest,
     name: str,
     camera: Camera | None = None,
-    on_photo: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> Calibration:
     """The printer that these photographs show; each inner list holds those of one print."""
-    readings, warnings = _read_all(prints, manifest, camera, on_photo)
+    readings, warnings = _read_all(prints, manifest, camera, advance)
     by_print = [
         combine([reading.chart.light for reading in readings if reading.of_print == i])
         for i in sorted({reading.of_print for reading in readings})
@@ -211,7 +212,7 @@ def summary_lines(calibration: Calibration) -> list[str]:
 
 
 def _read_all(
-    prints: Sequence[Sequence[Path]], manifest: Manifest, camera: Camera | None, on_photo: Callable[[int, int], None]
+    prints: Sequence[Sequence[Path]], manifest: Manifest, camera: Camera | None, advance: Advance
 ) -> tuple[list[Reading], list[str]]:
     """All photographs that can be read, and what is wrong with the others; refused where none is left."""
     if not manifest.chart:
@@ -224,7 +225,7 @@ def _read_all(
                 readings.append(Reading(path, number, photo))
             except PhotoRejected as cannot:
                 warnings.append(f"{path.name} is left out ({cannot})")
-            on_photo(len(readings) + len(warnings), total)
+            advance(len(readings) + len(warnings), total)
     if not readings:
         first = warnings[0] if warnings else "none given"
         raise Refused("photographs in which the chart can be read", f"none of {total}", f"see the first: {first}")

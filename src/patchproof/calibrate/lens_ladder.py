@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from patchproof.base.errors import Refused
+from patchproof.base.progress import Advance, no_advance
 from patchproof.calibrate.boards import View
 from patchproof.calibrate.ladder import Rung, compared, simplest
 
@@ -72,7 +73,7 @@ class Fit:
 def climb(
     views: Sequence[View],
     usable: Callable[[Fit], bool] = lambda fit: True,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> tuple[tuple[Rung, ...], Fit]:
     """All rungs, their errors the photographs' RMS in px, and the chosen one's fit to all photographs.
 
@@ -85,7 +86,7 @@ def climb(
         if fit is not None and usable(fit):
             errors[number], spread = _held_out(views, folds, fit)
             start = fits[name] = replace(fit, sd=np.maximum(fit.sd, spread))
-        progress(number + 1, len(RUNGS))
+        advance(number + 1, len(RUNGS))
     if not np.isfinite(errors).all(1).any():
         do = "photograph the board, glued to something flat, from more directions"
         raise Refused("photographs of a board that a lens model fits", "none that does", do)

@@ -5,12 +5,14 @@ Nothing is written before the printer is complete, and what exists is replaced o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import check_file, write_together
+from patchproof.base.progress import Progress, no_progress
 from patchproof.calibrate.chart import calibrate_chart, prints_of, summary_lines
 from patchproof.calibrate.icc import bake
 from patchproof.calibrate.printer_files import save_printer
@@ -40,12 +42,12 @@ def printer_from_chart(
     out: Path,
     camera: str | None = None,
     overwrite: bool = False,
-    on_photo: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the printer that photographs of a chart show; returns the summary and warnings."""
     out = _new_file(out, overwrite)
     known = None if camera is None else load_camera(camera)
-    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, known, on_photo)
+    result = calibrate_chart(prints_of(photos), load_manifest(sheet), out.stem, known, partial(progress, "chart"))
     return [*summary_lines(result), _written(result.printer, out)], result.warnings
 
 

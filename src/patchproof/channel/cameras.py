@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def camera_of(
-    name_or_file: str | None, base: Path | None = None, photo_px: tuple[int, int] | None = None
+    name_or_file: str | Path | None, base: Path | None = None, photo_px: tuple[int, int] | None = None
 ) -> Camera | None:
     """The camera of that name or file, as `lens.load_camera` reads it; None where none is named."""
     if name_or_file is None:

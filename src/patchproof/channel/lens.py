@@ -116,7 +116,7 @@ class Camera(Strict):
         )
 
 
-def load_camera(name_or_file: str, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
+def load_camera(name_or_file: str | Path, base: Path | None = None, photo_px: tuple[int, int] | None = None) -> Camera:
     """A shipped camera by name, or a JSON file relative to `base`; refused where it cannot have taken `photo_px`."""
     path = _path(name_or_file, base)
     camera = validated(Camera, read_json(path, "a camera file (JSON)", "calibrate again"), str(path))
@@ -197,7 +197,7 @@ def _edge_px(size_px: tuple[int, int]) -> np.ndarray:
     return np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in sides])
 
 
-def _path(name_or_file: str, base: Path | None) -> Path:
+def _path(name_or_file: str | Path, base: Path | None) -> Path:
     path = Path(name_or_file)
     if path.suffix.lower() == ".json" or len(path.parts) > 1:
         path = (base or Path()) / path
@@ -205,9 +205,9 @@ def _path(name_or_file: str, base: Path | None) -> Path:
             raise Refused("a camera file (JSON)", f"no file at {path}", "check the path")
         return path
     known = sorted(file.stem for file in packaged_path("calibration", "cameras").glob("*.json"))
-    if name_or_file not in known:
+    if (name := str(name_or_file)) not in known:
         raise Refused("a camera's name or file", f'"{name_or_file}"', nearest(name_or_file, known))
-    return packaged_path("calibration", "cameras", f"{name_or_file}.json")
+    return packaged_path("calibration", "cameras", f"{name}.json")
 
 
 def _refuse_folded(camera: Camera, where: str) -> None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,40 +31,78 @@ def load_custom(dotted: str, base: Path) -> Classifier:
         made = factory()
     except Exception as error:  # the user's code: whatever it raises is about it
         raise Refused(f"a network from {name}", f"{type(error).__name__} ({error})", "mend the factory") from error
-    if isinstance(made, Classifier):
-        return made
-    input_px, labels = getattr(made, "input_px", None), getattr(made, "labels", None)
-    if not isinstance(made, torch.nn.Module) or not isinstance(input_px, int) or not labels or isinstance(labels, str):
-        do = "return a torch.nn.Module with input_px (an int) and labels (a list of names), or a Classifier"
-        raise Refused(f"a network from {name}", f"a {type(made).__name__} without them", do)
-    make = detector_of if getattr(made, "kind", "") == Detector.KIND else classifier_of
-    return make(made, input_px, labels, name)
+    return made if isinstance(made, Classifier) else labeled_module(made, name)
+
+
+def labeled_module(module: object, name: str) -> Classifier:
+    """The Classifier of a torch module that has its `input_px` and `labels` as attributes; anything else is refused."""
+    input_px, labels = getattr(module, "input_px", None), getattr(module, "labels", None)
+    if (
+        not isinstance(module, torch.nn.Module)
+        or not isinstance(input_px, int)
+        or not labels
+        or isinstance(labels, str)
+    ):
+        do = "give it input_px (an int) and labels (a list of names), or wrap it with classifier_of"
+        raise Refused(f"a torch.nn.Module with input_px and labels as {name}", f"a {type(module).__name__}", do)
+    make = detector_of if getattr(module, "kind", "") == Detector.KIND else classifier_of
+    return make(module, input_px, labels, name)
 
 
 def classifier_of(
-    network: torch.nn.Module, input_px: int, labels: Sequence[str], name: str = "python:network"
+    network: Callable[[Tensor], Tensor], input_px: int, labels: Sequence[str], name: str = "python:network"
 ) -> Classifier:
-    """A network in memory as a Classifier: it takes N×3×S×S sRGB in [0, 1], S = `input_px`, its normalization inside,
-    and returns N×K logits, K the number of `labels`. Put into evaluation mode.
+    """Make a Classifier of a network in memory.
+
+    network: takes N×3×S×S sRGB in [0, 1], its normalization inside, and returns N×K logits. A torch module is put into
+        evaluation mode; scripted modules, `ExportedProgram.module()` and plain functions are taken as they are.
+    input_px: S, the side of the square that it takes, in pixels.
+    labels: names of its K classes, in the order of its outputs.
+    name: what runs and reports call it, "python:" and a word.
+
+    Raises Refused for what cannot be called with a batch of pictures.
     """
-    return Classifier(name, weights_sha256(network), input_px, tuple(map(str, labels)), network.eval())
+    _check_callable(network)
+    labels = tuple(map(str, labels))
+    return Classifier(name, weights_sha256(network), input_px, labels, _in_evaluation_mode(network))
 
 
 def detector_of(
-    network: torch.nn.Module, input_px: int, labels: Sequence[str], name: str = "python:detector"
+    network: Callable[[Tensor], Any], input_px: int, labels: Sequence[str], name: str = "python:detector"
 ) -> Detector:
     """A detector in memory: it takes N×3×S×S sRGB in [0, 1] and returns candidates N×A×(4+K), boxes in pixels and
     logits of the K labels, or for each picture a dictionary of `boxes` M×4, `labels` M and `scores` M, as torchvision
     has them. Best before suppression and with low scores among them: only what is found can be made surer.
     """
-    sha256 = weights_sha256(network)
-    return Detector(name, sha256, input_px, tuple(map(str, labels)), AsCandidates(network.eval(), len(labels)))
+    _check_callable(network)
+    candidates = AsCandidates(_in_evaluation_mode(network), len(labels))
+    return Detector(name, weights_sha256(network), input_px, tuple(map(str, labels)), candidates)
+
+
+def _check_callable(network: object) -> None:
+    """Refuse what is no network: an ExportedProgram, a path, a list of weights."""
+    if callable(network) and not isinstance(network, type | torch.export.ExportedProgram):
+        return
+    exported = isinstance(network, torch.export.ExportedProgram)
+    do = "call its .module() first" if exported else "give the module itself, or load a file with load_classifier"
+    what = "an ExportedProgram" if exported else f"a {type(network).__name__}"
+    raise Refused("a network that can be called with a batch of pictures", what, do)
+
+
+def _in_evaluation_mode(network: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """The network in evaluation mode; exported modules have no modes, nor have functions."""
+    if isinstance(network, torch.nn.Module):
+        try:
+            return network.eval()
+        except NotImplementedError:  # of ExportedProgram.module(), which is frozen in the mode of its export
+            return network
+    return network
 
 
 class AsCandidates(torch.nn.Module):
     """A detector's findings as candidates, however it gives them."""
 
-    def __init__(self, network: torch.nn.Module, labels: int):
+    def __init__(self, network: Callable[[Tensor], Any], labels: int):
         super().__init__()
         self.network, self.labels = network, labels
 

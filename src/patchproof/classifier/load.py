@@ -24,15 +24,28 @@ from patchproof.base.errors import Refused
 from patchproof.base.validation import expand
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.check import check_network, smooth_pictures
-from patchproof.classifier.custom import load_custom
-from patchproof.classifier.network import Classifier
+from patchproof.classifier.custom import labeled_module, load_custom
+from patchproof.classifier.network import Classifier, freeze
 from patchproof.networks.batches import fastest
 
 
-def load_classifier(name: str | Classifier, base: Path, device: torch.device | str = "cpu") -> Classifier:
-    """The classifier of that name, or the one given, on `device`; refused in one sentence where it is missing or cannot
-    be trusted.
+def load_classifier(
+    name: str | Classifier | torch.nn.Module, base: str | Path = ".", device: torch.device | str = "cpu"
+) -> Classifier:
+    """Load a classifier or detector, check that it can be used, and make it as fast as it goes.
+
+    name: a name as in scene files (see the module's list), a classifier in memory, or a torch module with the
+        attributes `input_px` and `labels`.
+    base: folder that file names are relative to.
+    device: where its tensors go.
+
+    Raises Refused where it is missing, or where its answers cannot be used (`classifier.check`).
+
+        network = pp.load_classifier("file:net.onnx")
+        logits = network.logits(photos)  # N×3×H×W sRGB in [0, 1] -> N×K
     """
+    if isinstance(name, torch.nn.Module):
+        name = labeled_module(name, "python:network")
     if isinstance(name, Classifier):
         return _trusted(name, device)
     kind, _, rest = expand(name, Path(base)).partition(":")
@@ -72,7 +85,7 @@ def _trusted(classifier: Classifier, device: torch.device | str) -> Classifier:
     """The classifier on the device, frozen, doubted, and as fast as it can be called."""
     use_full_precision(device)
     if isinstance(classifier.network, torch.nn.Module):
-        classifier.network.requires_grad_(False).to(device)
+        freeze(classifier.network).to(device)
     check_network(classifier, device)
     pictures = smooth_pictures(classifier.input_px).to(device)
     return replace(classifier, network=fastest(classifier.network, pictures))

@@ -127,9 +127,16 @@ def _in_square(windows: np.ndarray, photo_px: Sequence[int], size_px: int) -> np
     return np.hstack([first, last]).clip(0, size_px).astype(int)
 
 
-def weights_sha256(network: torch.nn.Module) -> str | None:
+def freeze(network: torch.nn.Module) -> torch.nn.Module:
+    """Ask for no gradients of the module's weights; scripted modules cannot do so as a whole."""
+    for weights in network.parameters():
+        weights.requires_grad_(False)
+    return network
+
+
+def weights_sha256(network: object) -> str | None:
     """SHA-256 over names, types, shapes and bytes of a module's state, in the order of the names; None without any."""
-    if not network.state_dict():
+    if not isinstance(network, torch.nn.Module) or not network.state_dict():
         return None
     digest = hashlib.sha256()
     for name, tensor in sorted(network.state_dict().items()):

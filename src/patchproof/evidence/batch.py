@@ -45,7 +45,7 @@ _DESIGN_COLOR, _MARKER_COLOR = (255, 64, 129), (0, 200, 140)
 _DIED = "measuring it ended its process each time, for want of memory: save it smaller"
 _EMPTY = "it shows one tone or noise and nothing else: take it again"
 # codes of photographs whose homography can still be believed
-_BELIEVED = (None, "clipped", "blurred", "too_small", "cropped")
+MEASURABLE_CODES = (None, "clipped", "blurred", "too_small", "cropped")
 _PART = "it is a crop or a screenshot by its shape, its name or EXIF: it counts, but use the camera's own file"
 
 # linear light of paper and ink; `frame_light` can give no more, and less than none of a print lighter than its paper
@@ -207,7 +207,7 @@ def shot_again(task: Task, size_px: int, item: tuple[Path, MeasuredPhoto]) -> Sh
     """
     path, measured = item
     entry, geometry, light = measured.entry, measured.entry.geometry, measured.light
-    believed = measured.counted and entry.code in _BELIEVED
+    believed = measured.counted and entry.code in MEASURABLE_CODES
     if not believed or geometry is None or geometry.homography_px_from_mm is None or light is None:
         return None
     px_from_mm, blur_px = np.array(geometry.homography_px_from_mm), geometry.blur_px

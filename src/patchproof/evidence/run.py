@@ -17,8 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.base.claims import wilson
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_folder
+from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import TAIL
 from patchproof.base.settings import behind
 from patchproof.base.workers import open_workers
@@ -47,22 +49,21 @@ def gather_evidence(
     manifest: Manifest,
     options: Options,
     *,
-    jobs: int = 1,
-    cluster: str | None = None,
+    compute: Compute = Compute(),
     journal: Path | None = None,
     resume: bool = False,
     forecast: Callable[[Shot], float | None] | None = None,
     on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> Report:
     """Measure, classify and judge every picture in the folder (or the one picture) `photos`, folders in it being
     sessions (see `grouping`).
 
-    Photographs are measured by `jobs` local processes or by a Dask cluster's workers. The file `journal` keeps what is
+    Photographs are measured by the processes or the cluster of `compute`. The file `journal` keeps what is
     finished; with `resume`, what it has of an earlier run is not done again. `forecast` gives a photograph's chance of
     being recognized without looking at its piece. `on_pictures` gets the pictures of each
     photograph that is (of the first `batch.WITH_PICTURES`: `photo`, and `seen`, `fitted`, `promised`, `delta_e00` where
-    it was measured); `progress` is called with (done, all).
+    it was measured); `advance` is called with (done, all).
     """
     apart = None if options.controls is None else Path(options.controls)
     grouping, control_paths = group(photos, apart), _list_controls(apart)
@@ -76,8 +77,8 @@ def gather_evidence(
         do = "name the images of the boxes' file as the photographs are called"
         raise Refused("boxes of these photographs", f"some of {next(iter(options.boxes))} and others", do)
     kept = closing(Journal(journal, settings_key(manifest, options), resume)) if journal else nullcontext()
-    with kept as open_journal, open_workers(jobs, cluster) as workers:
-        results = measure_all(task, items, judges, workers, open_journal, on_pictures, progress)
+    with kept as open_journal, open_workers(compute.jobs, compute.cluster) as workers:
+        results = measure_all(task, items, judges, workers, open_journal, on_pictures, advance)
         own = without_copies(results[: len(paths)], grouping.session, task.surface.rect_mm)
         ledger, estimated = None, None
         if judges and task.promised:

@@ -8,16 +8,18 @@ has seen. They are seen a few at a time, by this process or by others, each of w
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file
 from patchproof.base.output import write_whole
+from patchproof.base.progress import Advance, Progress, no_advance, no_progress
+from patchproof.base.validation import Strict
 from patchproof.base.workers import Workers, open_workers
 from patchproof.classifier.network import Classifier, center_square
 from patchproof.classifier.precision import Finding, average_precision, findings
@@ -27,53 +29,89 @@ from patchproof.optimizer.responses import AT_A_TIME, Answers, in_parts, joined,
 from patchproof.optimizer.run import Run, load_run
 from patchproof.render.photograph import Shown, expose
 from patchproof.scene.conditions import Conditions
+from patchproof.sheets.manifest import ControlClaim, ModelClaim
 
 Networks = tuple[str | Classifier, ...] | None
 Found = dict[str, dict[str, list[Finding]]]  # by detector and what is shown
 
 
-def evaluate_run(
+class ModelEvaluation(ModelClaim):
+    """One network's rate and confidence of the design, its controls by kind, and a detector's average precision (at an
+    overlap of 0.5) by what is shown: "design" or a control.
+    """
+
+    controls: dict[str, ControlClaim]
+    ap50: dict[str, float] | None = None
+
+
+class Evaluation(Strict):
+    """A run evaluated under `n` fresh conditions of a seed, by network name."""
+
+    n: int
+    seed: int
+    models: dict[str, ModelEvaluation]
+
+    def to_json(self) -> str:
+        """Return the text of evaluate.json."""
+        models = {name: each.model_dump(exclude={"name"}) for name, each in self.models.items()}
+        for each in models.values():
+            if each["ap50"] is None:  # of networks that are no detectors
+                del each["ap50"]
+        return json.dumps({"n": self.n, "seed": self.seed, "models": models}, indent=1) + "\n"
+
+
+def evaluate(
     run_folder: str | Path,
     *,
     models: Sequence[str | Classifier] | None = None,
     n: int = PROMISE_VIEWS,
     seed: int | None = None,
-    device: str = "cpu",
-    jobs: int = 1,
-    cluster: str | None = None,
+    compute: Compute = Compute(),
     overwrite: bool = False,
-    on_view: Callable[[int, int], None] = lambda done, total: None,
-) -> dict[str, Any]:
-    """Rates of the run's design and its controls on n fresh conditions; written to RUN/evaluate.json and returned, an
-    earlier one only with `overwrite`.
+    progress: Progress = no_progress,
+) -> Evaluation:
+    """Evaluate a run's design and controls under fresh conditions, and write the result to RUN/evaluate.json.
 
-    `models` are names, or classifiers in memory, which other processes cannot have.
+    run_folder: a finished run.
+    models: networks in place of the run's: names, or classifiers in memory, which other processes cannot load.
+    n: conditions, 1 or more.
+    seed: of the conditions, in place of the scene's.
+    compute: device, and processes or cluster.
+    overwrite: replace an earlier evaluate.json.
+    progress: called with the stage "evaluate" (views).
+
+    Raises Refused for a folder without a finished run, or one that was evaluated before.
     """
     folder, networks = Path(run_folder).resolve(), None if models is None else tuple(models)
-    refuse_unnamed(networks, jobs, cluster)
+    refuse_unnamed(networks, compute)
     if is_file(folder / "evaluate.json") and not overwrite:
         do = "add --overwrite, or rename it to keep it"
         raise Refused("a run that was not evaluated yet", f"{folder / 'evaluate.json'}, which exists", do)
-    with open_workers(jobs, cluster) as workers:
-        run, problem = _opened(folder, networks, device)
-        conditions = run.scene.draw("evaluate", n, seed)
-        answers, shown = answers_of(folder, conditions, workers, networks, device, lambda done: on_view(done, n))
+    with open_workers(compute.jobs, compute.cluster) as workers:
+        run, problem = _opened(folder, networks, compute.device)
+        conditions, advance = run.scene.draw("evaluate", n, seed), partial(progress, "evaluate")
+        answers, shown = answers_of(folder, conditions, workers, networks, compute.device, advance)
     forget()
-    result: dict[str, Any] = {"n": n, "seed": run.scene.seed if seed is None else seed, "models": {}}
+    evaluated = {}
     for i, claim in enumerate(model_claims(problem, answers["design"])):
-        controls = {kind: control.model_dump() for kind, control in control_claims(answers, i).items()}
-        result["models"][claim.name] = claim.model_dump(exclude={"name"}) | {"controls": controls}
+        ap50 = None
         if found := [part[claim.name] for part in shown if claim.name in part]:
             ap50 = {kind: average_precision([f for part in found for f in part[kind]], n) for kind in found[0]}
-            result["models"][claim.name]["ap50"] = ap50
-    write_whole(run.folder / "evaluate.json", json.dumps(result, indent=1) + "\n")
+        controls = control_claims(answers, i)
+        evaluated[claim.name] = ModelEvaluation(**claim.model_dump(), controls=controls, ap50=ap50)
+    result = Evaluation(n=n, seed=run.scene.seed if seed is None else seed, models=evaluated)
+    write_whole(run.folder / "evaluate.json", result.to_json())
     return result
 
 
-def refuse_unnamed(networks: Networks, jobs: int, cluster: str | None) -> None:
+def refuse_unnamed(networks: Networks, compute: Compute) -> None:
     """Refuse networks in memory where other processes do the work."""
-    if (jobs > 1 or cluster is not None) and any(isinstance(network, Classifier) for network in networks or ()):
-        raise Refused("networks that other processes load by name", "one in memory", "leave jobs and cluster out")
+    if (compute.jobs > 1 or compute.cluster is not None) and any(
+        isinstance(network, Classifier) for network in networks or ()
+    ):
+        raise Refused(
+            "networks that other processes load by name", "one in memory", "leave jobs and cluster out of Compute"
+        )
 
 
 def answers_of(
@@ -82,13 +120,13 @@ def answers_of(
     workers: Workers,
     networks: Networks = None,
     device: str = "cpu",
-    on_view: Callable[[int], None] = lambda done: None,
+    advance: Advance = no_advance,
 ) -> tuple[dict[str, Answers], list[Found]]:
     """What the networks answer to the design of the run in an absolute folder, and to its controls, under the
     conditions; and what detectors find, some conditions at a time.
     """
     show, n = partial(_show, folder, networks, device), len(conditions)
-    shown = workers.map(show, in_parts(conditions), lambda done, _: on_view(min(done * AT_A_TIME, n)))
+    shown = workers.map(show, in_parts(conditions), lambda done, _: advance(min(done * AT_A_TIME, n), n))
     return joined([answers for answers, _ in shown]), [found for _, found in shown]
 
 

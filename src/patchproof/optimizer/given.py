@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -23,16 +23,18 @@ import cv2
 import numpy as np
 
 from patchproof.base.color import LIGHT_OF_CODE, codes_of, srgb_from_linear
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import MM_PER_INCH
 from patchproof.base.input import is_file
 from patchproof.base.output import check_folder, new_folder
+from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import listed
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PROMISE_VIEWS
-from patchproof.optimizer.run import OWN, Run, check_promise, finish_run, load_run
+from patchproof.optimizer.promise import PROMISE_VIEWS, PromiseOptions
+from patchproof.optimizer.run import OWN, Run, finish_run, load_run
 from patchproof.photo.detect import find_markers
 from patchproof.photo.read import list_photos, printable, read_photo
 from patchproof.photo.rejection import PhotoRejected
@@ -74,30 +76,31 @@ def import_patch(
     *,
     models: Sequence[str | Classifier] | None = None,
     seed: int | None = None,
-    device: str = "cpu",
+    promise: PromiseOptions = PromiseOptions(),
+    compute: Compute = Compute(),
     overwrite: bool = False,
-    controls: Sequence[str] = CONTROLS,
-    promise_views: int | None = None,
-    jobs: int = 1,
-    on_promise: Callable[[int, int], None] = lambda done, total: None,
-    on_scene: Callable[[Scene], None] = lambda scene: None,
+    progress: Progress = no_progress,
 ) -> Run:
-    """Make a run of a picture (a file, or uint8 H×W×3 sRGB) on a scene's piece, and promise its rate, in the folder
-    `out`; all else as in `optimize_scene`. Refused where the picture does not fit the piece, or its markers would not
-    be read beside it.
+    """Make a run of a picture that was made elsewhere, and promise its rate.
+
+    picture: a file, or uint8 H×W×3 sRGB; its proportions are the piece's within 2 %.
+    scene: a scene with a printed piece, or the path of a scene file.
+    out: the run's folder, new or empty.
+    models, seed, promise, compute, overwrite: as in `optimize`.
+    progress: called with the stage "promise" (views).
+
+    Raises Refused where the picture does not fit the piece, or where the piece's markers could not be read beside it.
     """
-    out = Path(out)
-    check_promise(promise_views)
+    out, compute = Path(out), compute.without("import_patch", cluster=True)
     check_folder(out, OWN, overwrite)
     (file, sha256, pixels), scene = _read(picture), _with_piece(scene, seed)
     fitted, scene = fit(pixels, scene), scene.of_design(sha256)
-    on_scene(scene)
-    problem = set_problem(scene, device, models, jobs=jobs)
+    problem = set_problem(scene, compute.device, models, jobs=compute.jobs)
     problem = replace(problem, subject=replace(problem.patch, design_px=fitted.shape[1::-1]))
     design = problem.patch.pixels(from_pixels(fitted, problem.device))
     record = _looked_at(problem, file, sha256, pixels, fitted, design)
     with new_folder(out, OWN, overwrite) as folder:
-        run = finish_run(problem, design, folder, controls, promise_views, on_promise, asdict(record))
+        run = finish_run(problem, design, folder, promise, progress, asdict(record))
     return replace(run, folder=out)
 
 
@@ -107,20 +110,16 @@ def import_folder(
     out: str | Path,
     *,
     seed: int | None = None,
-    device: str = "cpu",
+    promise: PromiseOptions = PromiseOptions(),
+    compute: Compute = Compute(),
     resume: bool = False,
     overwrite: bool = False,
-    promise_views: int | None = None,
-    jobs: int = 1,
-    on_promise: Callable[[int, int], None] = lambda done, total: None,
-    on_scene: Callable[[Scene], None] = lambda scene: None,
+    progress: Progress = no_progress,
 ) -> list[Run]:
     """A run `out`/NAME of every picture NAME.png (or another kind) in a folder, as `import_patch` makes it. All
     pictures are looked at before the first promise; with `resume` finished runs of theirs are kept.
     """
-    check_promise(promise_views)
-    scene, out, total = _with_piece(scene, seed), Path(out), promise_views or PROMISE_VIEWS
-    on_scene(scene)
+    scene, out, total = _with_piece(scene, seed), Path(out), promise.views or PROMISE_VIEWS
     runs = {path: out / printable(path.stem) for path in list_photos(folder)}
     if len(set(runs.values())) < len(runs):
         raise Refused("pictures whose names differ in more than their kind", f"others in {folder}", "rename them")
@@ -140,11 +139,10 @@ def import_folder(
                 path,
                 scene,
                 each,
-                device=device,
+                promise=promise,
+                compute=compute,
                 overwrite=overwrite,
-                promise_views=promise_views,
-                jobs=jobs,
-                on_promise=lambda done, _, before=before: on_promise(before + done, len(runs) * total),
+                progress=lambda stage, done, _, before=before: progress(stage, before + done, len(runs) * total),
             )
     return [made[path] for path in runs]
 

@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 
 from patchproof.base.claims import student_mean
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
+from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import OptimizeSettings
 from patchproof.base.validation import Side, Strict
 from patchproof.base.workers import sharing
@@ -105,15 +107,24 @@ def choose_place(
     *,
     models: Sequence[str | Classifier] | None = None,
     loss: Loss | None = None,
-    device: str = "cpu",
-    jobs: int = 1,
-    on_pass: Callable[[int, int], None] = lambda done, total: None,
+    compute: Compute = Compute(),
+    progress: Progress = no_progress,
 ) -> Place:
-    """Search the object of a scene with `patch.place = "auto"` for the piece's place; `models` and `loss` as in
-    `optimize`. `scene.at(place.at, place.spin_deg)` has the piece there. Refused where there is no place at all.
+    """Search the object of a scene with `patch.place = "auto"` for the best place of the piece.
+
+    scene: loaded by `load_scene` or `make_scene`; `scene.at(place.at, place.spin_deg)` has the piece there.
+    models, loss: networks and loss in place of the scene's, as in `optimize`.
+    compute: device and processes; refuses a cluster.
+    progress: called with the stage "place" (passes of the networks).
+
+    Raises Refused where the piece fits nowhere on the object.
     """
-    scene = needs_open(scene)
-    search, ground = _Search(scene, (models, loss, device, jobs), on_pass), Ground(scene)
+    scene, compute, advance = (
+        needs_open(scene),
+        compute.without("choose_place", cluster=True),
+        partial(progress, "place"),
+    )
+    search, ground = _Search(scene, (models, loss, compute.device, compute.jobs), advance), Ground(scene)
     trials = search.screened(ground.spots(PLACES))
     leaders = sorted(trials, key=lambda trial: trial.outlook)[:TURNED]
     trials += search.screened([turn for leader in leaders for turn in ground.turned(leader.spot)])
@@ -123,7 +134,7 @@ def choose_place(
     order = sorted(range(len(finalists)), key=lambda i: float(drafts[i].mean()))
     candidates = [_candidate(finalists[i], float(drafts[i].mean())) for i in order]
     candidates += [_candidate(trial) for trial in trials if trial not in finalists]
-    on_pass(search.passes, search.passes)  # no more will come
+    advance(search.passes, search.passes)  # no more will come
     return Place(
         sheet_id=scene.sheet_id,
         front=scene.settings.patch.side,
@@ -159,8 +170,8 @@ def default_passes() -> int:
 class _Search:
     """A search under way, which counts its networks' passes."""
 
-    def __init__(self, scene: OpenScene, stated, on_pass: Callable[[int, int], None]):
-        self.passes, self._scene, self._stated, self._on_pass = 0, scene, stated, on_pass
+    def __init__(self, scene: OpenScene, stated, advance: Advance):
+        self.passes, self._scene, self._stated, self._advance = 0, scene, stated, advance
         self._first: Problem | None = None
         self._bare: float | None = None
 
@@ -219,7 +230,7 @@ class _Search:
 
     def _count(self, passes: int) -> None:
         self.passes += passes
-        self._on_pass(self.passes, PASSES)
+        self._advance(self.passes, PASSES)
 
 
 def _screen(conditions: Conditions, problem: Problem) -> tuple[float, float]:

@@ -142,6 +142,7 @@ def set_problem(
     _check_device(device)
     settings = scene.settings
     names, least_score = models or settings.target.models, settings.target.least_score
+    names = [scene.given_models.get(name, name) if isinstance(name, str) else name for name in names]
     classifiers = tuple(load_classifier(name, scene.base, device).at_score(least_score) for name in names)
     accept = settings.target.accept
     indices = tuple(find_labels(c.labels, settings.target.label, accept) for c in classifiers)

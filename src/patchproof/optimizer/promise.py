@@ -12,7 +12,8 @@ after half and three quarters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,8 @@ import torch
 
 from patchproof.base import geometry
 from patchproof.base.color import linear_from_srgb
+from patchproof.base.errors import Refused
+from patchproof.base.progress import Advance, no_advance
 from patchproof.base.sessions import difference_in_sessions, in_sessions, spread_of
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import Problem
@@ -40,12 +43,30 @@ CONTROLS = ("bare", "mean", "gray", "noise")
 SETTLED = 1.25
 
 
+@dataclass(frozen=True)
+class PromiseOptions:
+    """How a finished design's rate is promised.
+
+    views: photographs simulated for the promise, 8 or more; fewer than 400 make it a draft. None: up to 400, as many as
+        the scene's `promise.half_width` needs.
+    controls: what the design is compared with, one at least: "bare", "mean", "gray", "noise".
+    """
+
+    views: int | None = None
+    controls: tuple[str, ...] = CONTROLS
+
+    def __post_init__(self):
+        if self.views is not None and self.views < 2 * PER_SESSION:
+            expected = f"a promise of {2 * PER_SESSION} views, two sessions, at least"
+            raise Refused(expected, f"{self.views}", "promise of more")
+
+
 def make_promise(
     problem: Problem,
     design: np.ndarray,
     conditions: Conditions,
     controls: Sequence[str] = CONTROLS,
-    on_views: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
     per_session: int = 1,
     half_width: float | None = None,
 ) -> Promise:
@@ -55,7 +76,7 @@ def make_promise(
     every control's difference is settled; else it goes on without those that are.
     """
     shown = shown_with_controls(problem, design, controls)
-    compared = _until_known(problem, shown, conditions, per_session, half_width, on_views)
+    compared = _until_known(problem, shown, conditions, per_session, half_width, advance)
     answers = compared["design"]
     conditions = conditions[: answers.recognized.shape[1]]
     places = _places(conditions, per_session)
@@ -81,7 +102,7 @@ def _until_known(
     conditions: Conditions,
     per_session: int,
     half_width: float | None,
-    on_views: Callable[[int, int], None],
+    advance: Advance,
 ) -> dict[str, Answers]:
     """The answers to the design and, until their differences are settled, to the controls; all of them without a
     `half_width`.
@@ -91,7 +112,7 @@ def _until_known(
     with asking(problem, shown, conditions) as asked:
         for first, last in pairwise(looks):
             rows, beside = np.arange(first, last), _with_controls(last - first, per_session)
-            answers = asked(unsettled, rows, beside, lambda done, _, n=first: on_views(n + done, len(conditions)))
+            answers = asked(unsettled, rows, beside, lambda done, _, n=first: advance(n + done, len(conditions)))
             compared = joined([compared, answers]) if compared else answers
             if half_width is None or last == len(conditions):
                 break
@@ -101,7 +122,7 @@ def _until_known(
             places = _places(conditions[:last], per_session)
             counts = in_sessions(compared["design"].recognized[0], per_session, places)
             if unsettled == ["design"] and np.ptp(spread_of(*counts).rate) <= 2 * half_width:
-                on_views(last, last)  # a bar that stays at half would look broken
+                advance(last, last)  # a bar that stays at half would look broken
                 break
     return compared
 

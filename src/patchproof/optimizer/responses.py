@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import sharing
 from patchproof.optimizer.problem import Problem
 from patchproof.render.photograph import Shown, expose, windows_of
@@ -48,14 +49,14 @@ def responses(
     conditions: Conditions,
     side_px: int | None = None,
     beside: np.ndarray | None = None,
-    on_views: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> dict[Thing, Answers]:
     """Show each thing under every condition to every network, in square views of `side_px` (by default the size of
-    figures that people will read); all but the first only under those that the mask `beside` names. `on_views` gets how
+    figures that people will read); all but the first only under those that the mask `beside` names. `advance` gets how
     many views are done, and how many there are.
     """
     with asking(problem, shown, conditions, side_px) as asked:
-        return asked(list(shown), np.arange(len(conditions)), beside, on_views)
+        return asked(list(shown), np.arange(len(conditions)), beside, advance)
 
 
 @contextmanager
@@ -83,7 +84,7 @@ def asking(
         things: Sequence[Thing],
         rows: np.ndarray,
         beside: np.ndarray | None = None,
-        on_views: Callable[[int, int], None] = lambda done, total: None,
+        advance: Advance = no_advance,
     ) -> dict[Thing, Answers]:
         compared = np.ones(len(rows), bool) if beside is None else beside
         of_all = [_Part(part, things) for part in in_parts(rows[compared])]
@@ -94,7 +95,7 @@ def asking(
         last = sorted(chain(*tasks[-problem.jobs :]), key=lambda part: -len(part.things))
         tasks[-problem.jobs :] = [[part] for part in last]
         seen = np.cumsum([sum(len(part.rows) for part in task) for task in tasks])
-        told = workers.map(share, tasks, lambda done, _: on_views(int(seen[done - 1]), len(rows)))
+        told = workers.map(share, tasks, lambda done, _: advance(int(seen[done - 1]), len(rows)))
         parts = list(zip(chain(*tasks), chain(*told), strict=True))  # the first of them has all things
         whole = joined([answered for _, answered in parts])
         whole[things[0]] = whole[things[0]].at(np.argsort(np.concatenate([part.rows for part, _ in parts])))

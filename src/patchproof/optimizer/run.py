@@ -15,6 +15,7 @@ import platform
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,19 +24,21 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.input import is_file, read_json
 from patchproof.base.output import check_folder, make_folder, write_whole
+from patchproof.base.progress import Advance, Progress, no_progress
 from patchproof.base.settings import SceneSettings
 from patchproof.base.validation import validated
 from patchproof.base.version import __version__
 from patchproof.classifier.network import Classifier
 from patchproof.optimizer.checkpoint import CHECKPOINT, resumed, save_checkpoint
 from patchproof.optimizer.goals import Loss
-from patchproof.optimizer.loop import SELECT_AFTER, State, Step, saves, start, steps
+from patchproof.optimizer.loop import SELECT_AFTER, State, saves, start, steps
 from patchproof.optimizer.pixels import side_by_side
 from patchproof.optimizer.problem import Problem, set_problem
-from patchproof.optimizer.promise import CONTROLS, PER_SESSION, PROMISE_VIEWS, make_promise
+from patchproof.optimizer.promise import PER_SESSION, PROMISE_VIEWS, PromiseOptions, make_promise
 from patchproof.optimizer.subject import DESIGN_FILE, MASK_FILE, OBJECT_FILE, TEXTURE_FILES, read_design, write_png
 from patchproof.scene.interface import Scene
 from patchproof.scene.patch_scene import PatchScene
@@ -64,44 +67,46 @@ class Run:
     details: dict[str, Any]
 
 
-def optimize_scene(
+def optimize(
     scene: str | Path | Scene,
     out: str | Path,
     *,
     models: Sequence[str | Classifier] | None = None,
     loss: Loss | None = None,
     seed: int | None = None,
-    device: str = "cpu",
+    promise: PromiseOptions = PromiseOptions(),
+    compute: Compute = Compute(),
     resume: bool = False,
     overwrite: bool = False,
-    controls: Sequence[str] = CONTROLS,
-    promise_views: int | None = None,
-    jobs: int = 1,
-    on_step: Callable[[Step, int], None] = lambda step, total: None,
-    on_promise: Callable[[int, int], None] = lambda done, total: None,
-    on_scene: Callable[[Scene], None] = lambda scene: None,
-    on_place: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> Run:
-    """Optimize the patch of a scene or its file into the folder `out` and promise its rate.
+    """Optimize the patch of a scene, promise its rate, and write both into a folder.
 
-    `models` (names, or classifiers in memory) and `loss` replace the scene's networks and its goal's loss; `seed`
-    replaces the file's; `resume` goes on from the checkpoint, at the place that was chosen. A page names the best of
-    `controls`, one at least. A promise is made of `promise_views`, two sessions at least and a draft's where they are
-    fewer than usual, or of as many as the scene's `promise.half_width` needs.
-    `jobs` processes share the views (`workers.sharing`) and change no byte where this one works on one thread, too.
-    `on_scene` gets the scene that is optimized, `on_place` the passes of a search.
+    scene: a scene, or the path of a scene file.
+    out: the run's folder, new or empty.
+    models: networks in place of the scene's: names as in scene files, or classifiers in memory.
+    loss: `loss(logits N×K, indices) -> N` to descend on, in place of the goal's.
+    seed: of all random draws, in place of the scene's `optimize.seed`.
+    promise: how many views the promise takes, and its controls.
+    compute: device and processes; refuses a cluster.
+    resume: continue from the folder's checkpoint, at the place that was chosen there.
+    overwrite: delete an earlier run in the folder first.
+    progress: called with the stages "place" (where the scene searches one), "optimize" (steps) and "promise" (views).
+
+    Raises Refused for a scene, network or folder that cannot be used. Method: Pestana et al., section 3.
+
+        run = pp.optimize("scene.toml", "run", compute=pp.Compute(jobs=2))
+        print(run.promise.rate, run.promise.interval)
     """
-    out = Path(out)
-    check_promise(promise_views)
+    out, compute = Path(out), compute.without("optimize", cluster=True)
     if not resume:
         check_folder(out, OWN, overwrite, unfinished=is_file(out / CHECKPOINT) and not is_file(out / RUN_FILE))
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     keep_place = None
     if not scene.HAS_PLACE:
-        searching = {"models": models, "loss": loss, "device": device, "jobs": jobs, "on_pass": on_place}
+        searching = {"models": models, "loss": loss, "compute": compute, "progress": progress}
         scene, keep_place = _placed(scene, out, resume, searching)
-    on_scene(scene)
-    problem = set_problem(scene, device, models, loss, jobs)
+    problem = set_problem(scene, compute.device, models, loss, compute.jobs)
     if not resume:
         for path in (path for name in OWN[:-1] for path in out.glob(name)):  # all that the new one needs is read
             path.unlink()
@@ -109,8 +114,8 @@ def optimize_scene(
     if keep_place is not None:
         keep_place()
     state = resumed(out, problem) if resume else start(problem)
-    design = _loop(problem, state, out, on_step)
-    return finish_run(problem, design, out, controls, promise_views, on_promise)
+    design = _loop(problem, state, out, partial(progress, "optimize"))
+    return finish_run(problem, design, out, promise, progress)
 
 
 def _placed(
@@ -130,19 +135,12 @@ def _placed(
     return placed, lambda: save_place(place, placed, out)
 
 
-def check_promise(views: int | None) -> None:
-    """Refuse too few views for a promise."""
-    if views is not None and views < 2 * PER_SESSION:
-        raise Refused(f"a promise of {2 * PER_SESSION} views, two sessions, at least", f"{views}", "promise of more")
-
-
 def finish_run(
     problem: Problem,
     design: np.ndarray,
     out: Path,
-    controls: Sequence[str],
-    views: int | None,
-    on_promise: Callable[[int, int], None],
+    options: PromiseOptions,
+    progress: Progress,
     imported: Mapping[str, Any] | None = None,
 ) -> Run:
     """Promise a design's rate and write what its run keeps into a folder; `imported` says where a design comes from
@@ -150,7 +148,7 @@ def finish_run(
     """
     scene = problem.scene
     problem.subject.save(design, out)
-    promise = promise_of(problem, design, controls, views, on_promise)
+    promise = promise_of(problem, design, options, partial(progress, "promise"))
     if scene.given_glb is not None:
         write_whole(out / _GIVEN, scene.given_glb)
     details = _details(problem, promise, out) | ({} if imported is None else {"imported": dict(imported)})
@@ -162,17 +160,18 @@ def promise_run(
     run_folder: str | Path,
     *,
     views: int | None = None,
-    device: str = "cpu",
-    jobs: int = 1,
-    on_promise: Callable[[int, int], None] = lambda done, total: None,
+    compute: Compute = Compute(),
+    progress: Progress = no_progress,
 ) -> Run:
-    """Promise a run's design anew, from so many views (by default as many as `optimize` takes), with its controls: to
-    the byte the run that `optimize` would have left. A sheet keeps its promise until it is written again.
+    """Promise the rate of a finished run's design again, from `views` views and with the run's own controls; the run is
+    the same to the byte as if `optimize` had been given these views. A sheet keeps its promise until it is written
+    again.
     """
-    check_promise(views)
+    compute, options = compute.without("promise", cluster=True), PromiseOptions(views)
     run = load_run(run_folder)
-    problem = set_problem(run.scene, device, jobs=jobs)
-    promise = promise_of(problem, run.design, tuple(run.promise.controls), views, on_promise)
+    options = replace(options, controls=tuple(run.promise.controls))
+    problem = set_problem(run.scene, compute.device, jobs=compute.jobs)
+    promise = promise_of(problem, run.design, options, partial(progress, "promise"))
     details = run.details | {"promise": promise.model_dump(mode="json")}
     write_whole(run.folder / RUN_FILE, json.dumps(details, indent=1) + "\n")
     return replace(run, promise=promise, details=details)
@@ -218,7 +217,7 @@ class _Record(BaseModel):
     imported: _Imported | None = None
 
 
-def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, int], None]) -> np.ndarray:
+def _loop(problem: Problem, state: State, out: Path, advance: Advance) -> np.ndarray:
     """Run the remaining steps, leaving log, checkpoint and views; the best design's pixels."""
     settings, largest, path = problem.scene.settings.optimize, None, out / _LOG
     # without the lines after the step that it goes on from
@@ -236,7 +235,7 @@ def _loop(problem: Problem, state: State, out: Path, on_step: Callable[[Step, in
             if saves(settings, state.number):  # after the views, which a run that goes on from the last step lacks
                 save_checkpoint(state, problem, out)
             largest = max(step.gradient, largest or 0.0)
-            on_step(step, settings.steps)
+            advance(state.number, settings.steps)
     _doubt(float((state.best - start(problem).design).abs().max()), largest)
     return problem.subject.pixels(state.best)
 
@@ -251,19 +250,12 @@ def _doubt(moved: float, gradient: float | None) -> None:
     warnings.warn(f"the design is still what it began as: {why}", stacklevel=3)
 
 
-def promise_of(
-    problem: Problem,
-    design: np.ndarray,
-    controls: Sequence[str],
-    views: int | None,
-    on_promise: Callable[[int, int], None],
-) -> Promise:
-    """The promise of a finished design, of so many views (of fewer than usual it is a draft's) or, by default, of as
-    many as the scene's `promise.half_width` needs.
-    """
-    most, enough = views or PROMISE_VIEWS, None if views else problem.scene.settings.promise.half_width
+def promise_of(problem: Problem, design: np.ndarray, options: PromiseOptions, advance: Advance) -> Promise:
+    """The promise of a finished design."""
+    most = options.views or PROMISE_VIEWS
+    enough = None if options.views else problem.scene.settings.promise.half_width
     conditions = problem.scene.draw("promise", most, per_session=PER_SESSION)
-    promise = make_promise(problem, design, conditions, controls, on_promise, PER_SESSION, enough)
+    promise = make_promise(problem, design, conditions, options.controls, advance, PER_SESSION, enough)
     return promise.changed(draft=most < PROMISE_VIEWS)
 
 

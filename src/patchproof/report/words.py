@@ -109,7 +109,7 @@ def evaluation_lines(result: Mapping[str, Any]) -> list[str]:
         low, high = rates["interval"]
         lines.append(f"{name}: recognized in {rates['rate']:.1%} of {result['n']} conditions [{low:.1%}, {high:.1%}]")
         lines += _control_lines(rates["controls"])
-        if "ap50" in rates:
+        if rates["ap50"] is not None:
             lines.append("  AP50 " + ", ".join(f"{kind} {share:.3f}" for kind, share in rates["ap50"].items()))
     return lines
 

@@ -45,6 +45,29 @@ _FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 × 24 mm, to which EXIF's 35 mm focal
 
 
 @dataclass(frozen=True)
+class PhotoTruth:
+    """What is known of a simulated photograph.
+
+    homography_px_from_mm: 3×3 from page millimeters to pixels; None where the piece is bent or absent.
+    marker_corners_px: 4×2 pixels (x right, y down) by marker id.
+    conditions: drawn values by name, as in `truth.json`; of a scan its `scan_dpi` and `print_scale`.
+    """
+
+    homography_px_from_mm: np.ndarray | None
+    marker_corners_px: dict[int, np.ndarray]
+    conditions: dict[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the photograph's entry in `truth.json`."""
+        homography = self.homography_px_from_mm
+        return {
+            "homography_px_from_mm": None if homography is None else homography.tolist(),
+            "marker_corners_px": {str(i): corners.tolist() for i, corners in self.marker_corners_px.items()},
+            "conditions": self.conditions,
+        }
+
+
+@dataclass(frozen=True)
 class Hanging:
     """How a sheet was printed and what hangs there: by another printer than the scene's (a name or a file), larger or
     smaller along x and y, in its place that `control`'s own sheet (mean, gray, noise) or nothing (bare); `path_traced`
@@ -98,25 +121,21 @@ class HungSheet:
             return _stored(photograph_traced(self.stage, self.piece, conditions), self.scene, conditions)
         return take_photo(self.stage, self.piece, conditions)
 
-    def truth(self, conditions: Conditions) -> dict[str, Any]:
-        """Where the page's millimeters fall in the photograph of one view, and what it was taken under."""
+    def truth(self, conditions: Conditions) -> PhotoTruth:
+        """Return where the page's millimeters fall in the photograph of one view, and its conditions."""
         drawn: dict[str, Any] = {name: values[0].tolist() for name, values in fields_of(conditions).items()}
         drawn["print_scale"] = [scale * float(conditions.pose.printed_scale[0]) for scale in self.how.print_scale]
         if self.piece is None:
-            return {"homography_px_from_mm": None, "marker_corners_px": {}, "conditions": drawn}
+            return PhotoTruth(None, {}, drawn)
         surface, homography, cut = surface_of(self.manifest), self.px_from_page(conditions), self.manifest.cut_mm[:2]
         corners = {
-            str(i): geometry.apply_homography(homography, page_mm)
+            i: geometry.apply_homography(homography, page_mm)
             if self.scene.is_flat
             else self.scene.piece_px(conditions, page_mm - cut)
             for i, page_mm in surface.corners_mm.items()
             if i in surface.piece_ids
         }
-        return {
-            "homography_px_from_mm": geometry.normalized(homography).tolist() if self.scene.is_flat else None,
-            "marker_corners_px": {i: px.tolist() for i, px in corners.items()},
-            "conditions": drawn,
-        }
+        return PhotoTruth(geometry.normalized(homography) if self.scene.is_flat else None, corners, drawn)
 
     def outlines(self, conditions: Conditions) -> dict[str, np.ndarray]:
         """Corners of the object's box, where it has a mesh, and pixels N×2 round the piece, where it faces the camera

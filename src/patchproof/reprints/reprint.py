@@ -9,23 +9,33 @@ session or in several, each with a place, light and camera of its own and in a f
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from patchproof.base.compute import Compute
 from patchproof.base.errors import Refused
 from patchproof.base.output import make_folder, new_folder
+from patchproof.base.progress import Progress, no_progress
 from patchproof.base.workers import Workers, open_workers, result_of, sharing
 from patchproof.optimizer.run import Run, load_run
 from patchproof.report.coco import Labeled, coco_json
-from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, hang, sheet_scene
-from patchproof.reprints.run_sheet import sheet_of
+from patchproof.reprints.hung_sheet import AS_MADE, Hanging, HungSheet, PhotoTruth, hang, sheet_scene
+from patchproof.reprints.run_sheet import sheet as sheet_of
 from patchproof.scene.conditions import Conditions
 
 OWN = ("photo_*.jpg", "session_*", "scan_*.jpg", "truth.json", "coco.json")
+
+
+@dataclass(frozen=True)
+class Reprint:
+    """Simulated photographs or scans in a folder, with the truth about each by file name."""
+
+    folder: Path
+    photos: dict[str, PhotoTruth]
 
 
 def reprint(
@@ -37,14 +47,26 @@ def reprint(
     *,
     sessions: int = 1,
     seed: int | None = None,
+    compute: Compute = Compute(),
     overwrite: bool = False,
-    jobs: int = 1,
-    cluster: str | None = None,
-    on_photo: Callable[[int, int], None] = lambda done, total: None,
-) -> dict:
-    """Write n photographs of what hangs there, taken in so many sessions, and truth.json into the folder `out`; returns
-    the truth by file name.
+    progress: Progress = no_progress,
+) -> Reprint:
+    """Print a sheet in simulation, hang the piece on its object, and photograph it.
+
+    pdf_path: the sheet's PDF, its manifest beside it.
+    run: the run that the sheet was made from.
+    n: photographs in all, 1 or more.
+    out: folder for the JPEG files, `truth.json` and `coco.json`; one folder a session inside, if there are several.
+    how: printer, print scale, a control in place of the design, and the renderer.
+    sessions: places to photograph in, 1 to n, each with a light and camera of its own.
+    seed: of the conditions, in place of the scene's.
+    compute: processes or cluster; the renderer runs on the CPU, and another device is refused.
+    overwrite: delete earlier photographs in `out` first.
+    progress: called with the stage "photograph".
+
+    Raises Refused where the PDF is not of this run.
     """
+    compute = compute.without("reprint", device=True)
     if not 1 <= sessions <= n:
         raise Refused(f"1 to {n} sessions of {n} photographs", f"{sessions}", "ask for fewer")
     with _hung_pdf(pdf_path, run, how.control, Path(out)) as pdf:
@@ -59,18 +81,21 @@ def reprint(
         if sessions > 1:
             names = [f"session_{i // each + 1:02d}/{name}" for i, name in enumerate(names)]
         there = partial(_take_there, Path(pdf).resolve(), run.folder.resolve(), how)
+        jobs, cluster = compute.jobs, compute.cluster
         opened = sharing(sheet.photograph, jobs) if cluster is None else _by_name(there, jobs, cluster)
         with new_folder(out, OWN, overwrite) as folder, opened as (workers, take):
             for i, photo in workers.completed(take, views):
                 make_folder((folder / names[i]).parent)
                 (folder / names[i]).write_bytes(result_of(photo))
                 done += 1
-                on_photo(done, n)
+                progress("photograph", done, n)
             label, size_px = str(sheet.scene.settings.target.label), sheet.scene.photo_px
             photos = [Labeled(name, size_px, sheet.outlines(v)) for name, v in zip(names, views, strict=True)]
             text = coco_json(photos, label, f"simulated photographs of sheet {sheet.manifest.sheet_id}")
             (folder / "coco.json").write_text(text, encoding="utf-8")
-            return write_truth(folder, dict(zip(names, map(sheet.truth, views), strict=True)))
+            truth = dict(zip(names, map(sheet.truth, views), strict=True))
+            write_truth(folder, truth)
+    return Reprint(Path(out), truth)
 
 
 @contextmanager
@@ -104,7 +129,7 @@ def _hung_there(pdf: Path, run_folder: Path, how: Hanging) -> HungSheet:
     return hang(pdf, load_run(run_folder), how)
 
 
-def write_truth(folder: Path, truth: dict) -> dict:
-    """Write truth.json into a folder of photographs or scans; returns the truth."""
-    (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
-    return truth
+def write_truth(folder: Path, truth: Mapping[str, PhotoTruth]) -> None:
+    """Write truth.json into a folder of photographs or scans."""
+    entries = {name: photo.to_json() for name, photo in truth.items()}
+    (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")

@@ -27,11 +27,18 @@ from patchproof.sheets.template import Template, load_template
 from patchproof.sheets.write import write_sheet
 
 
-def sheet_of(
+def sheet(
     run: Run, pdf_path: str | Path, *, template: str | None = None, control: str | None = None, copies: int = 1
 ) -> Manifest:
-    """Write the run's sheet; `control` is mean, gray, noise, shuffled or blank, `template` a name or file in place of
-    the scene's.
+    """Write the page of a run's design as a PDF at true size, and its manifest beside it.
+
+    run: a run with a printed piece.
+    pdf_path: SHEET.pdf; the manifest is SHEET.json.
+    template: a template's name or file, in place of the scene's.
+    control: print this in place of the design: "mean", "gray", "noise", "shuffled" or "blank".
+    copies: pages with the same content, for label rolls.
+
+    Raises Refused where the piece does not fit the page.
     """
     content, scene = content_of(run, template, control)
     page = load_template(scene.settings.sheet.template)

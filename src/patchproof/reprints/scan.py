@@ -15,8 +15,8 @@ from patchproof.base.output import image_bytes, new_folder
 from patchproof.base.resample import between_indices
 from patchproof.channel.printer import Printer
 from patchproof.optimizer.run import Run
-from patchproof.reprints.hung_sheet import AS_MADE, Hanging, sheet_scene
-from patchproof.reprints.reprint import OWN, write_truth
+from patchproof.reprints.hung_sheet import AS_MADE, Hanging, PhotoTruth, sheet_scene
+from patchproof.reprints.reprint import OWN, Reprint, write_truth
 from patchproof.sheets.raster import page_pixels
 
 SCAN_QUALITY, SCAN_BLUR_PX = 95, 0.8  # a flatbed's JPEG and its softness, in pixels of twice the scan's resolution
@@ -31,28 +31,24 @@ def scan(
     how: Hanging = AS_MADE,
     *,
     overwrite: bool = False,
-) -> dict:
-    """Write n flat scans at `dpi` of each uncut page with markers; returns the truth."""
-    (manifest, _), truth = sheet_scene(pdf_path, run), {}
+) -> Reprint:
+    """Scan each uncut page with markers n times at `dpi`, in simulation, into the folder `out`."""
+    manifest, truth = sheet_scene(pdf_path, run)[0], {}
     printer, px_from_mm = how.printer_for(run.scene), np.diag([*(dpi / MM_PER_INCH * np.array(how.print_scale)), 1.0])
     with new_folder(out, OWN, overwrite) as folder:
         for page in sorted({marker.page for marker in manifest.markers}):
             picture = _scanned(page_pixels(pdf_path, page, 2 * dpi), manifest.page_mm, dpi, printer, how.print_scale)
             corners = {
-                str(m.id): geometry.apply_homography(px_from_mm, m.corners_mm).tolist()
-                for m in manifest.markers
-                if m.page == page
+                m.id: geometry.apply_homography(px_from_mm, m.corners_mm) for m in manifest.markers if m.page == page
             }
             content = image_bytes(photo_codes_of(picture), "JPEG", {"quality": SCAN_QUALITY})
             for _ in range(n):
                 name = f"scan_{len(truth) + 1:04d}.jpg"
                 (folder / name).write_bytes(content)
-                truth[name] = {
-                    "homography_px_from_mm": (px_from_mm @ manifest.page_from_home(page)).tolist(),
-                    "marker_corners_px": corners,
-                    "conditions": {"scan_dpi": dpi, "print_scale": list(how.print_scale)},
-                }
-        return write_truth(folder, truth)
+                conditions = {"scan_dpi": dpi, "print_scale": list(how.print_scale)}
+                truth[name] = PhotoTruth(px_from_mm @ manifest.page_from_home(page), corners, conditions)
+        write_truth(folder, truth)
+    return Reprint(Path(out), truth)
 
 
 def _scanned(page: np.ndarray, page_mm, dpi: float, printer: Printer, print_scale: tuple[float, float]) -> np.ndarray:

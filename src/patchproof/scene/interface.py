@@ -73,6 +73,7 @@ class Scene(ABC):
     known: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # beside settings, what the sheet id tells
     camera: Camera | None = field(default=None, kw_only=True)  # a calibrated one
     given_glb: bytes | None = field(default=None, kw_only=True)  # the mesh, where it was given in Python
+    given_models: Mapping[str, Any] = field(default_factory=dict, kw_only=True)  # networks given in Python, by name
 
     HAS_OBJECT: ClassVar[bool] = False  # a surface of its own before what is behind it
     HAS_PIECE: ClassVar[bool] = False

@@ -6,10 +6,16 @@ mesh needs nothing of textures, bent paper, photographs or images.
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from patchproof.base.output import write_pictures
 from patchproof.base.settings import SceneSettings, load_scene_settings
 from patchproof.base.validation import validated
 from patchproof.scene.interface import Scene, SceneSource
@@ -28,18 +34,61 @@ def load_scene(path: str | Path, seed: int | None = None, steps: int | None = No
 
 
 def make_scene(
-    settings: SceneSettings | dict[str, Any],
+    settings: SceneSettings | Mapping[str, Any],
     mesh: trimesh.Trimesh | trimesh.Scene | None = None,
     base: str | Path = ".",
     seed: int | None = None,
 ) -> Scene:
-    """The scene of settings made in Python (or of a dictionary like a scene file's), whose paths are relative to
-    `base`; `mesh` is the object where the settings name it `python:` and a word.
+    """Make a scene of settings in Python.
+
+    settings: `SceneSettings`, or a dictionary like a scene file's. Where a scene file names something, the dictionary
+        may hold it: a Path for any path, a trimesh mesh as `object.mesh`, classifiers (or torch modules with `input_px`
+        and `labels`) in `target.models`, and lists of uint8 H×W×3 sRGB arrays as `object.photos`, `object.images` or
+        `background.images`; arrays are written as PNG files into a folder of `base` that is named after their bytes.
+    mesh: the object, where `object.mesh` is "python:" and a word.
+    base: folder that paths in the settings are relative to.
+    seed: of all random draws, in place of `optimize.seed`.
+
+    Raises Refused for settings that contradict each other, and files that cannot be read.
     """
+    models: dict[str, Any] = {}
     if not isinstance(settings, SceneSettings):
-        settings = validated(SceneSettings, settings, "the scene's settings")
+        named, given_mesh, models = _named(settings, Path(base))
+        settings, mesh = validated(SceneSettings, named, "the scene's settings"), mesh or given_mesh
     glb: Any = None if mesh is None else mesh.export(file_type="glb")
-    return build_scene(settings, Path(base), seed, given_glb=glb)
+    scene = build_scene(settings, Path(base), seed, given_glb=glb)
+    return replace(scene, given_models=models) if models else scene
+
+
+def _named(settings: Mapping[str, Any], base: Path) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """The settings with names in place of objects, the mesh among these, and the networks by name."""
+    tables = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
+    mesh, models = None, {}
+    for table in (value for value in tables.values() if isinstance(value, dict)):
+        table.update({key: str(value) for key, value in table.items() if isinstance(value, Path)})
+    for key, name in (("object", "photos"), ("object", "images"), ("background", "images")):
+        table = tables.get(key)
+        if isinstance(table, dict) and isinstance(table.get(name), list | tuple):
+            table[name] = str(_written(table[name], base).name)
+    thing, target = tables.get("object"), tables.get("target")
+    if isinstance(thing, dict) and hasattr(thing.get("mesh"), "export"):
+        mesh, thing["mesh"] = thing["mesh"], "python:mesh"
+    if isinstance(target, dict) and isinstance(target.get("models"), list | tuple):
+        names = []
+        for number, model in enumerate(target["models"]):
+            is_named = isinstance(model, str | Path)
+            names.append(str(model) if is_named else getattr(model, "name", f"python:network{number}"))
+            models |= {} if is_named else {names[-1]: model}
+        target["models"] = names
+    return tables, mesh, models
+
+
+def _written(pictures: Sequence[np.ndarray], base: Path) -> Path:
+    """The folder of `base` that holds these pictures."""
+    digest = hashlib.sha256()
+    for picture in pictures:
+        digest.update(np.ascontiguousarray(picture).tobytes())
+    return write_pictures(pictures, base.resolve() / f"pictures-{digest.hexdigest()[:12]}")
 
 
 def build_scene(

@@ -53,7 +53,7 @@ def measured(source: Path, number: int, folder: str) -> list[dict]:
 if __name__ == "__main__":
     with TemporaryDirectory() as folder:
         at = Path(folder)
-        run = pp.optimize("photos.toml", at / "run", promise_views=40)
+        run = pp.optimize("photos.toml", at / "run", promise=pp.PromiseOptions(40))
         pp.sheet(run, at / "sheet.pdf")
         pp.reprint(at / "sheet.pdf", run, 24, at / "photos", sessions=2)
         turns = [(Path(source), n) for n in range(int(sys.argv[1])) for source in sys.argv[2:]]

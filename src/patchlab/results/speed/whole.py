@@ -18,9 +18,15 @@ begin = time.perf_counter()
 import patchproof as pp
 ends = []
 scene = pp.load_scene(sys.argv[2])
-jobs = {"jobs": 2} if "jobs" in pp.optimize.__code__.co_varnames else {}  # before, two threads
 folder = sys.argv[1]
-run = pp.optimize(scene, folder + "/run", on_step=lambda step, total: ends.append(time.perf_counter()), **jobs)
+
+
+def clock(stage, done, total):
+    if stage == "optimize":
+        ends.append(time.perf_counter())
+
+
+run = pp.optimize(scene, folder + "/run", compute=pp.Compute(jobs=2), progress=clock)
 promised = time.perf_counter()
 pp.sheet(run, folder + "/sheet.pdf")
 end = time.perf_counter()

@@ -15,6 +15,7 @@ import hashlib
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 from patchproof.base.errors import Refused
 from patchproof.base.output import check_folder, make_folder
@@ -37,7 +38,7 @@ class UploadRefused(Refused):
         super().__init__(expected, got, do)
         self.status = status
 
-    def __reduce__(self):
+    def __reduce__(self) -> Any:
         return UploadRefused, (self.status, *self._parts)
 
 

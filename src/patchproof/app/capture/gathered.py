@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from patchproof.app.capture.album import CONTROLS_FOLDER, JOURNAL, Album
+from patchproof.base.progress import Advance, no_advance
 from patchproof.base.workers import Workers
 from patchproof.evidence.batch import Item, measure_all, shot_again
 from patchproof.evidence.classify import judges_of
@@ -53,13 +54,13 @@ class Gathered:
     def measure(
         self,
         paths: Sequence[Path],
-        progress: Callable[[int, int], None] = lambda done, total: None,
+        advance: Advance = no_advance,
         on_pictures: Callable[[str, Mapping[str, np.ndarray]], None] = lambda file, pictures: None,
     ) -> None:
         """Measure and classify those of these photographs that are not yet; see `gather_evidence`."""
         paths = [path for path in paths if path not in self._measured]
         items = [self._item(path) for path in paths]
-        results = measure_all(self._task, items, self._judges, self._workers, self._journal, on_pictures, progress)
+        results = measure_all(self._task, items, self._judges, self._workers, self._journal, on_pictures, advance)
         if self._forecast is not None and self._judges is not None:
             there = partial(_forecast_there, self._forecast, self._task, self._judges.primary.input_px)
             own = [i for i, item in enumerate(items) if item.control is None]

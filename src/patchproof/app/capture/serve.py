@@ -13,6 +13,7 @@ import secrets
 import socket
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +25,7 @@ from patchproof.app.verify import options_of
 from patchproof.base.errors import Refused
 from patchproof.base.input import read_json
 from patchproof.base.output import write_whole
+from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import Strict, validated
 from patchproof.base.workers import open_workers
 from patchproof.evidence.results import Report
@@ -51,11 +53,12 @@ def serve_capture(
     models: Sequence[str] | None = None,
     camera: str | None = None,
     lan: bool = False,
-    on_photo: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = no_progress,
     on_address: Callable[[str], None] = print,
 ) -> Report:
-    """Serve the page and receive photographs into `out` until interrupted; `on_photo` gets (done, all) of those that
-    are there already, `on_address` the address once it listens. `run`, `models` and `camera` as in `verify_photos`.
+    """Serve the page and receive photographs into `out` until interrupted. `progress` is called with the stage
+    "measure" for photographs that are there already, `on_address` with the address once the server listens; `run`,
+    `models` and `camera` as in `verify`.
     """
     try:
         import uvicorn
@@ -73,7 +76,7 @@ def serve_capture(
     with open_workers(1, apart=True) as workers:
         workers.map(ready, [None])
         with closing(Gathered(album, manifest, options, workers, forecast)) as gathered:
-            gathered.measure(album.photos(), on_photo)
+            gathered.measure(album.photos(), partial(progress, "measure"))
             kept = _kept_address(album.folder)
             with _listening(_host(lan), kept.port) as listener:
                 host, port = listener.getsockname()

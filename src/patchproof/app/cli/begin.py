@@ -69,12 +69,12 @@ def plan(
     if out is not None:
         check_file(out, overwrite)
     with progress() as bar:
-        geometry, problem = plan_geometry(scene, on_stage=bar)
+        geometry, problem = plan_geometry(scene, progress=bar)
     warn(geometry.warnings)
     say(*geometry_lines(geometry))
     sys.stdout.flush()  # what follows takes minutes
     with progress() as bar:
-        planned = measured_plan(geometry, problem, timing=not no_timing, on_stage=bar)
+        planned = measured_plan(geometry, problem, timing=not no_timing, progress=bar)
     say(*measured_lines(planned))
     if out is not None:
         write_whole(out, planned.model_dump_json(indent=1) + "\n")

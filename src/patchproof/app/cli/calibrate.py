@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -39,7 +38,7 @@ def printer(
         raise typer.BadParameter("name the JSON that was written beside the chart's PDF", param_hint="--sheet")
     else:
         with progress() as bar:
-            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, partial(bar, "chart"))
+            lines, warned = printer_from_chart(photos, sheet, out, camera, overwrite, bar)
     warn(warned)
     say(*lines)
 

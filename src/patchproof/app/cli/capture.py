@@ -43,7 +43,7 @@ def capture(
             models=names_of(models),
             camera=camera,
             lan=lan,
-            on_photo=lambda done, total: bar("measure", done, total) if total else None,
+            progress=lambda stage, done, total: bar(stage, done, total) if total else None,
             on_address=show,
         )
     controls = f" --controls {out / CONTROLS_FOLDER}" if report.controls else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +20,7 @@ from patchproof.app.cli.console import (
     say_study,
     warn,
 )
+from patchproof.base.compute import Compute
 
 
 def import_picture(
@@ -38,17 +38,20 @@ def import_picture(
     """Make a run of a picture that was made elsewhere: its promise, as of a design of ours."""
     from patchproof.base.settings import behind
     from patchproof.optimizer.given import import_folder, import_patch
+    from patchproof.optimizer.promise import PromiseOptions
     from patchproof.optimizer.run import DRAFT
     from patchproof.report.words import imported_lines, promise_lines
+    from patchproof.scene.scene import load_scene
 
     with progress() as bar:
-        options: dict[str, Any] = {"seed": seed, "device": device, "overwrite": overwrite, "jobs": jobs or 1}
-        options |= {"promise_views": promise or (DRAFT[1] if draft else None), "on_promise": partial(bar, "promise")}
-        options |= {"on_scene": lambda loaded: warn(loaded.warnings)}
+        loaded, views = load_scene(scene, seed), promise or (DRAFT[1] if draft else None)
+        warn(loaded.warnings)
+        options: dict[str, Any] = {"promise": PromiseOptions(views), "compute": Compute(device, jobs or 1)}
+        options |= {"overwrite": overwrite, "progress": bar}
         if picture.is_dir():
-            runs = import_folder(picture, scene, out, resume=resume, **options)
+            runs = import_folder(picture, loaded, out, resume=resume, **options)
         else:
-            runs = [import_patch(picture, scene, out, **options)]
+            runs = [import_patch(picture, loaded, out, **options)]
     for run in runs:
         say(*imported_lines(run.details["imported"]))
         say(*promise_lines(run.promise, behind(run.scene.settings.model_dump())), f"run: {run.folder}")
@@ -66,18 +69,18 @@ def evaluate(
     overwrite: Overwrite = False,
 ) -> None:
     """Rates on fresh conditions, with controls, on any classifiers; of several runs side by side."""
-    from patchproof.app.compare import compare_runs
-    from patchproof.optimizer.evaluate import evaluate_run
+    from patchproof.app.compare import compare
+    from patchproof.optimizer.evaluate import evaluate as evaluate_run
     from patchproof.report.words import evaluation_lines
 
     if (out is None) != (len(runs) == 1):
         raise typer.BadParameter("is for several runs, and they need it; one has its own folder", param_hint="--out")
     with progress() as bar:
-        options: dict[str, Any] = {"models": names_of(models), "n": n, "seed": seed, "device": device}
-        options |= {"jobs": jobs or 1, "cluster": cluster, "overwrite": overwrite, "on_view": partial(bar, "evaluate")}
-        done: Any = evaluate_run(runs[0], **options) if out is None else compare_runs(runs, out, **options)
-    if out is None:
-        say(*evaluation_lines(done), f"written: {runs[0] / 'evaluate.json'}")
-    else:
-        say_study(done)
-        say(f"page: {out / 'designs.html'}")
+        options: dict[str, Any] = {"models": names_of(models), "n": n, "seed": seed, "overwrite": overwrite}
+        options |= {"compute": Compute(device, jobs or 1, cluster), "progress": bar}
+        if out is None:
+            result = evaluate_run(runs[0], **options)
+            say(*evaluation_lines(result.model_dump()), f"written: {runs[0] / 'evaluate.json'}")
+        else:
+            say_study(compare(runs, out, **options))
+            say(f"page: {out / 'designs.html'}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,6 +22,7 @@ from patchproof.app.cli.console import (
     say,
     warn,
 )
+from patchproof.base.compute import Compute
 
 Control = Literal["mean", "gray", "noise", "shuffled", "blank"]  # that can be printed
 Shown = Literal["bare", "mean", "gray", "noise"]  # that can hang on the object in place of the design
@@ -40,7 +40,7 @@ def demo(
     from patchproof.app.demo import run_demo
 
     with progress() as bar:
-        summary = run_demo(out, detector=detector, jobs=jobs or 1, overwrite=overwrite, on_stage=bar)
+        summary = run_demo(out, detector=detector, jobs=jobs or 1, overwrite=overwrite, progress=bar)
     say(*summary)
 
 
@@ -63,7 +63,9 @@ def optimize(
 ) -> None:
     """Optimize the patch of a scene and promise its rate."""
     from patchproof.base.settings import behind
-    from patchproof.optimizer.run import DRAFT, THOROUGH, optimize_scene
+    from patchproof.optimizer.promise import PromiseOptions
+    from patchproof.optimizer.run import DRAFT, THOROUGH
+    from patchproof.optimizer.run import optimize as optimize_scene
     from patchproof.report.words import promise_lines
     from patchproof.scene.scene import load_scene
 
@@ -73,20 +75,18 @@ def optimize(
         effort = DRAFT if draft else THOROUGH
         steps, promise = steps or effort[0], promise or effort[1]
     with progress() as bar:
+        loaded = load_scene(scene, seed, steps)
+        warn(loaded.warnings)
         run = optimize_scene(
-            scene if steps is None else load_scene(scene, seed, steps),
+            loaded,
             out,
-            seed=seed,
-            device=device,
+            promise=PromiseOptions(promise),
+            compute=Compute(device, jobs or 1),
             resume=resume,
             overwrite=overwrite,
-            promise_views=promise,
-            jobs=jobs or 1,
-            on_scene=lambda loaded: warn(loaded.warnings),
-            on_place=partial(bar, "place"),
-            on_step=lambda step, total: bar("optimize", step.state.number, total),
-            on_promise=partial(bar, "promise"),
+            progress=bar,
         )
+    warn(tuple(text for text in run.scene.warnings if text not in loaded.warnings))  # of the place that was found
     say(*promise_lines(run.promise, behind(run.scene.settings.model_dump())))
     if (out / "place.json").is_file():  # what searches a place is loaded where one was searched for
         from patchproof.optimizer.place_files import read_place
@@ -112,7 +112,7 @@ def promise(
     from patchproof.report.words import promise_lines
 
     with progress() as bar:
-        made = promise_run(run, views=n, device=device, jobs=jobs or 1, on_promise=partial(bar, "promise"))
+        made = promise_run(run, views=n, compute=Compute(device, jobs or 1), progress=bar)
     say(*promise_lines(made.promise, behind(made.scene.settings.model_dump())))
     if made.scene.settings.patch.kind == "patch":
         say(f"next: patchproof sheet {run} --out sheet.pdf (a page that was written before has the former promise)")
@@ -153,7 +153,8 @@ def sheet(
         manifests = [blank_page(out, template=template, control=control)]
     else:
         from patchproof.optimizer.run import load_run
-        from patchproof.reprints.run_sheet import sheet_of, sheet_of_several
+        from patchproof.reprints.run_sheet import sheet as sheet_of
+        from patchproof.reprints.run_sheet import sheet_of_several
 
         first, *others = loaded = [load_run(folder) for folder in runs]
         if others:
@@ -212,10 +213,10 @@ def reprint(
         return say(f"{n} photographs: {out}")
     made = load_run(run)
     if scan_dpi is not None:
-        truth = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
+        taken = scan(pdf, made, n, out, scan_dpi, how, overwrite=overwrite)
     else:
         with progress() as bar:
-            truth = reprint_sheet(
+            taken = reprint_sheet(
                 pdf,
                 made,
                 n,
@@ -223,12 +224,11 @@ def reprint(
                 how,
                 sessions=sessions,
                 seed=seed,
+                compute=Compute(jobs=jobs or 1, cluster=cluster),
                 overwrite=overwrite,
-                jobs=jobs or 1,
-                cluster=cluster,
-                on_photo=partial(bar, "photograph"),
+                progress=bar,
             )
-    say(f"{len(truth)} photographs: {out}")
+    say(f"{len(taken.photos)} photographs: {out}")
 
 
 def verify(
@@ -264,7 +264,8 @@ def verify(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure photographs of the print and judge them against the promise."""
-    from patchproof.app.verify import verify_photos
+    from patchproof.app.verify import CaptureInfo
+    from patchproof.app.verify import verify as verify_photos
     from patchproof.report.words import verdict_lines
 
     with progress() as bar:
@@ -274,17 +275,13 @@ def verify(
             out,
             models=names_of(models),
             controls=controls,
-            scan_dpi=scan_dpi,
-            ruler_mm=None if ruler_mm is None else pair_of(ruler_mm, "--ruler-mm"),
-            ledger_photos=ledger,
-            camera=camera,
-            boxes=boxes,
+            capture=CaptureInfo(camera, scan_dpi, pair_of(ruler_mm, "--ruler-mm") if ruler_mm else None, boxes),
             run=run,
-            jobs=jobs or 1,
-            cluster=cluster,
+            ledger_photos=ledger,
+            compute=Compute(jobs=jobs or 1, cluster=cluster),
             resume=resume,
             overwrite=overwrite,
-            on_photo=partial(bar, "verify"),
+            progress=bar,
         )
     say(*verdict_lines(report), f"report: {out / 'report.html'}")
     summary = report.summary

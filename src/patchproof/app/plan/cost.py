@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from patchproof.base.progress import Advance, no_advance
 from patchproof.base.validation import Strict
 from patchproof.optimizer.problem import Problem
 from patchproof.optimizer.training_views import new_pose_share
@@ -46,14 +46,12 @@ class Cost(Strict):
     parts: tuple[Part, ...]
 
 
-def measure_cost(
-    problem: Problem, design: Tensor, on_step: Callable[[int, int], None] = lambda done, total: None
-) -> Cost:
+def measure_cost(problem: Problem, design: Tensor, advance: Advance = no_advance) -> Cost:
     """The cost of a step that shows `design`, with all classifiers of the problem."""
     views, threads, rows = problem.scene.settings.optimize.views, torch.get_num_threads(), []
     for number in range(REPEATS + 1):  # the first one warms up
         rows.append(_step_ms(problem, design, problem.scene.draw("train", views, start=number * views)))
-        on_step(number + 1, REPEATS + 1)
+        advance(number + 1, REPEATS + 1)
     median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0]}
     total = sum(median.values())
     parts = tuple(Part(name=name, ms=ms, share=ms / total) for name, ms in median.items())

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from patchproof.app.plan.terms import Setup, Term, scene_terms
 from patchproof.base.output import image_bytes, image_pixels
+from patchproof.base.progress import Advance, no_advance
 from patchproof.base.validation import Strict
 from patchproof.classifier.network import center_square
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -66,7 +67,7 @@ def measure_terms(
     conditions: Conditions,
     selection_views: int,
     other_surface: Placement | None = None,
-    on_view: Callable[[int, int], None] = lambda done, total: None,
+    advance: Advance = no_advance,
 ) -> Terms:
     """The errors of all terms over `conditions`. The threshold is the standard error that the mean confidence has over
     `selection_views` views: a smaller change decides about no design.
@@ -78,15 +79,15 @@ def measure_terms(
     photo_px = min(problem.scene.settings.camera.photo_px)
     done = 0
 
-    def advance(count: int) -> None:
+    def add_views(count: int) -> None:
         nonlocal done
         done += count
-        on_view(done, 3 * len(conditions))
+        advance(done, 3 * len(conditions))
 
     with torch.no_grad():
         wholes = [term for term in on if term.whole]
-        whole = _squares(problem, photo_px, base, [changed[term.name] for term in wholes], advance)
-        small = _squares(problem, problem.training_px, base, [changed[term.name] for term in on], advance)
+        whole = _squares(problem, photo_px, base, [changed[term.name] for term in wholes], add_views)
+        small = _squares(problem, problem.training_px, base, [changed[term.name] for term in on], add_views)
         boxes = problem.boxes(conditions)
         confidence = _confidence(problem, whole[0], boxes)
         threshold = float(confidence.std()) / selection_views**0.5
@@ -99,7 +100,7 @@ def measure_terms(
         for term in gone:
             setup = term.change(setup) or setup
         if gone:
-            (pictures,) = _squares(problem, photo_px, setup, [], advance)
+            (pictures,) = _squares(problem, photo_px, setup, [], add_views)
             together = float((_confidence(problem, pictures, boxes) - confidence).abs().mean())
     return Terms(
         views=len(conditions),
@@ -146,7 +147,7 @@ def _confidence(problem: Problem, pictures: Tensor, boxes: np.ndarray | None) ->
 
 
 def _squares(
-    problem: Problem, side_px: int, base: Setup, setups: list[Setup], on_view: Callable[[int], None]
+    problem: Problem, side_px: int, base: Setup, setups: list[Setup], add_views: Callable[[int], None]
 ) -> Tensor:
     """(1 + len(setups))×N×3×S×S views as the primary classifier gets them: the base setup's, then each other one's."""
     size_px, stack = (side_px, side_px), []
@@ -159,7 +160,7 @@ def _squares(
             seen = relit(views, conditions) if same else see(setup.stage, setup.shown, conditions, size_px)
             parts.append(_pictures(problem, seen, setup.shown))
         stack.append(torch.stack(parts))
-        on_view(len(known))
+        add_views(len(known))
     return torch.cat(stack, 1)
 
 

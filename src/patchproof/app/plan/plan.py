@@ -27,6 +27,8 @@ from torch import Tensor
 from patchproof.app.plan.cost import Cost, measure_cost
 from patchproof.app.plan.errors import Terms, measure_terms
 from patchproof.base.claims import wilson
+from patchproof.base.compute import Compute
+from patchproof.base.progress import Progress, no_progress
 from patchproof.base.validation import Strict
 from patchproof.optimizer.loop import SELECT_VIEWS, start, steps
 from patchproof.optimizer.pixels import as_pixels, from_pixels
@@ -126,12 +128,12 @@ def plan_geometry(
     scene_path: str | Path,
     *,
     device: str = "cpu",
-    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+    progress: Progress = no_progress,
 ) -> tuple[Geometry, Problem]:
     """How the piece of a scene lies and what views show of it, and the problem that a plan goes on with."""
     scene, place = load_scene(scene_path), None
     if isinstance(scene, OpenScene):
-        place = choose_place(scene, device=device, on_pass=partial(on_stage, "place"))
+        place = choose_place(scene, compute=Compute(device), progress=progress)
         scene = scene.at(place.at, place.spin_deg)
     problem, target = set_problem(scene, device), scene.settings.target
     _, sentence = other_surface(scene)
@@ -155,21 +157,21 @@ def measured_plan(
     *,
     timing: bool = True,
     views: int = TERM_VIEWS,
-    on_stage: Callable[[str, int, int], None] = lambda name, done, total: None,
+    progress: Progress = no_progress,
 ) -> Plan:
     """The rest of a plan: a draft of the design, the terms and the cost."""
     scene = problem.scene
     other, _ = other_surface(scene)
-    design, draft = _draft(problem, on_stage)
+    design, draft = _draft(problem, progress)
     conditions = scene.draw("select", views)
-    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(on_stage, "terms"))
+    terms = measure_terms(problem, design, conditions, SELECT_VIEWS, other, partial(progress, "terms"))
     return Plan(
         **dict(geometry),
         draft=draft,
         terms=terms,
         samples=sample_plan(draft.rate, terms.threshold),
         omitted=scene.OMITTED,
-        cost=measure_cost(problem, design, partial(on_stage, "cost")) if timing else None,
+        cost=measure_cost(problem, design, partial(progress, "cost")) if timing else None,
     )
 
 
@@ -218,13 +220,13 @@ def _quantiles(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _draft(problem: Problem, on_stage: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
+def _draft(problem: Problem, progress: Callable[[str, int, int], None]) -> tuple[Tensor, Draft]:
     """The loop's design after a few steps, in 8-bit colors, tried on the selection set."""
     settings = problem.scene.settings.optimize
     count = min(settings.steps, math.ceil(DRAFT_VIEWS / settings.views))
     state, rate = start(problem), None
     for step in steps(problem.trained_by(settings.changed(steps=count)), state):
         state, rate = step.state, step.select_rate
-        on_stage("draft", state.number, count)
+        progress("draft", state.number, count)
     assert rate is not None  # the last step ends with a selection
     return from_pixels(as_pixels(state.design), problem.device), Draft(steps=count, rate=rate)

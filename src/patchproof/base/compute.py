@@ -1,0 +1,32 @@
+"""Where work runs: the device, the processes on this machine, or a cluster; shared by all verbs.
+
+In: what somebody asks for. Out: `Compute`, whose fields a verb either uses or refuses by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from patchproof.base.errors import Refused
+
+
+@dataclass(frozen=True)
+class Compute:
+    """Where work runs. Results do not depend on `jobs` where one process works on one thread, too.
+
+    device: torch device of scene and networks, "cpu" or "cuda"; photographs are judged on the CPU only.
+    jobs: processes on this machine that share the work, 1 or more.
+    cluster: address of a dask scheduler whose workers do the work in place of this machine's; None for no cluster.
+    """
+
+    device: str = "cpu"
+    jobs: int = 1
+    cluster: str | None = None
+
+    def without(self, verb: str, *, device: bool = False, cluster: bool = False) -> Compute:
+        """This object, refused where it asks `verb` for a device or cluster that the verb cannot use."""
+        if device and self.device != "cpu":
+            raise Refused(f'device = "cpu" for {verb}', f'"{self.device}"', "leave device out of Compute")
+        if cluster and self.cluster is not None:
+            raise Refused(f"no cluster for {verb}", f'"{self.cluster}"', "use jobs, which share this machine")
+        return self
