@@ -17,8 +17,8 @@ import pytest
 
 from patchlab.study.study import Result, load_study, run_study
 from patchlab.validation import real
-from patchlab.validation.board_fit import edge_of, fit_board, white_noise
-from patchlab.validation.known_boards import BoardSettings, find_pose
+from patchlab.validation.board_fit import BoardFit, edge_of, fit_board, white_noise
+from patchlab.validation.known_boards import BoardSettings, Pose, find_pose
 from patchproof.base.errors import Refused
 from patchproof.base.validation import validated
 from patchproof.photo.rejection import PhotoRejected
@@ -67,17 +67,23 @@ def photograph(kind: str = "grid", noise: float = NOISE, blur_px: float = BLUR_P
     return (srgb * 255 + 0.5).astype(np.uint8), light
 
 
-@pytest.mark.parametrize(
-    ("kind", "board"), [("grid", grid()), ("charuco", grid(kind="charuco", rows=4, columns=5, gap=0.25))]
-)
-def test_known_figures_come_back(kind, board):
-    srgb, light = photograph(kind)
-    pose = find_pose(srgb, board)
-    fit = fit_board(srgb, pose)
+BOARDS = {"grid": grid(), "charuco": grid(kind="charuco", rows=4, columns=5)}
+
+
+@lru_cache(maxsize=2)
+def fitted(kind: str = "grid") -> tuple[Pose, BoardFit]:
+    srgb = photograph(kind)[0]
+    pose = find_pose(srgb, BOARDS[kind])
+    return pose, fit_board(srgb, pose)
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+def test_known_figures_come_back(kind):
+    (srgb, light), (pose, fit) = photograph(kind), fitted(kind)
     assert pose.found == pose.expected and pose.misfit_px < 0.15
     assert fit.blur_px == pytest.approx(BLUR_PX, abs=0.06)
     assert fit.black == pytest.approx(BLACK, abs=0.006)
-    assert fit.light[fit.mask] == pytest.approx(np.repeat(light[fit.mask][:, None], 3, 1), rel=0.015)
+    np.testing.assert_allclose(fit.light[fit.mask], np.repeat(light[fit.mask][:, None], 3, 1), rtol=0.015)
     noise, uneven = white_noise(fit, srgb)
     assert noise == pytest.approx(NOISE, rel=0.2) and uneven < 0.015
     left = (srgb.astype(float) - fit.rendered())[fit.mask]
@@ -110,11 +116,10 @@ def residual(srgb, fit) -> float:
 
 
 def test_the_wrong_print_leaves_much():
-    srgb, _ = photograph()
-    pose = find_pose(srgb, grid())
+    (srgb, _), (pose, fit) = photograph(), fitted()
     others = cells_of("DICT_6X6_250", range(100, 100 + len(pose.prints)))
     wrong = [replace(printed, cells=cells) for printed, cells in zip(pose.prints, others, strict=True)]
-    assert residual(srgb, fit_board(srgb, pose)) < 4
+    assert residual(srgb, fit) < 4
     assert residual(srgb, fit_board(srgb, replace(pose, prints=tuple(wrong)))) > 40
 
 
@@ -129,11 +134,9 @@ def test_boards_that_are_not_there_or_not_flat_are_told():
 
 
 def test_only_what_was_found_counts():
-    srgb = photograph("charuco")[0].copy()
-    board = grid(kind="charuco", rows=4, columns=5, gap=0.25)
-    whole = find_pose(srgb, board)
+    srgb, (whole, _) = photograph("charuco")[0].copy(), fitted("charuco")
     srgb[:80, :90] = 128  # hides the first markers
-    part = find_pose(srgb, board)
+    part = find_pose(srgb, BOARDS["charuco"])
     assert part.found < whole.found
     assert not part.mask(srgb.shape)[:60, :70].any() and part.mask(srgb.shape).sum() < whole.mask(srgb.shape).sum()
     assert residual(srgb, fit_board(srgb, part)) < 4
