@@ -106,7 +106,8 @@ def test_a_default_is_checked_where_it_stands():
     assert check.claim.startswith("knob: ") and check.figure == 0
 
 
-def test_the_default_is_among_the_sides_of_training_s_views():
+def test_the_default_is_among_the_sides_of_training_s_views(monkeypatch):
+    monkeypatch.setattr("patchlab.bench.render.SIDES_PX", (96,))
     problem = demo_problem()
     drawn = problem.subject.start()
     chart = resolution_chart(problem, drawn, views=2, rounds=1, on_stage=lambda *_: None)

@@ -110,13 +110,14 @@ def test_exact_corners_of_bent_sheets_need_their_model(kind, beaten):
     assert right < wrong / 3
 
 
-def test_efforts_are_timed_beside_the_default_and_judged_in_the_same_views():
-    efforts = {"draft": (1, 8), effort.DEFAULT: (3, 16)}
-    chart = effort.effort_chart(["carton"], efforts, 12, lambda stage, done, total: None)
+def test_efforts_are_timed_beside_the_default_and_judged_in_the_same_views(monkeypatch):
+    monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
+    efforts = {"draft": (1, 8), effort.DEFAULT: (2, 9)}
+    chart = effort.effort_chart(["carton"], efforts, 6, lambda stage, done, total: None)
     draft, default = chart.series["carton"]
     assert (draft.setting, default.setting, default.default) == ("draft", "default", True)
     (table,) = chart.tables
     assert default.cost == 1.0 and draft.cost == table.rows[0][2] / table.rows[1][2]
     assert [row[:2] for row in table.rows] == [("carton", "draft"), ("carton", "default")]
     for point, row in zip((draft, default), table.rows, strict=True):
-        assert point.error.n == 12 and row[-1] == 1 - point.error.value
+        assert point.error.n == 6 and row[-1] == 1 - point.error.value

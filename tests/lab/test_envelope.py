@@ -197,7 +197,7 @@ def blue_run(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("blue")
     scene = conftest.SCENE.replace('"carton"\nmodels = ["builtin"]', BLUE).replace("[800, 600]", "[96, 96]")
-    (folder / "scene.toml").write_text(scene.replace("steps = 3", "steps = 8").replace("[500, 900]", "[330, 340]"))
+    (folder / "scene.toml").write_text(scene.replace("steps = 3", STRIDES).replace("[500, 900]", "[330, 340]"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 8)
         patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
@@ -205,6 +205,7 @@ def blue_run(tmp_path_factory):
     return folder / "run"
 
 
+STRIDES = 'steps = 4\noptimizer = "sign"\nstep_size = 0.15'
 BLUE = '"blue"\nmodels = ["module:fake_networks.red_against_blue"]'
 
 
@@ -216,7 +217,7 @@ def test_where_nothing_is_left_of_the_object_the_page_says_no_effect_whatever_is
     config, out = tmp_path / "envelope.toml", tmp_path / "out"
     config.write_text(
         f'run = "{blue_run}"\nn = 8\nphotos = 1\nmap_n = 4\nmap_photos = 1\n'
-        'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 200, points = 3}]\n'
+        'sweeps = [{axis = "noise", points = 3}, {axis = "blur", easy = 0.1, hard = 60, points = 3}]\n'
         'maps = [{x = "noise", y = "mismatch", points = 3}]\n'
     )
     finished = run_study("envelope", config, out)

@@ -46,7 +46,7 @@ def test_nothing_to_forecast_is_no_figure():
 
 def test_a_cell_goes_from_the_scene_to_forecasts_and_effects(tmp_path, monkeypatch):
     monkeypatch.setattr(retake, "DRAWS", 2)
-    (one,) = small_study("forecasts", tmp_path, monkeypatch).results
+    (one,) = small_study("forecasts", tmp_path, monkeypatch, 2).results
     assert len(one.answers["sessions"]) == 2
     for session in one.answers["sessions"]:
         # a photograph or two may be too small to be taken again

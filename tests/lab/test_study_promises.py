@@ -54,8 +54,8 @@ def test_shares_and_biases_by_hand():
     assert [(row[6].value, row[7]) for row in elsewhere.rows] == [(0.79, True), (0.79, False)]
 
 
-def small_study(study, tmp_path, monkeypatch, more=""):
-    """A finished study of that name: one cell, two sessions of five photographs by our own renderer."""
+def small_study(study, tmp_path, monkeypatch, sessions, more=""):
+    """A finished study of that name: one cell, sessions of five photographs by our own renderer."""
     monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
     data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [560, 420]}}
@@ -67,14 +67,14 @@ def small_study(study, tmp_path, monkeypatch, more=""):
     ]
     (tmp_path / "scene.toml").write_text("\n".join(lines), encoding="utf-8")
     names = 'scenes = ["scene.toml"]\nnetworks = ["module:fake_networks.red_against_blue"]\nprinters = ["uncoated"]\n'
-    (tmp_path / "study.toml").write_text(names + "sessions = 2\nphotos = 5\npath_traced = false\n" + more)
+    (tmp_path / "study.toml").write_text(names + f"sessions = {sessions}\nphotos = 5\npath_traced = false\n" + more)
     finished = run_study(study, tmp_path / "study.toml", tmp_path / "out")
     assert not finished.failed
     return finished
 
 
 def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
-    finished = small_study("promises", tmp_path, monkeypatch, "elsewhere = 6\nrendered = 2\n")
+    finished = small_study("promises", tmp_path, monkeypatch, 2, "elsewhere = 6\nrendered = 2\n")
     (one,) = finished.results
     assert len(one.answers["promised"]) == 8 and one.answers["per_session"] == PER_SESSION
     assert len(one.answers["elsewhere"]) == 6 and [n for _, n in one.answers["rendered"]] == [5, 5]
@@ -85,11 +85,11 @@ def test_a_cell_goes_from_the_scene_to_the_count(tmp_path, monkeypatch):
 
 def test_a_picture_made_elsewhere_takes_the_place_of_a_design(tmp_path, monkeypatch):
     Image.new("RGB", (48, 48), (220, 30, 30)).save(tmp_path / "red.png")
-    finished = small_study("promises", tmp_path, monkeypatch, 'pictures = {scene = ["red.png"]}\n')
+    finished = small_study("promises", tmp_path, monkeypatch, 1, 'pictures = {scene = ["red.png"]}\n')
     (only,) = finished.results
     assert only.cell.values["picture"] == "red.png" and len(only.answers["promised"]) == 8
-    (row, _) = next(table for table in finished.tables if table.name == "promises").rows
+    (row,) = next(table for table in finished.tables if table.name == "promises").rows
     assert row[4] == "red"
     (tmp_path / "b").mkdir()
     with pytest.raises(Refused, match='got "other": use one of: scene'):
-        small_study("promises", tmp_path / "b", monkeypatch, 'pictures = {other = ["red.png"]}\n')
+        small_study("promises", tmp_path / "b", monkeypatch, 1, 'pictures = {other = ["red.png"]}\n')

@@ -536,11 +536,21 @@ def test_a_file_s_steps_are_weighed_on_rectangles_too():
     torch.testing.assert_close(gradient(lambda x: laid(x, Windows(asked)), photos), gradient(places, photos))
 
 
-def test_gradients_need_no_compiler_of_torch_s(tmp_path):
-    """Given a gradient to begin with, torch imports SymPy, which takes each process of a run half a second."""
-    scene = toml(tmp_path / "scene.toml", target__models=["builtin"], target__label="carton")
+def test_files_and_gradients_need_no_compiler_of_torch_s(tmp_path):
+    """Torch imports it, and SymPy, for tensors without memory and for a gradient to begin with: two seconds of every
+    command. What loads a network of common operators has nothing from onnx either.
+    """
+    onnx_files = pytest.importorskip("onnx_files", reason='needs onnx, of the extra "test"')
+    body = "a = Sub(x, [0.5]) b = Conv(a, W, F) c = Clip(b, Zero, Two) y = ReduceMean<keepdims=0>(c, [2, 3])"
+    file = onnx_files.save(tmp_path, onnx_files.model(body))
+    scene = toml(tmp_path / "scene.toml", target__models=["builtin"], target__label="carton", camera__photo_px=[96, 96])
     code = f"""
 import sys
+from pathlib import Path
+from patchproof.classifier import load_classifier
+load_classifier("file:{file}", Path("."))
+unwanted = {{"torch._dynamo", "sympy", "onnx"}}
+assert not unwanted & sys.modules.keys(), "imported by a file"
 import numpy as np, torch
 import patchproof as pp
 from patchproof.networks import windows
@@ -554,6 +564,6 @@ network, photos = problem.classifiers[0].network, torch.rand(2, 3, 96, 96).requi
 network(photos, windows.Windows(np.array([[40, 40, 50, 50]] * 2))).sum().backward()
 assert network.cut and not photos.grad[..., 0].any()
 next(loop.steps(problem))
-assert not {{"torch._dynamo", "sympy"}} & sys.modules.keys(), "imported"
+assert not unwanted & sys.modules.keys(), "imported by a gradient"
 """
     subprocess.run([sys.executable, "-c", code], check=True)

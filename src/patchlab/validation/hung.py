@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from patchproof.optimizer.run import Run
 from patchproof.render.stage import Stage, set_stage
 from patchproof.reprints.hung_sheet import AS_MADE, HungSheet, sent_pixels
-from patchproof.reprints.run_sheet import sheet as sheet_of
+from patchproof.reprints.run_sheet import content_of
 from patchproof.sheets.content import PrintedPiece
-from patchproof.sheets.manifest import Manifest
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
 
 def hang_own(run: Run, control: str | None = None) -> HungSheet:
-    """The sheet that the run makes, or that of a printed control (as `sheet_of` has them)."""
-    return _printed_and_hung(set_stage(run.scene), lambda pdf: sheet_of(run, pdf, control=control))
+    """The sheet that the run makes, or that of a printed control, without the page that says how to photograph it."""
+    return hang_piece(set_stage(run.scene), content_of(run, None, control)[0])
 
 
 def hang_piece(stage: Stage, content: PrintedPiece) -> HungSheet:
     """A sheet of the stage's scene with any content in its piece."""
     template = load_template(stage.scene.settings.sheet.template)
-    return _printed_and_hung(stage, lambda pdf: write_sheet(pdf, template, content))
-
-
-def _printed_and_hung(stage: Stage, write: Callable[[Path], Manifest]) -> HungSheet:
     with TemporaryDirectory() as folder:
         pdf = Path(folder) / "sheet.pdf"
-        manifest = write(pdf)
+        manifest = write_sheet(pdf, template, content)
         sent = sent_pixels(pdf, manifest, stage.scene)
     return HungSheet(stage, manifest, sent, AS_MADE.printer_for(stage.scene))
