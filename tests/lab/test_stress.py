@@ -116,8 +116,8 @@ def test_a_map_shows_where_light_fails(tmp_path):
     light = {"ambient": [0.0, 1.2], "directional": [0, 0]}
     problem = problem_with(tmp_path, target=BRIGHT, light=light, camera={"exposure_ev": [0, 0]}, **dark)
     both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=2, light_cells=3))
-    hits, confidence, alone = map_of(problem, both, problem.scene.draw("select", 8))
-    assert hits.shape == confidence.shape == alone.shape == (2, 3, 8) and not alone.any()
+    hits, confidence, alone = map_of(problem, both, problem.scene.draw("select", 4))
+    assert hits.shape == confidence.shape == alone.shape == (2, 3, 4) and not alone.any()
     assert not hits[:, 0].any() and (confidence.mean((0, 2))[1:] > confidence.mean((0, 2))[:-1]).all()
     assert worst_cells(hits, confidence)[0][1] == 0
 
@@ -130,7 +130,7 @@ def test_cells_where_the_object_is_recognized_no_more_often_than_its_background_
     for color in (0, 1):
         problem = problem_with(tmp_path, target=BRIGHT, light=light, background={"color": [color] * 3}, **look)
         both = axes_of(problem.scene.settings, MapSettings(light="ambient", pose_cells=1, light_cells=8))
-        hits, _, alone = map_of(problem, both, problem.scene.draw("select", 8))
+        hits, _, alone = map_of(problem, both, problem.scene.draw("select", 4))
         assert alone.all() == alone.any() == color
         map_ = {"hits": [[bits(cell) for cell in hits[0]]], "alone": [[bits(cell) for cell in alone[0]]]}
         empty[color] = _empty_cells(map_)

@@ -6,7 +6,6 @@ import pytest
 
 from patchlab.study.study import Cell, Result
 from patchlab.validation import forecasts
-from patchproof.reprints import retake
 from test_study_promises import small_study
 
 SETTINGS = forecasts.ForecastsSettings(scenes=("a",), networks=("builtin",))
@@ -45,7 +44,6 @@ def test_nothing_to_forecast_is_no_figure():
 
 
 def test_a_cell_goes_from_the_scene_to_forecasts_and_effects(tmp_path, monkeypatch):
-    monkeypatch.setattr(retake, "DRAWS", 2)
     (one,) = small_study("forecasts", tmp_path, monkeypatch, 2).results
     assert len(one.answers["sessions"]) == 2
     for session in one.answers["sessions"]:

@@ -47,7 +47,7 @@ def test_cells_are_trained_shown_and_photographed(tmp_path, monkeypatch, a_small
     (tmp_path / "scene.toml").write_text(
         '[object]\nmesh = "primitive:carton"\nlength_mm = 300\n[patch]\nwidth_mm = 120\nheight_mm = 120\n'
         '[target]\nlabel = "red"\nmodels = ["module:fake_networks.red_against_blue"]\n'
-        "[view]\nazimuth_deg = [-20, 20]\ndistance_mm = [400, 500]\n[camera]\nphoto_px = [720, 540]\n"
+        "[view]\nazimuth_deg = [-20, 20]\ndistance_mm = [400, 500]\n[camera]\nphoto_px = [480, 360]\n"
         "[optimize]\nsteps = 2\nviews = 2\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
     )
     config = tmp_path / "study.toml"

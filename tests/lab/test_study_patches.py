@@ -171,7 +171,7 @@ def two_classes(tmp_path, scene_file, more=""):
     (folder / "labels.csv").write_text("file,label\n0.png,mug\n1.png,mug\n2.png,2\n9.png,gone\n")
     config = tmp_path / "study.toml"
     config.write_text(
-        'images = "images"\nlabels = "images/labels.csv"\nrenders = ["scene.toml"]\nrenders_each = 20\n'
+        'images = "images"\nlabels = "images/labels.csv"\nrenders = ["scene.toml"]\nrenders_each = 8\n'
         'networks = ["builtin"]\nn = 8\nshown_px = 20\n' + more + "\n[optimize]\nsteps = 1\nviews = 2\n"
     )
     return config
@@ -182,7 +182,7 @@ def test_gain_and_harm_of_a_2d_patch(scene_file, short_loop, tmp_path):
     finished = run_study("patch2d", config, tmp_path / "out")
     assert not finished.failed
     pooled, gain, harm = finished.tables
-    assert gain.rows[0][:4] == ("carton (renders)", "builtin", 20, True) and gain.rows[0][4].n == 8
+    assert gain.rows[0][:4] == ("carton (renders)", "builtin", 8, True) and gain.rows[0][4].n == 8
     assert [row[2] for row in harm.rows] == ["mug", "traffic cone"]  # every other class, and the target is none of them
     called = finished.results[0].answers["classes"][2]
     assert called["same"] and all(own == target for own, target in called["hits"].values())

@@ -461,6 +461,7 @@ def test_nothing_is_sought_before_it_is_asked_for(monkeypatch):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_training_asks_in_windows_and_finds_the_same_design(tmp_path, monkeypatch, jobs):
+    monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
     torch.manual_seed(0)
     network = classifier_of(plain(), 192, ["red", *"bcde"])
     camera = {"camera__noise": [0.0, 0.0], "camera__blur_px": [0.0, 2.0], "view__distance_mm": [700, 900]}
