@@ -16,12 +16,13 @@ from typing import Any, Literal
 import numpy as np
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import by_scene, networks_at
+from patchlab.study.grid import by_scene
 from patchlab.study.record import hits_of
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.photographed import (
     SessionsSettings,
     cells,
+    judged,
     printed_run,
     recorded_promise,
     recorded_spread,
@@ -40,21 +41,20 @@ class ForecastsSettings(SessionsSettings):
 
 def run(settings: ForecastsSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Forecasts, estimates and what was photographed, by session."""
-    from patchproof.app.verify import verify as verify_photos
+    from patchproof.reprints.retake import retaker
+    from patchproof.sheets.manifest import load_manifest
 
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         made = printed_run(base, cell, folder)
         photos, controls = take_photos(settings, cell, made, folder), None
-        networks = networks_at(base, cell.values)
         if settings.control is not None:
             controls = take_photos(settings, cell, made, folder, settings.control)
-        sessions = []
+        forecast, sessions = retaker(made, load_manifest(folder / "sheet.json")), []
         for own in sorted(photos.iterdir()):
             if own.is_dir():
                 beside = None if controls is None else controls / own.name
-                out = folder / "reports" / own.name
-                report = verify_photos(own, folder / "sheet.json", out, models=networks, controls=beside, run=made)
+                report = judged(own, folder, base, cell, forecast, controls=beside)
                 sessions.append(_session(report, settings.control))
     return recorded_promise(made) | {"sessions": sessions}
 

@@ -1,12 +1,14 @@
 """What studies of promises share: a run for each combination, its sheet, and sessions of photographs of the print.
 
 In: scene files, networks, printers, seeds. Out: cells, and for one of them the design (optimized, or a picture that is
-imported), the page, the photographs; what answers keep of the promise. All by the commands that a user has.
+imported), the page, the photographs, their judgment; what answers keep of the promise. All as a user's commands do it,
+but that no report is written of what is judged.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,6 +32,8 @@ from patchproof.base.validation import expand
 from patchproof.optimizer.promise import PromiseOptions
 
 if TYPE_CHECKING:
+    from patchproof.evidence.reproject import Shot
+    from patchproof.evidence.results import Report
     from patchproof.optimizer.run import Run
 
 
@@ -85,6 +89,25 @@ def take_photos(settings: SessionsSettings, cell: Cell, made: Run, folder: Path,
     seed = zlib.crc32(cell.name.encode())
     reprint(folder / "sheet.pdf", made, n, out, how, sessions=settings.sessions, seed=seed)
     return out
+
+
+def judged(
+    photos: Path,
+    folder: Path,
+    base: Path,
+    cell: Cell,
+    forecast: Callable[[Shot], float | None] | None = None,
+    **options: Any,
+) -> Report:
+    """What `verify` finds in photographs of folder/sheet.pdf, without its files; `options` are some of `Options`."""
+    from patchproof.app.verify import options_of
+    from patchproof.evidence.run import gather_evidence
+    from patchproof.sheets.manifest import load_manifest
+
+    sheet, networks = folder / "sheet.json", networks_at(base, cell.values)
+    manifest = load_manifest(sheet)
+    given = replace(options_of(sheet, manifest, networks, None), **options)
+    return gather_evidence(photos, manifest, given, forecast=forecast)
 
 
 def recorded_promise(made: Run) -> dict[str, Any]:

@@ -24,12 +24,13 @@ import numpy as np
 from pydantic import Field
 
 from patchlab.study.claims import mean
-from patchlab.study.grid import Names, by_scene, networks_at, short_name
+from patchlab.study.grid import Names, by_scene, short_name
 from patchlab.study.record import bits, hits_of
 from patchlab.study.study import Cell, Result, Study
 from patchlab.validation.photographed import (
     SessionsSettings,
     cells,
+    judged,
     printed_run,
     recorded_promise,
     recorded_spread,
@@ -79,13 +80,10 @@ def promise_cells(settings: PromisesSettings, base: Path) -> list[Cell]:
 
 def run(settings: PromisesSettings, base: Path, cell: Cell) -> dict[str, Any]:
     """Promise and count of one combination."""
-    from patchproof.app.verify import verify as verify_photos
-
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         made = printed_run(base, cell, folder)
-        photos, networks = take_photos(settings, cell, made, folder), networks_at(base, cell.values)
-        report = verify_photos(photos, folder / "sheet.json", folder / "report", models=networks)
+        report = judged(take_photos(settings, cell, made, folder), folder, base, cell, ledger_photos=0)
     sessions = [(session.recognized, session.judged) for session in report.summary.sessions]
     kept = recorded_promise(made) | {"sessions": sessions, "verdict": report.summary.verdict}
     return kept | _without_paper(settings, made)
