@@ -57,16 +57,18 @@ def test_missing_weights_are_refused(tmp_path):
         load_builtin(folder=tmp_path)
 
 
-def test_pictures_are_repeatable_and_follow_the_seed(monkeypatch):
+def test_pictures_are_repeatable_and_follow_the_seed(fresh, monkeypatch):
+    images, labels, boxes = fresh
+    assert images.dtype == torch.uint8 and images.shape == (48, 3, 96, 96)
+    assert torch.equal(labels.bincount(), torch.full((12,), 4))
+    assert boxes.shape == (48, 4) and bool((boxes[:, 2:] > boxes[:, :2]).all())
+    assert (images.float().std((1, 2, 3)) > 1).all()  # none is blank
+    names = primitives.names()[:3]
+    monkeypatch.setattr(primitives, "names", lambda: names)
     monkeypatch.setattr(rendered, "VIEWS_PER_SHAPE", 1)
-    first, labels, boxes = pictures(1, 3, INPUT_PX)
-    again, other = pictures(1, 3, INPUT_PX).images, pictures(1, 4, INPUT_PX).images
-    assert first.dtype == torch.uint8 and first.shape == (12, 3, 96, 96)
-    assert torch.equal(labels.bincount(), torch.full((12,), 1))
-    assert boxes.shape == (12, 4) and bool((boxes[:, 2:] > boxes[:, :2]).all())
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-    assert (first.float().std((1, 2, 3)) > 1).all()  # none is blank
+    first, again, other = (pictures(1, seed, INPUT_PX).images for seed in (3, 3, 4))
+    assert len(first) == 3 and torch.equal(first, again)
+    assert not any(torch.equal(one, another) for one, another in zip(first, other, strict=True))
 
 
 def test_augmenting_keeps_the_range_and_pastes_as_often_as_said():

@@ -276,14 +276,14 @@ def test_detectors_carry_a_run_from_scene_to_verdict(tmp_path, two_stage, monkey
     assert [(claim.name, claim.least_score) for claim in run.promise.models] == [(name, 0.4) for name in names]
     assert 3 < len(run.promise.outermost_mm) <= MOST_POINTS
     pp.sheet(run, tmp_path / "sheet.pdf")
-    pp.reprint(tmp_path / "sheet.pdf", run, 3, tmp_path / "photos")
+    pp.reprint(tmp_path / "sheet.pdf", run, 2, tmp_path / "photos")
     evaluated = pp.evaluate(run.folder, n=2).models
     report = pp.verify(
         tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "report", run=run, models=names, ledger_photos=1
     )
     said = "recognized is what it finds in a box of score 0.4 or more that overlaps the object&#39;s own by half"
     assert said in (tmp_path / "report" / "report.html").read_text("utf-8")
-    truth = scene.boxes(scene.draw("reprint", 3))
+    truth = scene.boxes(scene.draw("reprint", 2))
     for name in names:
         found = evaluated[name].ap50
         assert set(found) >= {"design", "bare"} and 0 <= found["design"] <= 1

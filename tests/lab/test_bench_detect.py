@@ -16,8 +16,8 @@ def test_fitted_borders_beat_plain_corners_on_known_photographs():
 
 
 def test_the_chart_has_a_series_per_size_and_one_default_each(monkeypatch):
-    monkeypatch.setattr(detect, "SIZES_PX", ((800, 600),))
-    monkeypatch.setattr(detect, "COARSEST", (500, 1000))
+    monkeypatch.setattr(detect, "SIZES_PX", ((640, 480),))
+    monkeypatch.setattr(detect, "COARSEST", (400, 1000))
     (chart,) = detect.charts(True, lambda *stage: None)
     (points,) = chart.series.values()
     assert [p.default for p in points] == [False, False, True, False] and len(chart.checks) == 2

@@ -60,7 +60,7 @@ def small_study(study, tmp_path, monkeypatch, sessions, more=""):
     monkeypatch.setattr(run, "PROMISE_VIEWS", 8)
     monkeypatch.setattr(loop, "SELECT_VIEWS", 4)
     monkeypatch.setattr(retake, "DRAWS", 2)
-    data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [560, 420]}}
+    data = {key: dict(value) for key, value in SCENE.items()} | {"camera": {"photo_px": [440, 330]}}
     data |= {"background": {"color": [0.5, 0.5, 0.5]}, "optimize": data["optimize"] | {"steps": 2, "views": 2}}
     lines = [
         line

@@ -52,7 +52,7 @@ def table(finished, name):
 
 
 def test_a_design_helps_the_network_that_agrees_and_harms_the_one_that_reads_the_opposite(tmp_path):
-    config = written(tmp_path, config=f'networks = ["{RED}", "{BLUE}"]\nn = 12\nlights = 2\n')
+    config = written(tmp_path, config=f'networks = ["{RED}", "{BLUE}"]\nn = 6\nlights = 2\n')
     finished = run_study("transfer", config, tmp_path / "out")
     assert not finished.failed
     rows = {
@@ -152,17 +152,17 @@ def test_every_network_is_in_one_family():
 
 def test_a_study_finds_what_optimize_and_evaluate_find_and_no_gain_of_a_design_that_did_not_move(tmp_path):
     ways = '[ways.as_is]\n[ways.still]\noptimize = {optimizer = "sign", step_size = 1e-6}\n'
-    config = written(tmp_path, "carton", f'networks = ["builtin"]\nn = 8\nlights = 1\nseeds = [3]\n{ways}')
+    config = written(tmp_path, "carton", f'networks = ["builtin"]\nn = 4\nlights = 1\nseeds = [3]\n{ways}')
     finished = run_study("transfer", config, tmp_path / "out")
     original, design, before, still = table(finished, "matrix")
     assert still["way"] == "still" and still["gain in rate"].value == 0 and still["shows"] == "none shown"
-    assert still["gain in confidence"] == Estimate(0, 0, 0, 8)
+    assert still["gain in confidence"] == Estimate(0, 0, 0, 4)
     assert original["confidence"] == before["confidence"] == still["confidence"]
     names = {path.name for path in (tmp_path / "out").rglob("*.*")}
     assert {"texture.still.builtin.3.glb", "transfer_heat_texture_still.png", "transfer.html"} <= names
 
     optimize_scene(tmp_path / "texture.toml", tmp_path / "run", seed=3)
-    found = evaluate(tmp_path / "run", n=8).models["builtin"]
+    found = evaluate(tmp_path / "run", n=4).models["builtin"]
     assert design["rate"].value == found.rate and original["rate"].value == found.controls["bare"].rate
     # cells keep five digits
     assert design["confidence"].value == pytest.approx(found.confidence, abs=1e-5)
@@ -173,7 +173,7 @@ def test_a_study_finds_what_optimize_and_evaluate_find_and_no_gain_of_a_design_t
 
 
 def test_deceptive_textures_stand_beside_controls(tmp_path):
-    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 8\n')
+    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 4\n')
     finished = run_study("deceive", config, tmp_path / "out")
     rates, minus = table(finished, "rates"), table(finished, "differences")
     assert [row["way"] for row in rates] == ["free", "within_8"]
@@ -188,7 +188,7 @@ def test_deceptive_textures_stand_beside_controls(tmp_path):
 
 
 def test_each_class_asks_for_its_own_color(tmp_path):
-    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 8\nclasses = ["red", "blue"]\n')
+    config = written(tmp_path, config=f'networks = ["{RED}"]\nn = 4\nclasses = ["red", "blue"]\n')
     finished = run_study("robust", config, tmp_path / "out")
     assert not finished.failed
     red, blue = table(finished, "colors")

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +10,19 @@ import pytest
 import torch
 from small_networks import LABELS, ConvNeXt, ResNet, ViT, seeded
 
-import patchproof as pp
+from patchproof.app.verify import options_of
 from patchproof.base.errors import Refused
 from patchproof.classifier import load_classifier
 from patchproof.classifier.builtin import load_builtin
 from patchproof.classifier.custom import classifier_of
 from patchproof.classifier.network_file import EXPORT, load_network
+from patchproof.evidence.run import gather_evidence
 from patchproof.networks import windows
 from patchproof.networks.batches import fastest
 from patchproof.networks.onnx_file import read_onnx
 from patchproof.networks.onnx_operators import OPERATORS, Operator
 from patchproof.networks.windows import Windows
+from patchproof.sheets.manifest import load_manifest
 from test_zoo import judged
 
 pytest.importorskip("onnx", reason='needs onnx, of the extra "test"')
@@ -134,8 +137,10 @@ def test_a_file_goes_from_a_scene_to_a_verdict(tmp_path):
     (tmp_path / "b.json").write_text(json.dumps({"input_px": 96, "labels": list(builtin.labels)}))
     run, report = judged(tmp_path, "file:b.onnx", "carton")
     assert run.promise.models[0].name == "file:b.onnx"
-    judge = {"models": ["builtin"], "ledger_photos": 0}
-    again = pp.verify(tmp_path / "photos", tmp_path / "sheet.json", tmp_path / "again", **judge)
+    sheet = tmp_path / "sheet.json"
+    manifest = load_manifest(sheet)
+    options = replace(options_of(sheet, manifest, ["builtin"]), ledger_photos=0)
+    again = gather_evidence(tmp_path / "photos", manifest, options)
     pairs = [(a.predictions, b.predictions) for a, b in zip(report.photos, again.photos, strict=True) if a.predictions]
     assert pairs
     for ours, theirs in pairs:
