@@ -289,27 +289,26 @@ def test_each_term_of_the_camera_shows_and_lets_gradients_pass(tmp_path, line):
 def test_a_lens_puts_the_markers_where_opencv_says(tmp_path, k1):
     """The shipped phone and two strong lenses; the piece towards a corner, where they bend."""
     if k1 is None:
-        change = ("photo_px = [800, 600]", 'photo_px = [1200, 900]\nfile = "phone"')
+        change = ("photo_px = [800, 600]", 'photo_px = [800, 600]\nfile = "phone"')
     else:
         change = camera_file(tmp_path, k1=k1, k2=0.02, p1=0.002)
-        change = (change[0], change[1].replace("[800, 600]", "[1200, 900]"))
     scene = box_scene(tmp_path, change)
     conditions = posed(scene, look_at_offset=[[0.35, 0.3, 0]], blur_px=0, noise=0, distance_mm=650)
-    picture = photograph(set_stage(scene), piece_of(scene, 328), conditions, (1200, 900), jpeg=False)
+    picture = photograph(set_stage(scene), piece_of(scene, 328), conditions, (800, 600), jpeg=False)
     pixels = np.ascontiguousarray((picture[0].permute(1, 2, 0) * 255).round().byte().numpy())
     found = find_markers(pixels, {marker.id for marker in scene.piece.markers}).corners_px
-    camera, matrix = scene.camera, scene.matrix_px((1200, 900))
+    camera, matrix = scene.camera, scene.matrix_px((800, 600))
     distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
-    homography, moved = scene.piece_homographies(conditions, (1200, 900))[0], 0.0
+    homography, moved = scene.piece_homographies(conditions, (800, 600))[0], 0.0
     assert len(found) == len(scene.piece.markers)
     for marker in scene.piece.markers:
         straight = geometry.apply_homography(homography, np.array(marker.corners_mm))
         unit = np.linalg.solve(matrix, np.concatenate([straight, np.ones((4, 1))], 1).T).T
         expected = cv2.projectPoints(unit, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
-        np.testing.assert_allclose(camera.distort_points(straight, (1200, 900)), expected, atol=1e-3)
+        np.testing.assert_allclose(camera.distort_points(straight, (800, 600)), expected, atol=1e-3)
         np.testing.assert_allclose(found[marker.id], expected, atol=0.35)
         moved = max(moved, np.abs(expected - straight).max())
-    assert moved > (0.75 if k1 is None else 6)
+    assert moved > (0.5 if k1 is None else 4)
 
 
 def test_a_camera_inside_the_object_is_refused_in_one_sentence(tmp_path):
