@@ -40,7 +40,7 @@ def noise(width: int, height: int) -> np.ndarray:
 
 
 def slopes(width: int, height: int) -> np.ndarray:
-    """A picture without edges, in which a detector of markers has little to look at; no pixel is its neighbors' mean."""
+    """A picture without edges, in which a detector of markers has little to look at, and with a little grain."""
     y, x = np.mgrid[:height, :width]
     smooth = np.stack([250 * x // width, 250 * y // height, 250 * (x + y) // (width + height)], 2)
     return (smooth + RNG.integers(0, 4, smooth.shape)).astype(np.uint8)
