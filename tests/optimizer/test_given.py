@@ -31,7 +31,7 @@ from patchproof.sheets.raster import attached_manifest
 from test_optimize import scene_with, toml
 
 RNG = np.random.default_rng(0)
-SMALL = {"camera__photo_px": [96, 96], "background__color": [0.5, 0.5, 0.5]}
+SMALL = {"camera__photo_px": [96, 96]}
 DRAFT = {"promise": PromiseOptions(views=8, controls=("bare",))}
 
 

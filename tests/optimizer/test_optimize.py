@@ -40,6 +40,7 @@ SCENE = {
     "patch": {"side": "+z", "width_mm": 115, "height_mm": 115},
     "target": {"label": "red", "models": ["module:fake_networks.red_against_blue"]},
     "view": {"azimuth_deg": [-30, 30], "elevation_deg": [0, 20], "distance_mm": [400, 500], "look_at_jitter": 0},
+    "background": {"color": [0.5, 0.5, 0.5]},
     "camera": {"photo_px": [1600, 1200]},
     "optimize": {"steps": 12, "views": 4, "gamut": 0.0},
 }
@@ -59,7 +60,6 @@ def toml(path, **changes):
     data = {key: dict(value) for key, value in SCENE.items()}
     data["camera"] = {"photo_px": [96, 96]}
     data["optimize"] |= {"steps": 4, "views": 2}
-    data["background"] = {"color": [0.5, 0.5, 0.5]}
     for key, value in changes.items():
         table, name = key.split("__")
         data.setdefault(table, {})[name] = value
@@ -129,7 +129,6 @@ def test_assist_turns_the_patch_red_and_deceive_blue(tmp_path, optimizer, monkey
             "optimize__optimizer": optimizer,
             "optimize__step_size": 0.05,
             "optimize__views": 2,
-            "background__color": [0.5, 0.5, 0.5],
         }  # far, in twelve steps
         state = last(set_problem(scene_with(tmp_path, target__goal=goal, **optimize))).state
         color = state.best.mean((1, 2))
@@ -221,7 +220,7 @@ def test_variation_and_gamut_terms_do_what_they_say(tmp_path, few_views):
     """From noise in strong colors: the one smooths it, the other draws it towards what can be printed."""
 
     def after(**weights):
-        few = {"optimize__steps": 16, "optimize__views": 1, "background__color": [0.5, 0.5, 0.5]}
+        few = {"optimize__steps": 16, "optimize__views": 1}
         problem = set_problem(scene_with(tmp_path, optimize__step_size=0.05, **few, **weights))
         noise = torch.rand(start(problem).design.shape, generator=torch.Generator().manual_seed(0)).round()
         return problem, list(steps(problem, replace(start(problem), design=noise)))[-1].state.design
