@@ -57,7 +57,7 @@ def journey(tmp_path_factory):
     """A folder with picture.png, scene.toml, run/, sheet.pdf, sheet.json, photos/ and report/."""
     folder = tmp_path_factory.mktemp("given")
     Image.fromarray(noise(230, 230)).save(folder / "picture.png")  # 2 px per mm: as fine as designs are printed
-    toml(folder / "scene.toml", camera__photo_px=[1200, 900])
+    toml(folder / "scene.toml", camera__photo_px=[800, 600])
     run, pdf, photos = folder / "run", folder / "sheet.pdf", folder / "photos"
     assert command("import", folder / "picture.png", folder / "scene.toml", "--out", run, "--promise", 8) == 0
     assert command("sheet", run, "--out", pdf) == 0

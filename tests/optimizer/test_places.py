@@ -196,10 +196,6 @@ def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
 
 
-def test_the_same_scene_gives_the_same_place(a_small_search):
-    assert choose_place(open_scene()) == choose_place(open_scene())
-
-
 def test_a_single_place_needs_no_runner_up(monkeypatch, a_small_search):
     monkeypatch.setattr(places, "PLACES", 1)
     place = choose_place(open_scene(patch__search={"upright": True}))
