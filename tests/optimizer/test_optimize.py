@@ -44,6 +44,7 @@ SCENE = {
     "camera": {"photo_px": [1600, 1200]},
     "optimize": {"steps": 12, "views": 4, "gamut": 0.0},
 }
+BESIDE_BARE = PromiseOptions(controls=("bare",))  # where controls are not the point
 
 
 def scene_with(tmp_path, **changes):
@@ -281,7 +282,7 @@ def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml", optimize__steps=2)
     for out, seed in (("a", 0), ("b", 0), ("c", 1)):
-        optimize_scene(scene, tmp_path / out, seed=seed, controls=CONTROLS if seed == 0 else ("bare",))
+        optimize_scene(scene, tmp_path / out, seed=seed, promise=PromiseOptions() if seed == 0 else BESIDE_BARE)
     assert same_files(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "a" / "run.json").read_bytes() == (tmp_path / "b" / "run.json").read_bytes()
     assert not same_files(tmp_path / "a", tmp_path / "c", ("design.png",))
@@ -302,7 +303,7 @@ def test_a_design_that_never_moved_is_said_to_be_none(tmp_path, few_views, model
     scene = toml(tmp_path / "scene.toml", **changes)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        promise = optimize_scene(scene, tmp_path / "run", controls=("gray",)).promise
+        promise = optimize_scene(scene, tmp_path / "run", promise=PromiseOptions(controls=("gray",))).promise
     told = [str(one.message) for one in caught if "began as" in str(one.message)]
     assert told == [] if says is None else says in told[0]
     low, high = promise.controls["gray"].difference_interval
@@ -344,7 +345,7 @@ class Killed(Exception):
 def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, few_views):
     """Saved after 2 and 4 steps, tried on the selection set after 4 alone."""
     scene = toml(tmp_path / "scene.toml", optimize__steps=6)
-    optimize_scene(scene, tmp_path / "whole", controls=("bare",))
+    optimize_scene(scene, tmp_path / "whole", promise=BESIDE_BARE)
     for last, after in ((5, 4), (3, 2)):
         out, made = tmp_path / str(last), list[tuple]()
 
@@ -353,10 +354,10 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
                 raise Killed
 
         with pytest.raises(Killed):
-            optimize_scene(scene, out, controls=("bare",), progress=kill)
+            optimize_scene(scene, out, promise=BESIDE_BARE, progress=kill)
         with pytest.raises(Refused, match="an unfinished one"):
             load_run(out)
-        options = {"controls": ("bare",), "resume": True}
+        options = {"promise": BESIDE_BARE, "resume": True}
         resumed = optimize_scene(scene, out, **options, progress=lambda *report, m=made: m.append(report))
         assert [done for stage, done, _ in made if stage == "optimize"] == [*range(after + 1, 7)]
         assert same_files(tmp_path / "whole", out)
@@ -375,7 +376,7 @@ def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_se
     with threads(1):
         for jobs, kept_px in ((2, training_views.CACHE_PX), (1, 0)):
             monkeypatch.setattr(training_views, "CACHE_PX", kept_px)
-            optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs), controls=("bare",))
+            optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs), promise=BESIDE_BARE)
     assert same_files(tmp_path / "1", tmp_path / "2", files)
 
 
@@ -482,7 +483,10 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
 
 
 def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path, few_views):
-    scene, options = toml(tmp_path / "scene.toml", optimize__steps=2), {"controls": ("bare",), "promise_views": 8}
+    scene, options = (
+        toml(tmp_path / "scene.toml", optimize__steps=2),
+        {"promise": PromiseOptions(views=8, controls=("bare",))},
+    )
     optimize_scene(scene, tmp_path / "run", **options)
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     with pytest.raises(Refused, match="--overwrite"):
