@@ -35,7 +35,7 @@ def pytest_collection_modifyitems(items):
 def one_core():
     """What takes all free cores where nothing is said takes one: the others have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.base.workers.free_cores", lambda: 1)
+        patch.setattr("patchproof.app.cli.console.free_cores", lambda: 1)  # where the commands ask for it
         yield
 
 

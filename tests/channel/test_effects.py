@@ -112,6 +112,18 @@ def problem(tmp_path_factory):
     )
 
 
+@pytest.fixture(scope="module")
+def setup(problem):
+    return Setup(problem.stage, problem.subject.shown(problem.subject.start()), problem.scene.draw("select", 4))
+
+
+@pytest.fixture(scope="module")
+def whole(problem, setup):
+    """Operations and photographs with every effect; the first time, the scene's own textures are made."""
+    photographed(problem, setup.conditions, setup.shown)
+    return photographed(problem, setup.conditions, setup.shown)
+
+
 def test_plan_and_ablation_know_every_effect(problem):
     terms = {term.name: term for term in scene_terms(problem, problem.subject.start(), None)}
     assert {effect.name for effect in SWITCHED} <= set(terms)
@@ -123,9 +135,7 @@ def test_plan_and_ablation_know_every_effect(problem):
 
 
 @pytest.mark.parametrize("effect", SWITCHED, ids=lambda effect: effect.name)
-def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(problem, effect):
-    shown = problem.subject.shown(problem.subject.start())
-    setup = Setup(problem.stage, shown, problem.scene.draw("select", 4))
+def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(problem, setup, whole, effect):
     (term,) = (t for t in scene_terms(problem, problem.subject.start(), None) if t.name == effect.name)
     less = term.change(setup)
     assert less is not None, f"give {term.key} a range in the problem of these tests"
@@ -135,11 +145,8 @@ def test_an_effect_that_is_switched_off_is_off_and_the_rest_of_its_table_stays(p
     # light that is left out is made up for by other light
     others = {"ambient", "directional"} if effect.instead else set()
     assert effect.fields[0] in moved <= {effect.fields[0]} | others
-    views = (setup.conditions, setup.conditions, less.conditions)  # the first time, the scene's own textures are made
-    (_, count, less_count), (whole, _, plain) = zip(
-        *(photographed(problem, part, shown) for part in views), strict=True
-    )
-    assert (less_count < count) == (effect.name in SLOWS) and not torch.equal(whole, plain)
+    less_count, plain = photographed(problem, less.conditions, setup.shown)
+    assert (less_count < whole[0]) == (effect.name in SLOWS) and not torch.equal(whole[1], plain)
 
 
 def photographed(problem, conditions, shown) -> tuple[int, torch.Tensor]:

@@ -40,9 +40,11 @@ SCENE = {
     "patch": {"side": "+z", "width_mm": 115, "height_mm": 115},
     "target": {"label": "red", "models": ["module:fake_networks.red_against_blue"]},
     "view": {"azimuth_deg": [-30, 30], "elevation_deg": [0, 20], "distance_mm": [400, 500], "look_at_jitter": 0},
+    "background": {"color": [0.5, 0.5, 0.5]},
     "camera": {"photo_px": [1600, 1200]},
     "optimize": {"steps": 12, "views": 4, "gamut": 0.0},
 }
+BESIDE_BARE = PromiseOptions(controls=("bare",))  # where controls are not the point
 
 
 def scene_with(tmp_path, **changes):
@@ -59,7 +61,6 @@ def toml(path, **changes):
     data = {key: dict(value) for key, value in SCENE.items()}
     data["camera"] = {"photo_px": [96, 96]}
     data["optimize"] |= {"steps": 4, "views": 2}
-    data["background"] = {"color": [0.5, 0.5, 0.5]}
     for key, value in changes.items():
         table, name = key.split("__")
         data.setdefault(table, {})[name] = value
@@ -220,7 +221,7 @@ def test_variation_and_gamut_terms_do_what_they_say(tmp_path, few_views):
     """From noise in strong colors: the one smooths it, the other draws it towards what can be printed."""
 
     def after(**weights):
-        few = {"optimize__steps": 24, "optimize__views": 1}
+        few = {"optimize__steps": 16, "optimize__views": 1}
         problem = set_problem(scene_with(tmp_path, optimize__step_size=0.05, **few, **weights))
         noise = torch.rand(start(problem).design.shape, generator=torch.Generator().manual_seed(0)).round()
         return problem, list(steps(problem, replace(start(problem), design=noise)))[-1].state.design
@@ -281,7 +282,7 @@ def same_files(a, b, names=("design.png", "steps.jsonl", "checkpoint.safetensors
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path, few_views):
     scene = toml(tmp_path / "scene.toml", optimize__steps=2)
     for out, seed in (("a", 0), ("b", 0), ("c", 1)):
-        optimize_scene(scene, tmp_path / out, seed=seed)
+        optimize_scene(scene, tmp_path / out, seed=seed, promise=PromiseOptions() if seed == 0 else BESIDE_BARE)
     assert same_files(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "a" / "run.json").read_bytes() == (tmp_path / "b" / "run.json").read_bytes()
     assert not same_files(tmp_path / "a", tmp_path / "c", ("design.png",))
@@ -302,7 +303,7 @@ def test_a_design_that_never_moved_is_said_to_be_none(tmp_path, few_views, model
     scene = toml(tmp_path / "scene.toml", **changes)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        promise = optimize_scene(scene, tmp_path / "run").promise
+        promise = optimize_scene(scene, tmp_path / "run", promise=PromiseOptions(controls=("gray",))).promise
     told = [str(one.message) for one in caught if "began as" in str(one.message)]
     assert told == [] if says is None else says in told[0]
     low, high = promise.controls["gray"].difference_interval
@@ -344,7 +345,7 @@ class Killed(Exception):
 def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, few_views):
     """Saved after 2 and 4 steps, tried on the selection set after 4 alone."""
     scene = toml(tmp_path / "scene.toml", optimize__steps=6)
-    optimize_scene(scene, tmp_path / "whole")
+    optimize_scene(scene, tmp_path / "whole", promise=BESIDE_BARE)
     for last, after in ((5, 4), (3, 2)):
         out, made = tmp_path / str(last), list[tuple]()
 
@@ -353,10 +354,11 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
                 raise Killed
 
         with pytest.raises(Killed):
-            optimize_scene(scene, out, progress=kill)
+            optimize_scene(scene, out, promise=BESIDE_BARE, progress=kill)
         with pytest.raises(Refused, match="an unfinished one"):
             load_run(out)
-        resumed = optimize_scene(scene, out, resume=True, progress=lambda *report, m=made: m.append(report))
+        options = {"promise": BESIDE_BARE, "resume": True}
+        resumed = optimize_scene(scene, out, **options, progress=lambda *report, m=made: m.append(report))
         assert [done for stage, done, _ in made if stage == "optimize"] == [*range(after + 1, 7)]
         assert same_files(tmp_path / "whole", out)
         assert len((out / "steps.jsonl").read_text().splitlines()) == 6
@@ -365,17 +367,17 @@ def test_a_run_killed_and_resumed_gives_the_bytes_of_one_that_was_not(tmp_path, 
 
 @pytest.mark.skipif(not can_fork(), reason="processes are forked on Linux without a GPU")
 def test_the_number_of_processes_changes_no_byte(tmp_path, few_views, a_small_search, monkeypatch):
-    """A step of 5 views, the selection, promise and controls, and the search for a place among three; nor does it what
+    """Steps of 5 views, the selection, promise and controls, and the search for a place among three; nor does it what
     of the five poses a process keeps.
     """
     monkeypatch.setattr(training_views, "MIN_POSES", 5)
-    scene = toml(tmp_path / "scene.toml", optimize__steps=3, optimize__views=5, patch__place="auto")
+    scene = toml(tmp_path / "scene.toml", optimize__steps=2, optimize__views=5, patch__place="auto")
     files = ("design.png", "steps.jsonl", "views.png", "place.json", "run.json")
     with threads(1):
-        for jobs, kept_px in ((3, training_views.CACHE_PX), (1, 0)):
+        for jobs, kept_px in ((2, training_views.CACHE_PX), (1, 0)):
             monkeypatch.setattr(training_views, "CACHE_PX", kept_px)
-            optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs))
-    assert same_files(tmp_path / "1", tmp_path / "3", files)
+            optimize_scene(scene, tmp_path / str(jobs), compute=Compute(jobs=jobs), promise=BESIDE_BARE)
+    assert same_files(tmp_path / "1", tmp_path / "2", files)
 
 
 def test_poses_come_round_with_other_backgrounds_light_print_and_camera(tmp_path, monkeypatch):
@@ -481,8 +483,11 @@ def test_a_draft_gets_the_promise_that_it_would_have_had(tmp_path, few_views):
 
 
 def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path, few_views):
-    scene = toml(tmp_path / "scene.toml")
-    optimize_scene(scene, tmp_path / "run")
+    scene, options = (
+        toml(tmp_path / "scene.toml", optimize__steps=2),
+        {"promise": PromiseOptions(views=8, controls=("bare",))},
+    )
+    optimize_scene(scene, tmp_path / "run", **options)
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     with pytest.raises(Refused, match="--overwrite"):
         optimize_scene(scene, tmp_path / "run")
@@ -492,7 +497,7 @@ def test_runs_are_not_overwritten_unasked_nor_resumed_with_another_seed(tmp_path
     with pytest.raises(Refused, match="no such label"):
         optimize_scene(broken, tmp_path / "run", overwrite=True)
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    optimize_scene(scene, tmp_path / "run", overwrite=True)
+    optimize_scene(scene, tmp_path / "run", overwrite=True, **options)
     (tmp_path / "run" / "thesis.txt").write_text("mine")
     with pytest.raises(Refused, match=r"thesis\.txt"):
         optimize_scene(scene, tmp_path / "run", overwrite=True)

@@ -133,7 +133,8 @@ def covers(spots, mesh, faces):
     return bool((np.linalg.norm(np.array(over) - points[:, None], axis=2).min(1) < 1).any())
 
 
-def test_places_fit_are_apart_and_the_same_for_the_same_seed():
+def test_places_fit_are_apart_the_same_for_the_same_seed_and_no_farther_off_than_asked(monkeypatch):
+    monkeypatch.setattr("patchproof.scene.places._SAMPLES_APART", 1 / 8)
     ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
     scene = open_scene(mesh=ball, **small)
     spots = Ground(scene).spots(12)
@@ -146,11 +147,7 @@ def test_places_fit_are_apart_and_the_same_for_the_same_seed():
     assert [spot.at for spot in Ground(scene).spots(12)] == [spot.at for spot in spots]
     other = Ground(open_scene(mesh=ball, seed=1, **small)).spots(12)
     assert [spot.at for spot in other] != [spot.at for spot in spots]
-
-
-def test_a_gap_is_no_larger_than_asked():
-    ball, small = trimesh.creation.icosphere(3, 150), SHARP | {"patch__width_mm": 30, "patch__height_mm": 30}
-    least = min(spot.placement.gap_mm for spot in Ground(open_scene(mesh=ball, **small)).spots(12))
+    least = min(spot.placement.gap_mm for spot in spots)
     with pytest.raises(Refused, match=r"Expected a place for a piece of .* mm that views face, got none"):
         Ground(open_scene(mesh=ball, patch__search={"gap_mm": least / 2}, **small)).spots(12)
 
@@ -197,10 +194,6 @@ def test_the_search_counts_its_passes_and_keeps_to_a_quarter_of_a_run():
     drafts = places.DRAFTS * (18 * 2 * places.DRAFT_VIEWS + places.HELD_OUT_VIEWS) + places.HELD_OUT_VIEWS
     assert screens + drafts <= places.PASSES <= default_passes() / 4
     assert default_passes() == 240 * 4 * 2 + 4 * 64 + 200 + 4 * 100
-
-
-def test_the_same_scene_gives_the_same_place(a_small_search):
-    assert choose_place(open_scene()) == choose_place(open_scene())
 
 
 def test_a_single_place_needs_no_runner_up(monkeypatch, a_small_search):

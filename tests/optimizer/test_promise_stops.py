@@ -34,7 +34,7 @@ from test_verify_verdict import promise_of
 @pytest.fixture
 def promised(tmp_path):
     """Promises a blue design's rate on up to 40 views in sessions of four; counts are told to `told`."""
-    problem = set_problem(scene_with(tmp_path, target__label="blue", background__color=[0.5, 0.5, 0.5]))
+    problem = set_problem(scene_with(tmp_path, target__label="blue"))
     blue = np.zeros((*problem.subject.printed_px[::-1], 3), np.uint8)
     blue[..., 2] = 255
     conditions = problem.scene.draw("promise", 40, per_session=PER_SESSION)
@@ -83,8 +83,8 @@ def test_a_control_that_was_left_out_is_compared_where_both_were_shown():
 
 def test_a_scene_asks_for_a_half_width_and_a_number_of_views_for_all_of_them(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "PROMISE_VIEWS", 40)
-    gray = {"background__color": [0.5, 0.5, 0.5]}
-    scene = scene_with(tmp_path, optimize__steps=1, promise__half_width=0.3, **gray)
+    small = {"optimize__steps": 1, "optimize__views": 1}
+    scene = scene_with(tmp_path, promise__half_width=0.3, **small)
     assert SceneSettings.model_fields["promise"].default.half_width == 0.04
     whole = run.optimize(scene, tmp_path / "run", promise=PromiseOptions(controls=("bare",)))
     assert whole.promise.n == 20 and not whole.promise.draft

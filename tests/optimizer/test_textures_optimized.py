@@ -15,6 +15,7 @@ from patchproof.optimizer import loop, run
 from patchproof.optimizer.evaluate import evaluate as evaluate_run
 from patchproof.optimizer.pixels import from_pixels
 from patchproof.optimizer.problem import set_problem
+from patchproof.optimizer.promise import PromiseOptions
 from patchproof.optimizer.run import load_run
 from patchproof.optimizer.run import optimize as optimize_scene
 from patchproof.render.photograph import photograph
@@ -50,6 +51,7 @@ PATCHES = {
     "masked": 'kind = "masked"\nstart = "gray"\nmaterials = ["paint"]',
     "image": 'kind = "masked"\nmask = "half.png"',
 }
+BESIDE_BARE = PromiseOptions(controls=("bare",))  # where controls are not the point
 
 
 @pytest.fixture(autouse=True)
@@ -106,7 +108,7 @@ def read(folder, count=2):
 @pytest.mark.parametrize("kind", ["texture", "masked", "image"])
 def test_only_what_may_change_changes(tmp_path, kind):
     """To the bit outside the mask; within it by `epsilon` at most, in 8 bits."""
-    finished = optimize_scene(scene_file(tmp_path, kind), tmp_path / "run")
+    finished = optimize_scene(scene_file(tmp_path, kind), tmp_path / "run", promise=BESIDE_BARE)
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"object.glb", "texture_0.png", "texture_1.png", "mask.png", "run.json", "views.png"} <= names
     assert "design.png" not in names
@@ -194,10 +196,10 @@ def test_a_texture_run_killed_and_resumed_gives_the_same_bytes(tmp_path):
             raise Killed
 
     scene = scene_file(tmp_path, "masked")
-    optimize_scene(scene, tmp_path / "whole")
+    optimize_scene(scene, tmp_path / "whole", promise=BESIDE_BARE)
     with pytest.raises(Killed):
-        optimize_scene(scene, tmp_path / "cut", progress=kill)
-    optimize_scene(scene, tmp_path / "cut", resume=True)
+        optimize_scene(scene, tmp_path / "cut", promise=BESIDE_BARE, progress=kill)
+    optimize_scene(scene, tmp_path / "cut", promise=BESIDE_BARE, resume=True)
     files = sorted(path.name for path in (tmp_path / "whole").iterdir())
     assert files == sorted(path.name for path in (tmp_path / "cut").iterdir())
     for name in files:
@@ -206,7 +208,7 @@ def test_a_texture_run_killed_and_resumed_gives_the_same_bytes(tmp_path):
 
 def test_the_object_in_the_file_is_the_object_that_was_optimized(tmp_path):
     """object.glb read back and photographed bare, against the run's textures shown on the scene's own mesh."""
-    finished = optimize_scene(scene_file(tmp_path, "masked"), tmp_path / "run")
+    finished = optimize_scene(scene_file(tmp_path, "masked"), tmp_path / "run", promise=BESIDE_BARE)
     problem = set_problem(finished.scene)
     shown = problem.subject.shown(from_pixels(finished.design))
     scene = load_scene(scene_file(tmp_path, "texture", tmp_path / "run" / "object.glb"))
@@ -224,7 +226,7 @@ def test_a_mesh_of_colored_vertices_is_unwrapped_and_optimized(tmp_path):
     trimesh.Trimesh(box.vertices, box.faces, vertex_colors=colors, process=False).export(tmp_path / "colored.ply")
     path = scene_file(tmp_path, "texture", "colored.ply")
     path.write_text(path.read_text().replace("steps = 4", "steps = 1"))
-    finished = optimize_scene(path, tmp_path / "run")
+    finished = optimize_scene(path, tmp_path / "run", promise=BESIDE_BARE)
     assert any("unwrapped" in warning for warning in finished.scene.warnings)
     (texture,) = read(tmp_path / "run", 1)
     (mask,) = finished.scene.canvas.mask

@@ -47,13 +47,12 @@ def slow_twin(vertices, faces, views: Cameras):
             a, b, c = (snapped[k] for k in face)
             if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) < 0:
                 b, c = c, b
-            p, q, r = camera[face]
-            normal = np.cross(q - p, r - p)
             xs, ys = zip(a, b, c, strict=True)
             for y in range(max(0, min(ys) // 256), min(height, max(ys) // 256 + 1)):
                 for x in range(max(0, min(xs) // 256), min(width, max(xs) // 256 + 1)):
                     if all(inside(*edge, 256 * x + 128, 256 * y + 128) for edge in ((a, b), (b, c), (c, a))):
-                        ray = np.linalg.inv(matrix) @ [x + 0.5, y + 0.5, 1]
+                        p, q, r = camera[face]
+                        normal, ray = np.cross(q - p, r - p), np.linalg.inv(matrix) @ [x + 0.5, y + 0.5, 1]
                         z = np.float32(normal @ p / (normal @ ray))
                         if z < depth[n, y, x]:
                             depth[n, y, x], found[n, y, x] = z, index

@@ -116,14 +116,14 @@ def test_oblique_views_keep_detail_along_the_short_axis():
 
 def test_the_gradient_is_that_of_finite_differences_and_reaches_seen_texels_only():
     torch.manual_seed(0)
-    texture = torch.rand(12, 10, 3, dtype=torch.float64, requires_grad=True)
-    uv = torch.rand(30, 2) * torch.tensor([0.4, 0.4])
+    texture = torch.rand(8, 6, 3, dtype=torch.float64, requires_grad=True)
+    uv = torch.rand(20, 2) * torch.tensor([0.4, 0.4])
     dx, dy = torch.tensor([[0.11, 0.02]]), torch.tensor([[-0.03, 0.13]])
     assert torch.autograd.gradcheck(lambda t: look(t, uv, dx, dy), texture, atol=1e-7)
     sharp = look(texture, uv, torch.tensor([[0.01, 0]]), torch.tensor([[0.0, 0.01]])).sum()
     (gradient,) = torch.autograd.grad(sharp, texture)
     touched = gradient.abs().sum(-1) > 0
-    assert touched[:6, :5].any() and not touched[7:].any() and not touched[:, 7:].any()
+    assert touched[:4, :3].any() and not touched[5:].any() and not touched[:, 4:].any()
 
 
 def test_one_texel_and_large_textures():

@@ -80,9 +80,9 @@ def shares(seen, n, side):
 POSES = {"azimuth_deg": [0, 40, -55, 20], "elevation_deg": [0, 10, 0, 40], "roll_deg": [0, 25, -8, 45]}
 
 
-@pytest.mark.parametrize("pixels", [10, 24, 90, 300])
+@pytest.mark.parametrize("pixels", [10, 24, 90, 200])
 def test_the_shares_sum_up_to_the_projected_area(tmp_path, pixels):
-    """Pieces 10 to 300 px wide, turned by up to 55°; under 7 px, where the margin ends, within 2 %."""
+    """Pieces 10 to 200 px wide, turned by up to 55°; under 7 px, where the margin ends, within 2 %."""
     scene = box_scene(tmp_path)
     stage, conditions = set_stage(scene), posed(scene, 4, **POSES)
     focal = scene.matrix_px((1, 1))[0, 0]
@@ -264,7 +264,7 @@ def test_an_object_shown_with_its_own_textures_is_the_bare_object(tmp_path, mesh
     scene = scene_of(
         tmp_path, ("primitive:carton", mesh), ("width_mm = 90\nheight_mm = 90", "width_mm = 50\nheight_mm = 50")
     )
-    stage, conditions = set_stage(scene), scene.draw("promise", 2)
+    stage, conditions = set_stage(scene), scene.draw("promise", 1)
     for size in ((96, 96), (800, 600)):
         own = photograph(stage, ObjectTextures(stage.object.textures_srgb), conditions, size, jpeg=False)
         torch.testing.assert_close(own, photograph(stage, None, conditions, size, jpeg=False), atol=BY_TABLE, rtol=0)
@@ -289,27 +289,26 @@ def test_each_term_of_the_camera_shows_and_lets_gradients_pass(tmp_path, line):
 def test_a_lens_puts_the_markers_where_opencv_says(tmp_path, k1):
     """The shipped phone and two strong lenses; the piece towards a corner, where they bend."""
     if k1 is None:
-        change = ("photo_px = [800, 600]", 'photo_px = [1200, 900]\nfile = "phone"')
+        change = ("photo_px = [800, 600]", 'photo_px = [800, 600]\nfile = "phone"')
     else:
         change = camera_file(tmp_path, k1=k1, k2=0.02, p1=0.002)
-        change = (change[0], change[1].replace("[800, 600]", "[1200, 900]"))
     scene = box_scene(tmp_path, change)
     conditions = posed(scene, look_at_offset=[[0.35, 0.3, 0]], blur_px=0, noise=0, distance_mm=650)
-    picture = photograph(set_stage(scene), piece_of(scene, 328), conditions, (1200, 900), jpeg=False)
+    picture = photograph(set_stage(scene), piece_of(scene, 328), conditions, (800, 600), jpeg=False)
     pixels = np.ascontiguousarray((picture[0].permute(1, 2, 0) * 255).round().byte().numpy())
     found = find_markers(pixels, {marker.id for marker in scene.piece.markers}).corners_px
-    camera, matrix = scene.camera, scene.matrix_px((1200, 900))
+    camera, matrix = scene.camera, scene.matrix_px((800, 600))
     distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
-    homography, moved = scene.piece_homographies(conditions, (1200, 900))[0], 0.0
+    homography, moved = scene.piece_homographies(conditions, (800, 600))[0], 0.0
     assert len(found) == len(scene.piece.markers)
     for marker in scene.piece.markers:
         straight = geometry.apply_homography(homography, np.array(marker.corners_mm))
         unit = np.linalg.solve(matrix, np.concatenate([straight, np.ones((4, 1))], 1).T).T
         expected = cv2.projectPoints(unit, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
-        np.testing.assert_allclose(camera.distort_points(straight, (1200, 900)), expected, atol=1e-3)
+        np.testing.assert_allclose(camera.distort_points(straight, (800, 600)), expected, atol=1e-3)
         np.testing.assert_allclose(found[marker.id], expected, atol=0.35)
         moved = max(moved, np.abs(expected - straight).max())
-    assert moved > (0.75 if k1 is None else 6)
+    assert moved > (0.5 if k1 is None else 4)
 
 
 def test_a_camera_inside_the_object_is_refused_in_one_sentence(tmp_path):
@@ -464,7 +463,7 @@ def test_fixed_textures_are_held_once(tmp_path):
     scene = scene_of(tmp_path)
     stage = set_stage(scene)
     for shown in (piece_of(scene), None, ObjectTextures(stage.object.textures_srgb)):
-        for size in ((96, 96), (800, 600)):
+        for size in ((96, 96), (400, 300)):
             photograph(stage, shown, scene.draw("promise", 1), size)
     assert {fixed for _, fixed in stage.object._tables} == {True}
 

@@ -124,9 +124,13 @@ def test_promises_of_another_scene_meet_other_draws_and_evaluations_the_same():
         assert np.array_equal(*pair) == same
 
 
-def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
+@pytest.fixture(scope="module")
+def places():
+    return [module.place(number) for number in range(0, 12, 2)]
+
+
+def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch, places):
     """So that a place stays the same whatever shows in it: all that is random is drawn before a texture is made."""
-    places = [module.place(number) for number in range(0, 16, 2)]
 
     def at_once(rng, px):
         picture = patterns.drawn_texture(rng, px)()
@@ -141,8 +145,7 @@ def test_textures_that_nobody_sees_are_drawn_as_if_they_were_made(monkeypatch):
         assert np.array_equal(later(), later()) and rng.bit_generator.state == drawn
 
 
-def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch):
-    places = [module.place(number) for number in range(0, 16, 2)]
+def test_rays_that_pass_a_box_by_are_those_that_would_not_meet_it(monkeypatch, places):
     monkeypatch.setattr(module, "_passing", lambda aim, ends: np.arange(aim.shape[1]))
     assert all(np.array_equal(module.place(2 * i), place) for i, place in enumerate(places))
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from patchproof.base.color import linear_from_srgb, srgb_from_linear
+from patchproof.base.color import LIGHT_OF_CODE, srgb_from_linear
 from patchproof.base.errors import Refused
 from patchproof.base.geometry import apply_homography, intrinsics, look_at, plane_homography, rect_corners
 from patchproof.base.packaged import packaged_path
@@ -64,11 +65,21 @@ def homography(size_mm, azimuth, elevation, distance, roll) -> np.ndarray:
     return plane_homography(intrinsics(40, SIZE), look_at(eye, [20, -10, 0], roll), world_from_piece)
 
 
+@cache
+def _terms(rows: int, columns: int, *size_mm: float) -> np.ndarray:
+    """Those of the light at each pixel of the piece's raster, which all photographs share."""
+    mm = np.stack(np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows), -1) * size_mm
+    return quadratic_terms(mm.reshape(-1, 2), np.array(size_mm)).astype(np.float32)
+
+
+def save(pixels: np.ndarray, path) -> None:
+    Image.fromarray(pixels).save(path, compress_level=1)
+
+
 def photograph(raster, px_from_piece, size_mm, light, blur, seed) -> np.ndarray:
     """uint8 sRGB: the piece's reflectance in front of a striped wall, lit, blurred, noisy."""
     rows, columns = raster.shape[:2]
-    mm = np.stack(np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows), -1) * size_mm
-    lit = raster * (quadratic_terms(mm.reshape(-1, 2), size_mm) @ light.T).reshape(rows, columns, 3)
+    lit = raster * (_terms(rows, columns, *size_mm) @ light.T.astype(np.float32)).reshape(rows, columns, 3)
     size = (SIZE[0] * FINE, SIZE[1] * FINE)
     raster_from_piece = np.diag([columns / size_mm[0], rows / size_mm[1], 1.0])
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
@@ -88,12 +99,12 @@ def photograph(raster, px_from_piece, size_mm, light, blur, seed) -> np.ndarray:
 def world(tmp_path_factory) -> World:
     folder = tmp_path_factory.mktemp("photos")
     manifest = blank_sheet("blank_a4", folder / "BLANK.pdf")
-    raster = linear_from_srgb(piece_pixels(folder / "BLANK.pdf", manifest, DPI) / 255.0)
+    raster = LIGHT_OF_CODE.astype(np.float32)[piece_pixels(folder / "BLANK.pdf", manifest, DPI)]
     size_mm, truth = np.array(manifest.cut_mm[2:]), {}
     (folder / "photos").mkdir()
     for i, (*pose, blur, exposure) in enumerate(VIEWS):
         where, light = homography(size_mm, *pose), light_of(i, exposure)
-        Image.fromarray(photograph(raster, where, size_mm, light, blur, i)).save(folder / "photos" / f"{i}.png")
+        save(photograph(raster, where, size_mm, light, blur, i), folder / "photos" / f"{i}.png")
         truth[f"{i}.png"] = (where, light, blur)
     return World(folder, manifest, raster, truth)
 
@@ -226,7 +237,7 @@ def test_photographs_of_another_size_and_shape_agree_in_their_square(world, tmp_
     """A portrait crop of a photograph, twice the size: its centered square is the scene's, blur and places follow."""
     name, (where, _, blur) = next(iter(world.truth.items()))
     pixels = np.asarray(Image.open(world.folder / "photos" / name))[:, 160:640]  # 480 × 600
-    Image.fromarray(pixels).resize((960, 1200), Image.Resampling.BICUBIC).save(tmp_path / "tall.png")
+    Image.fromarray(pixels).resize((960, 1200), Image.Resampling.BICUBIC).save(tmp_path / "tall.png", compress_level=1)
     piece = lay_out_piece((162.0, 162.0), 19.0, "A1B2C3D4E5", "design")
     seen = see(tmp_path / "tall.png", world.manifest, piece, (640, 480))
     # (x - 160, y) in 480 × 600 has its square from y = 60 on; 480 px of it become 480
@@ -343,7 +354,7 @@ def test_each_unusable_photograph_has_its_code(world, tmp_path):
         "clipped": (np.minimum(sharp.astype(int) * 2, 255).astype(np.uint8), world.manifest),
     }
     for code, (pixels, manifest) in cases.items():
-        Image.fromarray(pixels).save(tmp_path / "photo.png")
+        save(pixels, tmp_path / "photo.png")
         with pytest.raises(PhotoRejected) as caught:
             see(tmp_path / "photo.png", manifest, piece, SIZE)
         assert caught.value.code == code, caught.value

@@ -140,7 +140,7 @@ def test_the_square_is_the_middle_of_the_photograph(tmp_path):
 
     for i in range(3):
         noise = np.random.default_rng(i).integers(0, 256, (12, 16, 3), np.uint8)
-        Image.fromarray(noise).resize((640, 480), 3).save(tmp_path / "backgrounds" / f"{i}.png")
+        Image.fromarray(noise).resize((320, 240), 3).save(tmp_path / "backgrounds" / f"{i}.png")
     scene = scene_of(tmp_path, text)
     stage, conditions, piece = set_stage(scene), scene.draw("promise", 4), piece_of(scene)
     photo = photograph(stage, piece, conditions, (400, 300), jpeg=False)[..., 50:350]
@@ -198,7 +198,7 @@ def test_what_trains_and_what_is_photographed_agree_in_rate(tmp_path):
     from patchproof.classifier.network import center_square
 
     scene = scene_of(tmp_path, SCENE)
-    stage, conditions, piece = set_stage(scene), scene.draw("evaluate", 4), piece_of(scene)
+    stage, conditions, piece = set_stage(scene), scene.draw("evaluate", 2), piece_of(scene)
     with torch.no_grad():
         small = photograph(stage, piece, conditions, (96, 96))
         large = center_square(photograph(stage, piece, conditions, (800, 600)), 96)

@@ -93,9 +93,11 @@ def camera_centers(poses) -> np.ndarray:
 
 
 def plane_homography(matrix_px, camera_from_world, world_from_plane) -> np.ndarray:
-    """3×3 from plane millimeters (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin."""
+    """3×3 from plane millimeters (x, y, 1) to pixels; `world_from_plane` 4×4 has the plane's x, y axes and origin. Of
+    poses N×4×4, N×3×3.
+    """
     pose = camera_from_world @ world_from_plane
-    return normalized(matrix_px @ pose[:3, [0, 1, 3]])
+    return normalized(matrix_px @ pose[..., :3, [0, 1, 3]])
 
 
 def scaled_about(middle, scale: float) -> np.ndarray:
@@ -108,11 +110,11 @@ def scaled_about(middle, scale: float) -> np.ndarray:
 
 
 def normalized(homography) -> np.ndarray:
-    """The same homography with its last entry 1, or with unit norm where that entry vanishes."""
+    """The same homography (or each of N×3×3) with its last entry 1, or with unit norm where that entry vanishes."""
     homography = np.asarray(homography, float)
-    last = homography[2, 2]
-    scale = last if abs(last) > 1e-12 * np.abs(homography).max() else np.linalg.norm(homography)
-    return homography / scale
+    last, largest = homography[..., 2, 2], np.abs(homography).max((-2, -1))
+    scale = np.where(np.abs(last) > 1e-12 * largest, last, np.linalg.norm(homography, axis=(-2, -1)))
+    return homography / scale[..., None, None]
 
 
 def apply_homography(homography, points) -> np.ndarray:

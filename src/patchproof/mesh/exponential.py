@@ -9,6 +9,7 @@ Geometry of Curves and Surfaces, 1976, section 4-6). On a cylinder (a constant h
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -27,15 +28,19 @@ class Smooth:
     scale_mm: float
 
     def height(self, s: np.ndarray, t: np.ndarray, ds: int = 0, dt: int = 0) -> np.ndarray:
-        """The height in mm, or its derivative of these orders."""
-        c = polynomial.polyder(polynomial.polyder(self.coefficients, ds, axis=0), dt, axis=1)
+        """The height in mm, or its derivative of these orders, up to the second."""
+        c = self._derivatives[ds, dt]
         return polynomial.polyval2d(s / self.scale_mm, t / self.scale_mm, c) / self.scale_mm ** (ds + dt)
+
+    @cached_property
+    def _derivatives(self) -> dict[tuple[int, int], np.ndarray]:
+        """The coefficients of the height's derivatives: a geodesic asks for them hundreds of times."""
+        by_s = [polynomial.polyder(self.coefficients, ds, axis=0) for ds in range(3)]
+        return {(ds, dt): polynomial.polyder(by_s[ds], dt, axis=1) for ds in range(3) for dt in range(3 - ds)}
 
     def tangents(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives N×3 of the surface point by s and by t, on the chart's across, along and normal at that place."""
-        k, none = self.chart.curvature, np.zeros(np.shape(s))
-        by_s = np.stack([1 + k * self.height(s, t), none, self.height(s, t, 1, 0)], -1)
-        return by_s, np.stack([none, none + 1, self.height(s, t, 0, 1)], -1)
+        return _tangents(self.chart.curvature, self.height(s, t), self.height(s, t, 1, 0), self.height(s, t, 0, 1))
 
     def points_and_normals(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points N×3 and unit normals N×3."""
@@ -85,10 +90,16 @@ def stretch_at(surface: Smooth, at: np.ndarray, size_mm: tuple[float, float], n:
 def _bending(surface: Smooth, at: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """The geodesic's acceleration in (s, t): what keeps its acceleration in space normal to the surface."""
     (s, t), (vs, vt), k = at.T, speed.T, surface.chart.curvature
-    hs, ht = surface.height(s, t, 1, 0), surface.height(s, t, 0, 1)
+    height, hs, ht = surface.height(s, t), surface.height(s, t, 1, 0), surface.height(s, t, 0, 1)
     across = 2 * k * hs * vs**2 + 2 * k * ht * vs * vt
-    outward = (surface.height(s, t, 2, 0) - k * (1 + k * surface.height(s, t))) * vs**2
+    outward = (surface.height(s, t, 2, 0) - k * (1 + k * height)) * vs**2
     outward = outward + 2 * surface.height(s, t, 1, 1) * vs * vt + surface.height(s, t, 0, 2) * vt**2
-    basis = np.stack(surface.tangents(s, t), 1)  # N×2×3
+    basis = np.stack(_tangents(k, height, hs, ht), 1)  # N×2×3
     pull = basis[:, :, 0] * across[:, None] + basis[:, :, 2] * outward[:, None]
     return -np.linalg.solve(basis @ basis.transpose(0, 2, 1), pull[..., None])[..., 0]
+
+
+def _tangents(k: float, height: np.ndarray, by_s: np.ndarray, by_t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents N×3 by s and by t over a chart of that curvature, of a height and its derivatives."""
+    none = np.zeros(np.shape(height))
+    return np.stack([1 + k * height, none, by_s], -1), np.stack([none, none + 1, by_t], -1)

@@ -90,8 +90,8 @@ class PatchScene(PieceScene, MeshScene):
 
     def piece_homographies(self, conditions: Conditions, size_px: tuple[int, int]) -> np.ndarray:
         """N×3×3 from piece millimeters to pixels of the pinhole picture; of a bent piece, its tangent plane's."""
-        matrix, plane = self.matrix_px(size_px), self.placement.world_from_piece
-        return np.stack([geometry.plane_homography(matrix, pose, plane) for pose in self.camera_from_print(conditions)])
+        poses, plane = self.camera_from_print(conditions), self.placement.world_from_piece
+        return geometry.plane_homography(self.matrix_px(size_px), poses, plane)
 
     def piece_px(self, conditions: Conditions, piece_mm: np.ndarray) -> np.ndarray:
         """As in `PieceScene.piece_px`."""
@@ -181,6 +181,6 @@ def _smallest_scales(scene: MeshScene, card: Placement) -> np.ndarray:
     poses = poses[(geometry.camera_centers(poses) - center_mm) @ card.normal > 0]
     if not len(poses):
         return np.zeros(0)
-    planes = np.stack([geometry.plane_homography(matrix, pose, card.world_from_piece) for pose in poses])
+    planes = geometry.plane_homography(matrix, poses, card.world_from_piece)
     mean, tilt_deg = geometry.local_scales(planes, np.array(card.size_mm) / 2).T
     return mean * np.sqrt(np.cos(np.radians(tilt_deg)))

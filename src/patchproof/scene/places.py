@@ -103,8 +103,8 @@ class Ground:
 
     def _facing(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """M shares of the views that face the points M×3."""
-        eyes = camera_centers(self.scene.camera_from_world(self.scene.draw("train", _VIEWS)))
-        cosines = [((eye - points) * normals).sum(1) / np.linalg.norm(eye - points, axis=1) for eye in eyes]
+        rays = (eye - points for eye in self._eyes)
+        cosines = [(ray * normals).sum(1) / np.linalg.norm(ray, axis=1) for ray in rays]
         return (np.array(cosines) > _FACING_COSINE).mean(0)
 
     def _first(self, frame: Frame) -> Spot | None:
@@ -156,6 +156,11 @@ class Ground:
     @property
     def _gap_mm(self) -> float:
         return self.scene.settings.patch.search.gap_mm or gap_limit_mm(self.size_mm)
+
+    @cached_property
+    def _eyes(self) -> np.ndarray:
+        """Where the cameras of the views stand that are asked what they face."""
+        return camera_centers(self.scene.camera_from_world(self.scene.draw("train", _VIEWS)))
 
     @cached_property
     def _triangles(self) -> np.ndarray:
