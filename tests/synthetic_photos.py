@@ -164,7 +164,8 @@ def save(srgb: np.ndarray, path: Path, focal_35mm: int | None = None) -> Path:
     if focal_35mm is not None:
         exif.get_ifd(0x8769)[0xA405] = focal_35mm
     buffer = io.BytesIO()
-    image.save(buffer, "JPEG" if path.suffix.lower() in {".jpg", ".jpeg"} else "PNG", quality=95, exif=exif)
+    kind = "JPEG" if path.suffix.lower() in {".jpg", ".jpeg"} else "PNG"
+    image.save(buffer, kind, quality=95, exif=exif, compress_level=1)
     path.write_bytes(buffer.getvalue())
     return path
 
