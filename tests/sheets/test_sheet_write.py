@@ -126,11 +126,8 @@ def test_rulers_measure_100_mm_on_the_page(sheet):
     )
     assert length == pytest.approx(100, abs=0.05) and start == pytest.approx(2, abs=0.05)
     x, y = template.ruler.y_start_mm
-    length, start = ends(
-        pixels[int((y - 2) * scale) : int((y + 102) * scale), int((x + 3.3) * scale) : int((x + 3.8) * scale)].swapaxes(
-            0, 1
-        )
-    )
+    strip = pixels[int((y - 2) * scale) : int((y + 102) * scale), int((x + 3.3) * scale) : int((x + 3.8) * scale)]
+    length, start = ends(strip.swapaxes(0, 1))
     assert length == pytest.approx(100, abs=0.05) and start == pytest.approx(2, abs=0.05)
 
 
