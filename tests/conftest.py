@@ -35,7 +35,8 @@ def pytest_collection_modifyitems(items):
 def one_core():
     """What takes all free cores where nothing is said takes one: the others have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.app.cli.console.free_cores", lambda: 1)  # where the commands ask for it
+        for module in ("base.workers", "app.cli.console"):  # the latter has a name of its own for it
+            patch.setattr(f"patchproof.{module}.free_cores", lambda: 1)
         yield
 
 

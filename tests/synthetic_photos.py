@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 from pathlib import Path
 
@@ -60,8 +61,16 @@ def noisy_design(seed: int = 0, colorful: bool = True) -> np.ndarray:
     return 1 / (1 + np.exp(-total))
 
 
+@functools.cache
+def _printed(pixels: bytes, shape: tuple[int, ...]) -> tuple[str, str]:
+    """Hash and PNG of a design, which hundreds of tests ask for."""
+    design = np.frombuffer(pixels, np.uint8).reshape(shape)
+    return design_sha256(design), png_base64(design)
+
+
 def make_manifest(promise: dict | None = None, first_id: int = 0, design: np.ndarray | None = None) -> Manifest:
     design = some_design() if design is None else design
+    sha256, png = _printed(design.tobytes(), design.shape)
     markers = []
     for marker_id, (x, y) in marker_squares().items():
         corners = [(x, y), (x + MARKER_MM, y), (x + MARKER_MM, y + MARKER_MM), (x, y + MARKER_MM)]
@@ -73,11 +82,11 @@ def make_manifest(promise: dict | None = None, first_id: int = 0, design: np.nda
             kind="design",
             page_mm=PAGE_MM,
             design=dict(
-                sha256=design_sha256(design),
+                sha256=sha256,
                 rect_mm=DESIGN_MM,
                 size_px=design.shape[1::-1],
                 page=1,
-                png=png_base64(design),
+                png=png,
             ),
             markers=markers,
             chart=(),
@@ -140,7 +149,7 @@ def photograph(page, px_from_mm, size_px=(1200, 900), blur_px=0.0, noise=0.0, li
     if blur_px > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), blur_px)
     if noise:
-        linear = linear + np.random.default_rng(seed).normal(0, 1, linear.shape) * noise
+        linear = linear + (np.random.default_rng(seed).standard_normal(linear.shape) * noise).astype(np.float32)
     srgb = np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
     if jpeg is None:
         return srgb
@@ -155,7 +164,8 @@ def save(srgb: np.ndarray, path: Path, focal_35mm: int | None = None) -> Path:
     if focal_35mm is not None:
         exif.get_ifd(0x8769)[0xA405] = focal_35mm
     buffer = io.BytesIO()
-    image.save(buffer, "JPEG" if path.suffix.lower() in {".jpg", ".jpeg"} else "PNG", quality=95, exif=exif)
+    kind = "JPEG" if path.suffix.lower() in {".jpg", ".jpeg"} else "PNG"
+    image.save(buffer, kind, quality=95, exif=exif, compress_level=1)
     path.write_bytes(buffer.getvalue())
     return path
 
@@ -165,20 +175,23 @@ def curled_photograph(page, camera_from_page, matrix_px, curvature, size_px=(120
     center: each ray of `fine`² per pixel is met with the cylinder, so nothing of the tool's own model is used.
     """
     center, radius = np.array(DESIGN_MM[:2]) + np.array(DESIGN_MM[2:]) / 2, 1 / curvature
-    width, height = size_px
-    v, u = np.mgrid[0 : height * fine, 0 : width * fine]
-    pixels = np.stack([(u + 0.5) / fine, (v + 0.5) / fine, np.ones(u.shape)], -1)
     rotation, eye = camera_from_page[:3, :3], -camera_from_page[:3, :3].T @ camera_from_page[:3, 3]
-    ray = pixels @ (np.linalg.inv(matrix_px).T @ rotation)
-    a, b = (ray[..., [0, 2]] ** 2).sum(-1), ray[..., 0] * eye[0] + ray[..., 2] * (eye[2] - radius)
-    rest = b * b - a * (eye[0] ** 2 + (eye[2] - radius) ** 2 - radius**2)
-    far = (-b - np.sign(radius) * np.sqrt(np.where(rest > 0, rest, np.nan))) / a
-    x, y, z = (eye[i] + far * ray[..., i] for i in range(3))
-    along = radius * np.arctan2(x / radius, (radius - z) / radius) + center[0]
-    left, top, w, h = CUT_MM
-    inside = (along > left) & (along < left + w) & (y + center[1] > top) & (y + center[1] < top + h)
-    maps = [np.where(inside, m * PX_PER_MM - 0.5, 0).astype(np.float32) for m in (along, y + center[1])]
-    light = np.where(inside[..., None], cv2.remap(page, *maps, cv2.INTER_NEAREST), np.float32(0.2))
+    width, height = size_px
+    light = np.empty((height * fine, width * fine, 3), np.float32)
+    for first in range(0, height * fine, 60):  # rows at a time that a processor's own memory holds
+        v, u = np.mgrid[first : min(first + 60, height * fine), 0 : width * fine]
+        pixels = np.stack([(u + 0.5) / fine, (v + 0.5) / fine, np.ones(u.shape)], -1)
+        ray = pixels @ (np.linalg.inv(matrix_px).T @ rotation)
+        a, b = (ray[..., [0, 2]] ** 2).sum(-1), ray[..., 0] * eye[0] + ray[..., 2] * (eye[2] - radius)
+        rest = b * b - a * (eye[0] ** 2 + (eye[2] - radius) ** 2 - radius**2)
+        far = (-b - np.sign(radius) * np.sqrt(np.where(rest > 0, rest, np.nan))) / a
+        x, y, z = (eye[i] + far * ray[..., i] for i in range(3))
+        along = radius * np.arctan2(x / radius, (radius - z) / radius) + center[0]
+        left, top, w, h = CUT_MM
+        inside = (along > left) & (along < left + w) & (y + center[1] > top) & (y + center[1] < top + h)
+        maps = [np.where(inside, m * PX_PER_MM - 0.5, 0).astype(np.float32) for m in (along, y + center[1])]
+        seen = cv2.remap(page, *maps, cv2.INTER_NEAREST)
+        light[first : first + 60] = np.where(inside[..., None], seen, np.float32(0.2))
     linear = cv2.GaussianBlur(cv2.resize(light, size_px, interpolation=cv2.INTER_AREA), (0, 0), blur_px)
     noisy = linear * 0.8 + np.random.default_rng(seed).normal(0, 0.004, linear.shape)
     return np.clip(srgb_from_linear(np.clip(noisy, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)

@@ -105,7 +105,7 @@ def test_the_search_stops_at_the_level_that_shows_everything(piece, monkeypatch)
 
 
 def test_markers_of_another_sheet_are_foreign(piece):
-    found = find_markers(photograph(piece, view(0, 0, 500)), frozenset({500, 501}))
+    found = find_markers(photograph(piece, view(0, 0, 500, size_px=(800, 600)), (800, 600)), frozenset({500, 501}))
     assert not found.markers and set(found.foreign) == IDS
 
 
@@ -122,7 +122,7 @@ def test_the_same_marker_twice_is_doubled(piece):
 
 
 def test_a_flipped_photo_is_known_as_mirrored(piece):
-    photo = photograph(piece, view(20, 5, 500))
+    photo = photograph(piece, view(20, 5, 500, size_px=(800, 600)), (800, 600))
     flipped = np.ascontiguousarray(photo[:, ::-1])
     assert not find_markers(flipped, IDS).markers
     assert is_mirrored(flipped, IDS) and not is_mirrored(photo, IDS)

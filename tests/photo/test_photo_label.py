@@ -22,6 +22,8 @@ from patchproof.sheets.several import write_several
 from patchproof.sheets.template import load_template
 from patchproof.sheets.write import write_sheet
 
+DPI = 100
+
 
 def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):
     design = some_design(seed)  # a smooth one: in hard squares the detector looks for markers
@@ -31,12 +33,12 @@ def sheet(path, seed=0, identity="A1B2C3D4E5", kind="design"):
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """Manifests and pages at 150 dpi: a sheet, the same sheet with another design, and another sheet."""
+    """Manifests and pages: a sheet, the same sheet with another design, and another sheet."""
     folder = tmp_path_factory.mktemp("labels")
     made = {}
     for name, seed, identity in (("ours", 0, "A1B2C3D4E5"), ("design", 1, "A1B2C3D4E5"), ("sheet", 0, "Z9Y8X7W6V5")):
         manifest = sheet(folder / f"{name}.pdf", seed, identity)
-        made[name] = manifest, page_pixels(folder / f"{name}.pdf", 1, 150)
+        made[name] = manifest, page_pixels(folder / f"{name}.pdf", 1, DPI)
     return made
 
 
@@ -47,11 +49,11 @@ def verified(manifest, srgb, scan_dpi=None):
 
 
 def oblique(page):
-    """The page on a gray table, seen from aside: 4 px per mm on its near side, 3 on its far one."""
+    """The page on a gray table, seen from aside: 3.2 px per mm on its near side, 2.4 on its far one."""
     height, width = page.shape[:2]
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
-    seen = np.array([[160, 60], [800, 90], [930, 1190], [70, 1170]], np.float32)
-    size = (1000, 1250)
+    seen = np.array([[128, 48], [640, 72], [744, 952], [56, 936]], np.float32)
+    size = (800, 1000)
     picture = cv2.warpPerspective(
         page, cv2.getPerspectiveTransform(corners, seen), size, flags=cv2.INTER_AREA, borderValue=(120, 120, 120)
     )
@@ -62,7 +64,7 @@ def test_every_page_carries_what_its_manifest_says(pages, tmp_path):
     for manifest, page in pages.values():
         assert read_label(page) == label_of(manifest)
     blank = blank_sheet("blank_a4", tmp_path / "blank.pdf")
-    assert read_label(page_pixels(tmp_path / "blank.pdf", 1, 150)) == label_of(blank) == Label(blank.sheet_id, "blank")
+    assert read_label(page_pixels(tmp_path / "blank.pdf", 1, DPI)) == label_of(blank) == Label(blank.sheet_id, "blank")
 
 
 @pytest.mark.parametrize(
@@ -72,7 +74,7 @@ def test_other_codes_are_none_of_ours(text):
     assert parsed(text) is None
 
 
-@pytest.mark.parametrize(("look", "scan_dpi"), [(lambda page: (page * 0.8).astype(np.uint8), 150), (oblique, None)])
+@pytest.mark.parametrize(("look", "scan_dpi"), [(lambda page: (page * 0.8).astype(np.uint8), DPI), (oblique, None)])
 def test_a_page_of_another_design_is_the_wrong_sheet_though_its_markers_are_ours(pages, look, scan_dpi):
     ours, page = pages["ours"]
     good = verified(ours, look(page), scan_dpi)
@@ -84,12 +86,12 @@ def test_a_page_of_another_design_is_the_wrong_sheet_though_its_markers_are_ours
     assert other.design.sha256[:16] in bad.entry.remark.advice and ours.design.sha256[:16] in bad.entry.remark.advice
     # and without its code the design is not told apart: then its colors show it
     hidden = other_page.copy()
-    hidden[: int(55 / 25.4 * 150), int(175 / 25.4 * 150) :] = 255
+    hidden[: int(55 / 25.4 * DPI), int(175 / 25.4 * DPI) :] = 255
     assert verified(ours, look(hidden), scan_dpi).entry.status == "measured"
 
 
 def test_another_sheet_is_named(pages):
-    entry = verified(pages["ours"][0], pages["sheet"][1][: int(65 / 25.4 * 150)]).entry
+    entry = verified(pages["ours"][0], pages["sheet"][1][: int(65 / 25.4 * DPI)]).entry
     assert (entry.status, entry.code) == ("rejected", "wrong_sheet")
     assert "Z9Y8X7W6V5" in entry.remark.advice
 
@@ -98,9 +100,9 @@ def test_the_code_alone_tells_of_another_sheet_when_no_marker_can_be_read(pages)
     manifest, page = pages["sheet"]
     covered = page.copy()
     for marker in manifest.markers:
-        low, high = (np.array(marker.corners_mm)[[0, 2]] * 150 / 25.4).astype(int)
+        low, high = (np.array(marker.corners_mm)[[0, 2]] * DPI / 25.4).astype(int)
         covered[low[1] : high[1], low[0] : high[0]] = 128
-    covered = covered[: int(65 / 25.4 * 150)]
+    covered = covered[: int(65 / 25.4 * DPI)]
     assert verified(pages["ours"][0], covered).entry.code == "wrong_sheet"
     assert verified(manifest, covered).entry.code == "too_few_markers"
 
@@ -114,16 +116,16 @@ def test_a_page_of_several_designs_is_each_ones_own_and_nobody_elses(tmp_path):
             for identity, pixels in designs
         ]
         manifests = write_several(tmp_path / f"{name}.pdf", template, each)
-        looks[name] = (page_pixels(tmp_path / f"{name}.pdf", 1, 150) * 0.8).astype(np.uint8)
+        looks[name] = (page_pixels(tmp_path / f"{name}.pdf", 1, DPI) * 0.8).astype(np.uint8)
         assert {label_of(manifest) for manifest in manifests} == {read_label(looks[name])}
         return manifests
 
     ids, designs = ("A1B2C3D4E5", "B1B2C3D4E5", "C1B2C3D4E5"), [some_design(seed) for seed in range(4)]
     ours = page("ours", *zip(ids, designs[:3], strict=True))
-    entry = verified(ours[2], looks["ours"], 150).entry
+    entry = verified(ours[2], looks["ours"], DPI).entry
     assert (entry.status, entry.code) == ("measured", None)
     page("one changed", *zip(ids, [*designs[:2], designs[3]], strict=True))
     page("without ours", ("Z9Y8X7W6V5", designs[3]), *zip(ids[1:], designs[1:3], strict=True))
     for other, code in (("one changed", "wrong_sheet"), ("without ours", "several_sheets")):
-        entry = verified(ours[0], looks[other], 150).entry
+        entry = verified(ours[0], looks[other], DPI).entry
         assert (entry.status, entry.code) == ("rejected", code)

@@ -63,12 +63,19 @@ def pictures():
 
 
 def written(out, verdict="kept"):
+    """The page of a report that is written into `out`."""
     rest = dict(azimuth_deg=None, contrast=None, blur_px=None, recognized=True)
     claims = [dict(px_per_mm=1.0 + i % 3, tilt_deg=float(i), **rest) for i in range(30)]
     manifest = make_manifest(promise(claims)).model_dump(mode="json")
     for file, kinds in pictures().items():
         save_pictures(out / "pictures", file, kinds)
     return write_report(some_report(verdict).model_dump(mode="json"), manifest, out, some_ledger())
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """A page to look at, beside the other files."""
+    return written(tmp_path_factory.mktemp("report"))
 
 
 class Tags(HTMLParser):
@@ -81,8 +88,8 @@ class Tags(HTMLParser):
         self.links += [value for name, value in attrs if name in {"src", "href", "xlink:href"}]
 
 
-def test_the_page_asks_nothing_of_the_network_and_runs_no_script(tmp_path):
-    text = written(tmp_path).read_text()
+def test_the_page_asks_nothing_of_the_network_and_runs_no_script(shown):
+    text = shown.read_text()
     tags = Tags()
     tags.feed(text)
     assert tags.links and all(link.startswith(("data:image/", "#")) for link in tags.links)
@@ -90,8 +97,8 @@ def test_the_page_asks_nothing_of_the_network_and_runs_no_script(tmp_path):
     assert not re.search(r"url\((?!#)|@import", text)
 
 
-def test_the_page_says_what_the_report_says_and_escapes_it(tmp_path):
-    text = written(tmp_path).read_text()
+def test_the_page_says_what_the_report_says_and_escapes_it(shown):
+    text = shown.read_text()
     for words in (
         "Promise kept",
         "TESTSHEET0",
@@ -123,17 +130,16 @@ def test_an_answer_about_a_photograph_that_does_not_count_is_not_called_recogniz
         assert [each for each in words if each in page] == [word]
 
 
-def test_json_is_the_report_and_nothing_else(tmp_path):
-    written(tmp_path)
-    assert json.loads((tmp_path / "report.json").read_text()) == some_report().model_dump(mode="json")
-    again = Report.model_validate_json((tmp_path / "report.json").read_text())
+def test_json_is_the_report_and_nothing_else(shown):
+    folder = shown.parent
+    assert json.loads((folder / "report.json").read_text()) == some_report().model_dump(mode="json")
+    again = Report.model_validate_json((folder / "report.json").read_text())
     assert again.photos == some_report().photos and again.model_dump_json() == some_report().model_dump_json()
-    assert sorted(p.name for p in (tmp_path / "pictures").iterdir())[0] == "p0.jpg.delta_e00.png"
+    assert sorted(p.name for p in (folder / "pictures").iterdir())[0] == "p0.jpg.delta_e00.png"
 
 
-def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(tmp_path):
-    written(tmp_path)
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "report.csv").read_text(encoding="utf-8"))))
+def test_csv_has_a_row_for_each_photograph_and_all_of_its_figures(shown):
+    rows = list(csv.DictReader(io.StringIO((shown.parent / "report.csv").read_text(encoding="utf-8"))))
     photos = some_report().photos
     assert [row["file"] for row in rows] == [photo.file for photo in photos]
     assert (
@@ -156,8 +162,8 @@ def test_csv_holds_no_formula():
     assert row["file"] == "'=1+1.jpg" and row["homography_px_from_mm_22"] == "9.5"
 
 
-def test_the_same_report_has_the_same_bytes(tmp_path):
-    assert written(tmp_path / "a").read_bytes() == written(tmp_path / "b").read_bytes()
+def test_the_same_report_has_the_same_bytes(shown, tmp_path):
+    assert shown.read_bytes() == written(tmp_path).read_bytes()
 
 
 def test_a_sheet_without_a_promise_has_a_page_too(tmp_path):
@@ -218,17 +224,17 @@ def seen_in_browser(page, width_px, tmp_path):
     return json.loads(html.unescape(title[1]))
 
 
-def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways_or_asking_anybody(tmp_path):
-    seen = seen_in_browser(written(tmp_path), 390, tmp_path)
+def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways_or_asking_anybody(shown, tmp_path):
+    seen = seen_in_browser(shown, 390, tmp_path)
     assert seen["inner"] == 390 and seen["width"] <= 390 and seen["wide"] == []
     assert seen["images"] == 5 and seen["broken"] == 0 and seen["small"] == 0
     assert seen["errors"] == [] and seen["fetched"] == []
 
 
-def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(tmp_path):
-    page = written(tmp_path)
+def test_the_browser_sees_what_is_too_wide_fetched_or_in_error(shown, tmp_path):
+    page = tmp_path / "report.html"
     bad = "<div style='width:900px'>x</div><img src='gone.png'><script>nothing.at.all</script></main>"
-    page.write_text(page.read_text(encoding="utf-8").replace("</main>", bad), encoding="utf-8")
+    page.write_text(shown.read_text(encoding="utf-8").replace("</main>", bad), encoding="utf-8")
     seen = seen_in_browser(page, 390, tmp_path)
     assert seen["width"] > 390 and seen["wide"] == ["DIV"] and seen["broken"] == 1
     assert len(seen["errors"]) == 1 and len(seen["fetched"]) == 1

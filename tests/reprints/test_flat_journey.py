@@ -119,9 +119,9 @@ def photos(tmp_path_factory):
 def images(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
     world = build_scene(WORLD, folder, 3)
-    conditions = world.draw("evaluate", 8)
+    conditions = world.draw("evaluate", 5)
     shoot(world, None, conditions, folder / "images")
-    rows = [f"photo_{i}.jpg,carton" for i in range(8)]
+    rows = [f"photo_{i}.jpg,carton" for i in range(5)]
     (folder / "labels.csv").write_text("\n".join(["file,label", *rows]), encoding="utf-8")
     tables = 'images = "images"\nlabels = "labels.csv"', "width_mm = 135\nheight_mm = 135", "deceive"
     return optimized(folder, world, conditions, *tables)

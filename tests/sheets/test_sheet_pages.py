@@ -139,18 +139,21 @@ def tiled(tmp_path_factory):
     return path, write(path, "a4_tiles", PIECE.size_mm, 30)
 
 
+SCAN_DPI = 100
+
+
 def scanned(page, seed):
     """A page turned by up to 2° and shifted by up to 3 mm on the scanner, and its homography from page mm to px."""
     rng = np.random.default_rng(seed)
-    turn, shift = np.radians(rng.uniform(-2, 2)), rng.uniform(-18, 18, 2)
+    turn, shift = np.radians(rng.uniform(-2, 2)), rng.uniform(-12, 12, 2)
     c, s = np.cos(turn), np.sin(turn)
     matrix = np.array([[c, -s, shift[0]], [s, c, shift[1]], [0, 0, 1.0]])  # of edges, about the corner
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-    size = page.shape[1] + 120, page.shape[0] + 120
-    move = np.array([[1, 0, 60], [0, 1, 60], [0, 0, 1.0]])
+    size = page.shape[1] + 80, page.shape[0] + 80
+    move = np.array([[1, 0, 40], [0, 1, 40], [0, 0, 1.0]])
     whole = half @ move @ matrix @ np.linalg.inv(half)
     scan = cv2.warpAffine(page, whole[:2], size, flags=cv2.INTER_LINEAR, borderValue=(255, 255, 255))
-    return scan, move @ matrix @ np.diag([PX_PER_MM, PX_PER_MM, 1])
+    return scan, move @ matrix @ np.diag([SCAN_DPI / 25.4, SCAN_DPI / 25.4, 1])
 
 
 def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimeter(tiled):
@@ -158,15 +161,15 @@ def test_a_600_mm_patch_rebuilds_from_scans_of_its_tiles_within_half_a_millimete
     surface, origin, errors = surface_of(manifest), np.array(manifest.design.rect_mm[:2]), []
     assert len(manifest.tiles) >= 12 and len(surface.piece_ids) == 8
     for tile in manifest.tiles:
-        scan, truth = scanned(page_pixels(path, tile.page, DPI), tile.page)
-        measured = measure(view_of(Photo(scan, None), None), "scan", surface, None, promised_ranges(()), DPI)
+        scan, truth = scanned(page_pixels(path, tile.page, SCAN_DPI), tile.page)
+        measured = measure(view_of(Photo(scan, None), None), "scan", surface, None, promised_ranges(()), SCAN_DPI)
         entry = measured.entry
         assert entry.status == "measured" and not measured.counted
         assert (entry.scale.scale_x, entry.scale.scale_y) == pytest.approx((1, 1), abs=0.002)
         corners = rect_corners(tile.cut_mm)
         in_design_page = corners - np.array(tile.page_from_design_mm)[:, 2] + origin
         seen = apply_homography(np.array(entry.geometry.homography_px_from_mm), in_design_page)
-        errors.append(np.linalg.norm(seen - apply_homography(truth, corners), axis=1).max() / PX_PER_MM)
+        errors.append(np.linalg.norm(seen - apply_homography(truth, corners), axis=1).max() / SCAN_DPI * 25.4)
     assert max(errors) < 0.5
 
 

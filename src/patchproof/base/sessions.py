@@ -88,9 +88,9 @@ def _spread_of(recognized: tuple[int, ...], photos: tuple[int, ...]) -> Spread:
     rates, correlations = _grid() if max(photos, default=0) > 1 else (_grid()[0], np.array([_INDEPENDENT]))
     rate, correlation = (part.ravel() for part in np.meshgrid(rates, correlations, indexing="ij"))
     alpha, beta = _shapes(rate, correlation)
-    log = np.zeros(len(rate))
+    log, before = np.zeros(len(rate)), betaln(alpha, beta)
     for (k, n), often in Counter(zip(recognized, photos, strict=True)).items():
-        log += often * (betaln(alpha + k, beta + n - k) - betaln(alpha, beta))
+        log += often * (betaln(alpha + k, beta + n - k) - before)
     weights = np.exp(log - log.max())
     kept = weights > _NEGLIGIBLE
     return Spread(rate[kept], correlation[kept], weights[kept] / weights[kept].sum())
