@@ -36,6 +36,7 @@ def one_core():
     """What takes all free cores where nothing is said takes one: the others have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("patchproof.base.workers.free_cores", lambda: 1)
+        patch.setattr("patchproof.app.cli.console.free_cores", lambda: 1)  # where commands have it from
         yield
 
 
