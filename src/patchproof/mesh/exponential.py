@@ -8,7 +8,7 @@ Geometry of Curves and Surfaces, 1976, section 4-6). On a cylinder (a constant h
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -25,17 +25,24 @@ class Smooth:
     chart: Chart
     coefficients: np.ndarray
     scale_mm: float
+    _derived: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def height(self, s: np.ndarray, t: np.ndarray, ds: int = 0, dt: int = 0) -> np.ndarray:
         """The height in mm, or its derivative of these orders."""
-        c = polynomial.polyder(polynomial.polyder(self.coefficients, ds, axis=0), dt, axis=1)
+        if (c := self._derived.get((ds, dt))) is None:  # a geodesic asks for the same few thousands of times
+            c = polynomial.polyder(polynomial.polyder(self.coefficients, ds, axis=0), dt, axis=1)
+            self._derived[ds, dt] = c
         return polynomial.polyval2d(s / self.scale_mm, t / self.scale_mm, c) / self.scale_mm ** (ds + dt)
 
     def tangents(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives N×3 of the surface point by s and by t, on the chart's across, along and normal at that place."""
-        k, none = self.chart.curvature, np.zeros(np.shape(s))
-        by_s = np.stack([1 + k * self.height(s, t), none, self.height(s, t, 1, 0)], -1)
-        return by_s, np.stack([none, none + 1, self.height(s, t, 0, 1)], -1)
+        return self.tangents_of(self.height(s, t), self.height(s, t, 1, 0), self.height(s, t, 0, 1))
+
+    def tangents_of(self, h: np.ndarray, hs: np.ndarray, ht: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same where the height and its derivatives by s and by t are these."""
+        none = np.zeros(np.shape(h))
+        by_s = np.stack([1 + self.chart.curvature * h, none, hs], -1)
+        return by_s, np.stack([none, none + 1, ht], -1)
 
     def points_and_normals(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points N×3 and unit normals N×3."""
@@ -85,10 +92,10 @@ def stretch_at(surface: Smooth, at: np.ndarray, size_mm: tuple[float, float], n:
 def _bending(surface: Smooth, at: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """The geodesic's acceleration in (s, t): what keeps its acceleration in space normal to the surface."""
     (s, t), (vs, vt), k = at.T, speed.T, surface.chart.curvature
-    hs, ht = surface.height(s, t, 1, 0), surface.height(s, t, 0, 1)
+    h, hs, ht = surface.height(s, t), surface.height(s, t, 1, 0), surface.height(s, t, 0, 1)
     across = 2 * k * hs * vs**2 + 2 * k * ht * vs * vt
-    outward = (surface.height(s, t, 2, 0) - k * (1 + k * surface.height(s, t))) * vs**2
+    outward = (surface.height(s, t, 2, 0) - k * (1 + k * h)) * vs**2
     outward = outward + 2 * surface.height(s, t, 1, 1) * vs * vt + surface.height(s, t, 0, 2) * vt**2
-    basis = np.stack(surface.tangents(s, t), 1)  # N×2×3
+    basis = np.stack(surface.tangents_of(h, hs, ht), 1)  # N×2×3
     pull = basis[:, :, 0] * across[:, None] + basis[:, :, 2] * outward[:, None]
     return -np.linalg.solve(basis @ basis.transpose(0, 2, 1), pull[..., None])[..., 0]
