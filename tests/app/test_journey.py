@@ -217,7 +217,7 @@ def test_distance_and_angle_come_from_the_focal_length_in_exif(journey, report):
 def test_scans_of_tiles_are_page_checks_that_lie_where_the_truth_says(journey, tmp_path):
     small = packaged_path("print_templates", "a4_tiles.toml").read_text(encoding="utf-8")
     assert "177.0, 262.4]" in small
-    (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "60.0, 60.0]"), encoding="utf-8")
+    (tmp_path / "small.toml").write_text(small.replace("177.0, 262.4]", "177.0, 60.0]"), encoding="utf-8")
     pdf, run = tmp_path / "tiles.pdf", journey / "run"
     # a control, for which no promise is made anew
     assert command("sheet", run, "--out", pdf, "--template", tmp_path / "small.toml", "--control", "mean") == 0
