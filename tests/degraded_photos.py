@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from bent_paper import CENTER, PAGE_PER_MM, SIDE_MM, Place, bent, camera, cone, flat, folded, rolled, sheet
 from PIL import Image
+from scipy.sparse import csc_array
 
 from patchproof.base.color import srgb_from_linear
 from patchproof.base.geometry import look_at, view_angles
@@ -275,11 +276,12 @@ def _samples() -> np.ndarray:
 def _projected(draw: Draw, points: np.ndarray, camera_from_page, wobble) -> tuple[np.ndarray, np.ndarray]:
     """Pixels N×2 of the file and depths N."""
     seen = points @ camera_from_page[:3, :3].T + camera_from_page[:3, 3]
-    off = FOCAL * draw.zoom * seen[:, :2] / seen[:, 2:]
-    off = off * (1 + draw.lens * (off**2).sum(1, keepdims=True) / (np.hypot(*SIZE) / 2) ** 2)
+    off = seen[:, :2] * (FOCAL * draw.zoom / seen[:, 2:])
+    if draw.lens:
+        off *= 1 + draw.lens * (off**2).sum(1, keepdims=True) / (np.hypot(*SIZE) / 2) ** 2
     shift = np.zeros(2) if draw.crop is None else np.array(draw.crop[:2])
-    px = off + np.array(SIZE) / 2 - shift
-    return px + wobble(px), seen[:, 2]
+    px = off + (np.array(SIZE) / 2 - shift)
+    return (px + wobble(px) if draw.wobble_px else px), seen[:, 2]
 
 
 def _wobble(draw: Draw) -> Callable[[np.ndarray], np.ndarray]:
@@ -305,27 +307,39 @@ def _background(draw: Draw) -> np.ndarray:
 def _laid_on(light, page, px, depth) -> np.ndarray:
     """The page's samples thrown into the picture's light, each into the four pixels about it, hidden ones left out."""
     height, width = light.shape[:2]
-    inside = ((px > 1) & (px < [width - 1, height - 1])).all(1)
+    x, y = np.ascontiguousarray(px.T)
+    inside = (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1)
     if not inside.all():
-        px, depth, page = px[inside], depth[inside], page[inside]
-    cell = (px[:, 1] * 0.25).astype(int) * (width // 4 + 1) + (px[:, 0] * 0.25).astype(int)
+        x, y, depth, page = x[inside], y[inside], depth[inside], page[inside]
+    # of the part of the picture that they reach
+    left, right = max(int(x.min()) - 4, 0), min(int(x.max()) + 5, width)
+    top, bottom = max(int(y.min()) - 4, 0), min(int(y.max()) + 5, height)
+    light, part = light.copy(), (slice(top, bottom), slice(left, right))
+    light[part] = _thrown(light[part], page, (x - left).astype(np.float32), (y - top).astype(np.float32), depth)
+    return light
+
+
+def _thrown(light, page, x, y, depth) -> np.ndarray:
+    height, width = light.shape[:2]
+    cell = (y * np.float32(0.25)).astype(np.int32) * (width // 4 + 1) + (x * np.float32(0.25)).astype(np.int32)
     nearest = np.full((height // 4 + 1) * (width // 4 + 1), np.inf)
     np.minimum.at(nearest, cell, depth)
     shown = depth < nearest[cell] + 12.0  # mm: what a steep part gains over four pixels
     if not shown.all():
-        px, page = px[shown], page[shown]
-    x, y = np.ascontiguousarray(px.T) - 0.5
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    right, below, colors = x - left, y - top, np.ascontiguousarray(page.T)
-    total = np.zeros((4, height * width))
-    for dx in (0, 1):
-        for dy in (0, 1):
-            weight = (right if dx else 1 - right) * (below if dy else 1 - below)
-            index = (top + dy) * width + left + dx
-            total[3] += np.bincount(index, weight, height * width)
-            for c in range(3):
-                total[c] += np.bincount(index, weight * colors[c], height * width)
-    total = np.ascontiguousarray(total.T.reshape(height, width, 4), np.float32)
+        x, y, page = x[shown], y[shown], page[shown]
+    x, y = x - np.float32(0.5), y - np.float32(0.5)
+    left, top = x.astype(np.int32), y.astype(np.int32)
+    right, below, corner = x - left, y - top, top * width + left
+    # each column of the matrix is a sample's: what of it the four pixels about it get
+    weights, pixels = np.empty((len(x), 4), np.float32), np.empty((len(x), 4), np.int32)
+    for n, (dx, dy) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        np.multiply(right if dx else 1 - right, below if dy else 1 - below, out=weights[:, n])
+        np.add(corner, dy * width + dx, out=pixels[:, n])
+    ends = np.arange(0, 4 * len(x) + 1, 4, dtype=np.int32)
+    thrown = csc_array((weights.ravel(), pixels.ravel(), ends), (height * width, len(x)))
+    colors = np.ones((len(page), 4), np.float32)
+    colors[:, :3] = page
+    total = (thrown @ colors).reshape(height, width, 4)
     dense = np.maximum(cv2.dilate(total[..., 3], np.ones((5, 5))), 1e-3)
     cover = np.clip(total[..., 3:] / dense[..., None] / 0.7, 0, 1)
     color = total[..., :3] / np.maximum(total[..., 3:], 1e-6)
@@ -341,7 +355,8 @@ def _exposed(light: np.ndarray, draw: Draw) -> np.ndarray:
         moved = (np.array([[1, 0, s * way[0]], [0, 1, s * way[1]]]) for s in steps)
         size = linear.shape[1::-1]
         linear = sum(cv2.warpAffine(linear, m, size, borderMode=cv2.BORDER_REPLICATE) for m in moved) / len(steps)
-    linear = linear + draw.rng.normal(0, draw.noise, linear.shape) * np.sqrt(np.maximum(linear, 0.02))
+    noise = draw.rng.standard_normal(linear.shape, np.float32) * np.float32(draw.noise)
+    linear = linear + noise * np.sqrt(np.maximum(linear, np.float32(0.02)))
     return np.clip(srgb_from_linear(np.clip(linear, 0, 1)) * 255 + 0.5, 0, 255).astype(np.uint8)
 
 

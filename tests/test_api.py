@@ -41,8 +41,8 @@ def loss(logits: torch.Tensor, indices: tuple[int, ...]) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> pp.Run:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 40)
-        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)
+        patch.setattr("patchproof.optimizer.run.PROMISE_VIEWS", 24)
+        patch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 4)
         return pp.optimize(scene(), tmp_path_factory.mktemp("api") / "run", models=[network()], loss=loss)
 
 
@@ -59,7 +59,7 @@ def test_an_own_loss_is_descended_on_and_the_promise_is_an_object(run):
         logits = [network().logits(pp.photograph(stage, shown, conditions, (72, 72))) for shown in (run.design, flat)]
     assert loss(logits[0], (0,)).mean() < loss(logits[1], (0,)).mean()
     promise = run.promise
-    assert promise.n == 40 and PROMISE_VIEWS == 400 and promise.models[0].name == "python:net"
+    assert promise.n == 24 and PROMISE_VIEWS == 400 and promise.models[0].name == "python:net"
     assert promise.models[0].sha256 == network().sha256
     assert promise.interval[0] <= promise.rate <= promise.interval[1]
 

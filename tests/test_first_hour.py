@@ -130,13 +130,14 @@ def typed_apart(line: str, folder: Path) -> tuple[int, str, float]:
 def test_a_first_hour_says_at_each_step_what_to_do_next(tmp_path, monkeypatch):
     monkeypatch.setattr("patchproof.optimizer.loop.SELECT_VIEWS", 8)  # what they cost is time
     monkeypatch.setattr("patchproof.optimizer.run.DRAFT", (24, 40))
+    monkeypatch.setattr("patchproof.app.begin.sides._STEP_DEG", 90)
     small = "[camera]\nphoto_px = [1040, 780]\n[background]\ncolor = [0.5, 0.5, 0.5]\n"
     said = {line: text for line, (text, _) in spent(tmp_path, typed_here, small).items()}
     asked, new, preview, optimize, sheet, _, refused, verify = said.values()
     assert 'add --label with what it is to be recognized as: "lamp", "vase", "stone"' in asked
     assert "length: 340 mm, by the file's units" in new and "next: patchproof preview scene.toml" in new
     assert '"lamp" first in ' in preview and "next: patchproof optimize scene.toml" in preview
-    assert "Draft of" in optimize and "better than its best control" in optimize
+    assert "Draft of" in optimize and ": better than its best control" in optimize
     assert "next: patchproof sheet run --out sheet.pdf" in optimize and "sheet.json" in sheet
     assert f"name it yourself if that code is yours (--models {MODEL})" in refused
     assert "Helps beside simulated controls" in verify and "Take at least 10 photographs in each of" in verify

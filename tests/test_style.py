@@ -34,8 +34,9 @@ def test_every_dependency_says_what_it_is_for():
 
 
 def british(text: str) -> list[str]:
-    """The words that are spelled so."""
-    return [word for word in re.findall(r"\w+", THEIRS.sub("", text)) if BRITISH.search(word)]
+    """The words that are spelled so, each once."""
+    words = dict.fromkeys(re.findall(r"\w+", THEIRS.sub("", text)))
+    return [word for word in words if BRITISH.search(word)]
 
 
 def test_the_speller_sees_words_and_lets_names_pass():

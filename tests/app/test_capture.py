@@ -45,7 +45,7 @@ from test_verify_run import NET, promise, shot
 
 pytestmark = pytest.mark.filterwarnings("ignore:the network net:UserWarning")  # it sees no color
 TOKEN = "a-token-that-is-nobodys-own"
-SHOTS = 16
+SHOTS = 8
 
 
 def condition(azimuth_deg: float, px_per_mm: float) -> dict:
@@ -64,10 +64,10 @@ def sheet(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> list[bytes]:
-    """What a phone that walks round the piece takes: one in eight in too little light for `NET`, one of no piece."""
+    """What a phone that walks round the piece takes: one in too little light for `NET`, one of no piece."""
     folder = tmp_path_factory.mktemp("phone")
-    looks = [dict(light=0.1 if i % 8 == 3 else 0.8, seed=i, noise=0.003) for i in range(SHOTS)]
-    pictures = [shot(5 * (i % 16) - 38, 450 + 60 * (i % 3), **look) for i, look in enumerate(looks)]
+    looks = [dict(light=0.1 if i == 3 else 0.8, seed=i, noise=0.003) for i in range(SHOTS)]
+    pictures = [shot(10 * i - 38, 450 + 60 * (i % 3), **look) for i, look in enumerate(looks)]
     pictures[5] = pictures[5] * 0 + 120
     return [save(picture, folder / f"{i}.jpg", focal_35mm=36).read_bytes() for i, picture in enumerate(pictures)]
 
@@ -165,7 +165,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
             for photo in own:
                 answers.append(client.send(photo, into).json)
 
-        for session, part in (("session_01", photos[:8]), ("session_02", photos[8:])):
+        for session, part in (("session_01", photos[: SHOTS // 2]), ("session_02", photos[SHOTS // 2 :])):
             tabs = [threading.Thread(target=tab, args=(own, session)) for own in (part[::2], part[1::2])]
             for thread in tabs:
                 thread.start()
@@ -176,7 +176,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
         assert client.send(save(shot(3, light=0.1), tmp_path / "gray.jpg").read_bytes(), "gray").status == 200
         state = client.get("state").json
     files = [path for path in files_in(folder) if path.endswith(".jpg")]
-    assert files[0] == "controls/gray/photo_0017.jpg" and len(files) == SHOTS + 1
+    assert files[0] == f"controls/gray/photo_{SHOTS + 1:04}.jpg" and len(files) == SHOTS + 1
     assert sorted((folder / file).read_bytes() for file in files[1:]) == sorted(photos)  # EXIF and all
     assert len({answer["photo"]["file"] for answer in answers}) == SHOTS
     assert {answer["photo"]["code"] for answer in answers} >= {None, "too_few_markers"}
@@ -188,7 +188,7 @@ def test_two_tabs_send_a_walk_and_verify_says_what_the_page_said(tmp_path, sheet
     assert tuple(state["prediction_interval"]) == summary.prediction_interval
     assert state["interval"] == pytest.approx(summary.interval, abs=1e-12)
     assert state["recognized"] == round(summary.rate * summary.judged)
-    assert state["judged"] == summary.judged > 10 and 1 <= summary.judged - state["recognized"] <= 2  # the dark ones
+    assert state["judged"] == summary.judged == SHOTS - 1 == state["recognized"] + 1  # the dark one
     said = {(s["name"], s["recognized"], s["judged"]) for s in state["sessions"]}
     assert (
         said == {(s.name, s.recognized, s.judged) for s in summary.sessions}

@@ -80,7 +80,7 @@ def quick_plan(path) -> Plan:
         patch.setattr(loop, "SELECT_VIEWS", 4)
         patch.setattr(errors, "_chunks", lambda views, side_px: [slice(0, 2), slice(2, views)])
         calls = []
-        plan = measured_plan(*plan_geometry(path), timing=False, views=3, on_stage=lambda *call: calls.append(call))
+        plan = measured_plan(*plan_geometry(path), timing=False, views=3, progress=lambda *call: calls.append(call))
     assert {name for name, _, _ in calls} == {"draft", "terms"} and all(done <= total for _, done, total in calls)
     return plan
 
@@ -272,8 +272,8 @@ def test_the_parts_of_a_step_add_up(tmp_path):
 def test_the_verb_prints_and_writes_and_does_not_overwrite(scene_file, tmp_path, monkeypatch, capsys, plan):
     import patchproof.app.plan.plan as study
 
-    monkeypatch.setattr(study, "plan_geometry", lambda path, on_stage: (plan, None))
-    monkeypatch.setattr(study, "measured_plan", lambda geometry, problem, timing, on_stage: plan)
+    monkeypatch.setattr(study, "plan_geometry", lambda path, progress: (plan, None))
+    monkeypatch.setattr(study, "measured_plan", lambda geometry, problem, timing, progress: plan)
     out = tmp_path / "plan.json"
     monkeypatch.setattr(sys, "argv", ["patchproof", "plan", str(scene_file), "--out", str(out), "--no-timing"])
     with pytest.raises(SystemExit) as done:
